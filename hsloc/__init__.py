@@ -1,0 +1,7 @@
+"""hsloc: where was the robot? Offline localisation and mapping for recorded 2D-lidar logs.
+
+Importing the package is cheap: the compiled kernels, SciPy and the readers are imported by the modules
+that use them, so that `hsloc --help` answers at once.
+"""
+
+__version__ = "0.1.0"

@@ -1,0 +1,60 @@
+"""`hsloc`: the command line's front door.
+
+Only argparse is imported here. A command is a module `hsloc.cli.<name>` with `HELP: str`,
+`add_arguments(parser)` and `run(arguments) -> int`; it is imported when it is called, and its heavy imports
+stand inside `run`, so that `hsloc --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from typing import TYPE_CHECKING
+
+from hsloc import __version__
+from hsloc.errors import HslocError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+COMMANDS = ("record", "replay", "info", "eval", "convert", "reproduce", "bench", "config")
+
+EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_DATA_LOST = 0, 1, 2, 3
+"""Exit codes: done; failed; wrong use; done, but part of the input was lost."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
+    parser = argparse.ArgumentParser(
+        prog="hsloc",
+        description="Where was the robot? Offline localisation and mapping for recorded 2D-lidar logs.",
+    )
+    parser.add_argument("--version", action="version", version=f"hsloc {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name in COMMANDS:
+        module = importlib.import_module(f"hsloc.cli.{name}")
+        command = commands.add_parser(name, help=module.HELP, description=module.__doc__)
+        module.add_arguments(command)
+        command.set_defaults(run=module.run)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code. Errors of `HslocError` are one line on stderr."""
+    arguments = build_parser().parse_args(argv)
+    try:
+        return int(arguments.run(arguments))
+    except HslocError as error:
+        print(f"hsloc: error: {error}", file=sys.stderr)
+        return EXIT_FAILED
+    except KeyboardInterrupt:
+        print("hsloc: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return EXIT_FAILED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,49 @@
+"""One tree of errors. Each message is one line that names the file, the value and the remedy.
+
+::
+
+    HslocError                  anything a user can be told; the command line maps it to exit code 1
+    ├── LogError                a log cannot be opened, or holds nothing that can be used
+    │   ├── LogFormatError      not a log of a known format, or damaged beyond use
+    │   └── TopicError          no scan or odometry topic, or several to choose from
+    ├── MapError                a map cannot be read, or does not fit the log
+    ├── ConfigError             an unknown key or a value outside its range
+    ├── EvaluationError         trajectories that cannot be compared
+    └── OutputError             results cannot be written
+
+A failed match is not an error: it is an `Estimate` whose status says so.
+"""
+
+from __future__ import annotations
+
+
+class HslocError(Exception):
+    """Base of all errors that hsloc raises on purpose."""
+
+
+class LogError(HslocError):
+    """A log cannot be opened or holds nothing that can be used."""
+
+
+class LogFormatError(LogError):
+    """The file is not a log of a known format, or it is damaged beyond use."""
+
+
+class TopicError(LogError):
+    """A topic is missing, or several could be meant."""
+
+
+class MapError(HslocError):
+    """A map cannot be read, or does not fit the log."""
+
+
+class ConfigError(HslocError):
+    """A configuration has an unknown key or a value outside its range."""
+
+
+class EvaluationError(HslocError):
+    """Two trajectories cannot be compared."""
+
+
+class OutputError(HslocError):
+    """Results cannot be written."""

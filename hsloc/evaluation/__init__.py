@@ -1,0 +1,1 @@
+"""HOW WELL: errors against truth, and what can be said without it."""

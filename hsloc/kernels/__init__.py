@@ -1,0 +1,1 @@
+"""COMPILED: the only package that imports numba. Arrays in, arrays out."""

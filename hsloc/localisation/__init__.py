@@ -1,0 +1,1 @@
+"""WHERE AM I, on a known map."""

@@ -1,0 +1,1 @@
+"""THE ONE DOOR to MCAP, ROS bags and CARMEN."""

@@ -1,0 +1,1 @@
+"""Maps as nav2 reads and writes them: PGM and YAML."""

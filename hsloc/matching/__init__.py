@@ -1,0 +1,1 @@
+"""POSE SEARCH: find the pose in a box that fits a scan best."""

@@ -1,0 +1,23 @@
+"""NOUNS: frozen values without behaviour of their own beyond geometry."""
+
+from hsloc.model.estimate import Estimate, ScanDiagnostics, Status
+from hsloc.model.events import Event, Odometry, Scan, Truth
+from hsloc.model.occupancy_grid import OccupancyGrid
+from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle, wrap_angles
+from hsloc.model.trajectory import Trajectory
+
+__all__ = [
+    "IDENTITY",
+    "Estimate",
+    "Event",
+    "OccupancyGrid",
+    "Odometry",
+    "Pose2",
+    "Scan",
+    "ScanDiagnostics",
+    "Status",
+    "Trajectory",
+    "Truth",
+    "wrap_angle",
+    "wrap_angles",
+]

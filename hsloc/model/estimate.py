@@ -1,0 +1,73 @@
+"""What an estimator says after an event, and the columns of all it said."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hsloc.model.pose2 import Pose2
+
+
+class Status(StrEnum):
+    """How an estimate came about."""
+
+    PREDICTED = "predicted"
+    """From odometry since the last match: an odometry message, or a scan the motion gate passed over."""
+    MATCHED = "matched"
+    """The scan was matched and the match was accepted."""
+    REJECTED = "rejected"
+    """The scan was matched, the match was refused; the prediction stands."""
+    NO_RETURNS = "no_returns"
+    """The scan has too few valid returns; the prediction stands."""
+    SEARCHING = "searching"
+    """The pose is unknown (at the start, or lost): the whole map is being searched. The pose is a guess."""
+    RELOCALISED = "relocalised"
+    """The search ended: one hypothesis won."""
+
+    @property
+    def is_localised(self) -> bool:
+        """Whether the pose that comes with this status may be believed."""
+        return self is not Status.SEARCHING
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The pose of the base in the map at a stamp, and how it came about.
+
+    `covariance` is 3 x 3 over (x, y, theta) in the map frame (m^2, m rad, rad^2). `fitness` is in (0, 1] where
+    a scan was matched, else None. `evaluations` counts the fitness evaluations spent. `reason` says in words
+    why a scan was skipped or refused.
+    """
+
+    stamp_ns: int
+    T_map_base: Pose2
+    status: Status
+    covariance: NDArray[np.float64] | None = None
+    fitness: float | None = None
+    evaluations: int = 0
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanDiagnostics:
+    """One row for each scan of a run, as columns of length n.
+
+    `status` holds values of `Status`; `fitness` is NaN where nothing was matched; `sigma` (n, 3) are the standard
+    deviations of x, y (m) and theta (rad), NaN where unknown; `evaluations` counts fitness evaluations;
+    `reason` is empty where there is nothing to say.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    status: tuple[str, ...]
+    fitness: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    evaluations: NDArray[np.int64]
+    reason: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)

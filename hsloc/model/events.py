@@ -1,0 +1,80 @@
+"""What a log tells, decoded at the door: odometry, scans and, where there is one, the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.model.pose2 import IDENTITY, Pose2
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """Dead reckoning: the base's pose in the odometry frame.
+
+    `covariance` is the 3 x 3 covariance of (x, y, theta) that the log states (m^2, rad^2), or None where it
+    states none (all zero means unknown, not perfect).
+    """
+
+    stamp_ns: int
+    T_odom_base: Pose2
+    covariance: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """A reference pose of the base that the log carries. It never reaches an estimator."""
+
+    stamp_ns: int
+    T_map_base: Pose2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """One turn of a 2D lidar.
+
+    Beam i points along `angle_min + i * angle_increment` in the laser's frame and was measured at
+    `stamp_ns + i * time_increment`. `ranges` (metres, shape (n,), float32 as in the log) keep their special
+    values: +inf is no return within range, NaN and -inf are invalid. `T_base_laser` is the mounting; an
+    upside-down laser is already turned (negated angles), so that the plane's geometry is all that is left.
+    """
+
+    stamp_ns: int
+    ranges: NDArray[np.float32]
+    angle_min: float
+    angle_increment: float
+    range_min: float
+    range_max: float
+    time_increment: float = 0.0
+    T_base_laser: Pose2 = IDENTITY
+    frame_id: str = "laser"
+    intensities: NDArray[np.float32] | None = field(default=None, repr=False)
+
+    def angles(self) -> NDArray[np.float64]:
+        """Direction of each beam in the laser's frame, radians, shape (n,)."""
+        return self.angle_min + self.angle_increment * np.arange(len(self.ranges), dtype=np.float64)
+
+    def hits(self) -> NDArray[np.bool_]:
+        """Which beams hit something: finite and within [range_min, range_max] (both included)."""
+        ranges = self.ranges
+        with np.errstate(invalid="ignore"):
+            return np.isfinite(ranges) & (ranges >= self.range_min) & (ranges <= self.range_max)
+
+    def no_returns(self) -> NDArray[np.bool_]:
+        """Which beams saw nothing within range (+inf): free space up to `range_max`."""
+        return np.isposinf(self.ranges)
+
+    def points_base(self) -> NDArray[np.float64]:
+        """The hits as points in the base's frame, metres, shape (m, 2), in the order of the beams."""
+        hits = self.hits()
+        ranges = self.ranges[hits].astype(np.float64)
+        angles = self.angles()[hits]
+        return self.T_base_laser @ np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))
+
+
+Event = Odometry | Scan | Truth

@@ -1,0 +1,1 @@
+"""THE RECORDER'S ROBOT: worlds, robots, sensors, scenarios."""

@@ -1,0 +1,1 @@
+"""WHERE AM I, while drawing the map."""

@@ -1,0 +1,1 @@
+"""The HTTP service: upload a log, get the answer."""

@@ -145,7 +145,7 @@ def test_an_exception_leaves_nothing_behind_and_an_old_file_untouched(tmp_path: 
 
 
 def test_a_missing_folder_is_one_clear_error(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="log[.]mcap: cannot be written"):
+    with pytest.raises(OutputError, match=r"log[.]mcap: cannot be written"):
         LogWriter(tmp_path / "missing" / "log.mcap")
     with pytest.raises(OutputError, match="is a folder"):
         LogWriter(tmp_path)

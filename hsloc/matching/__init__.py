@@ -1,1 +1,10 @@
 """POSE SEARCH: find the pose in a box that fits a scan best."""
+
+from hsloc.matching.harmony_search import HarmonySearch
+from hsloc.matching.hide import Hide
+from hsloc.matching.icp import Icp
+from hsloc.matching.likelihood_field import LikelihoodField
+from hsloc.matching.match import Match, Matcher, StopReason
+from hsloc.matching.window import Window
+
+__all__ = ["HarmonySearch", "Hide", "Icp", "LikelihoodField", "Match", "Matcher", "StopReason", "Window"]

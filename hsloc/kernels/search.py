@@ -1,0 +1,240 @@
+"""Harmony Search and HIDE over a box of poses, with restarts.
+
+One kernel serves both: HIDE is Harmony Search with a pass of differential evolution over the memory after every
+`improvisations_per_pass` improvisations; Harmony Search makes no such pass. Letters and equation numbers are
+those of the report [P] and of Mirkhani et al. [M]; see hsloc/matching for what they mean.
+
+Poses are (x, y, theta), x and y in cells of the packed field (hsloc/kernels/fitness.py).
+"""
+
+from __future__ import annotations
+
+from math import exp, log
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hsloc.kernels.fitness import score_sum
+from hsloc.kernels.polish import polish
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+    from numpy.typing import NDArray
+
+    F32 = NDArray[np.float32]
+    F64 = NDArray[np.float64]
+
+STOPPED_BUDGET = 0
+STOPPED_AGREEMENT = 1
+
+
+class SearchParameters(NamedTuple):
+    """Parameters of the search; in this module because a kernel's argument types decide whether it can be cached."""
+
+    memory_size: int
+    consideration_rate: float
+    par_min: float
+    par_max: float
+    bandwidth_max: tuple[float, float, float]
+    """Of each coordinate, in cells, cells and radians."""
+    bandwidth_min: tuple[float, float, float]
+    improvisations_per_pass: int
+    """HRT; 0: no differential evolution (plain Harmony Search)."""
+    attraction: float
+    """lambda of the differential evolution: the pull towards the best row."""
+    differential_weight: float
+    """F of the differential evolution."""
+    budget: int
+    """NI or NFE of one restart."""
+    count_improvisations: bool
+    """Whether the budget counts improvisations (the report's program) or fitness evaluations ([M])."""
+    restarts: int
+    agreement: int
+    """End when this many restarts have found the same best pose."""
+    polish_iterations: int
+    """Gauss-Newton steps after each restart; 0: none."""
+
+
+@njit(cache=True, nogil=True)
+def _improvise(memory: F64, low: F64, high: F64, par: float, bw: F64, hmcr: float, rng: Generator, new: F64) -> None:
+    """A new harmony, coordinate by coordinate ([P] III-B step 2)."""
+    for j in range(3):
+        if rng.random() < hmcr:
+            value = memory[int(rng.random() * len(memory)), j]
+            if rng.random() < par:
+                value += (2.0 * rng.random() - 1.0) * bw[j]
+            # The papers say nothing of a pitch that leaves the box: it stays at its border.
+            new[j] = min(max(value, low[j]), high[j])
+        else:
+            new[j] = low[j] + rng.random() * (high[j] - low[j])
+
+
+@njit(cache=True, nogil=True)
+def improve_memory(
+    packed: F32,
+    points: F32,
+    centre: F64,
+    half_widths: F64,
+    parameters: SearchParameters,
+    rng: Generator,
+    memory: F64,
+    sums: F64,
+    history: F64,
+    with_centre: bool,
+) -> tuple[int, int]:
+    """One run of HS or HIDE: fills `memory` (HMS, 3) and the sums of scores `sums` (HMS,).
+
+    Row 0 is the centre, the prediction, if `with_centre`; else it is drawn like the others.
+    Returns the index of the best row and the number of fitness evaluations, the initial ones included. `history`
+    takes the best sum after each evaluation as far as it is long; pass an empty array for none.
+    """
+    p = parameters
+    hms = p.memory_size
+    low = centre - half_widths
+    high = centre + half_widths
+    # 1. Harmony memory: row 0 is the prediction, the others are uniform in the box.
+    evaluations = 0
+    best = 0
+    for i in range(hms):
+        for j in range(3):
+            memory[i, j] = centre[j] if i == 0 and with_centre else low[j] + rng.random() * (high[j] - low[j])
+        sums[i] = score_sum(packed, points, memory[i, 0], memory[i, 1], memory[i, 2], -2.0)
+        if sums[i] > sums[best]:
+            best = i
+        if evaluations < len(history):
+            history[evaluations] = sums[best]
+        evaluations += 1
+    worst = int(np.argmin(sums))
+
+    new = np.empty(3, dtype=np.float64)
+    bandwidth = np.empty(3, dtype=np.float64)
+    improvisations = 0
+    spent = 0 if p.count_improvisations else evaluations
+    while spent < p.budget:
+        # 2. to 4. HRT improvisations; plain Harmony Search makes them all in one go.
+        in_a_row = p.improvisations_per_pass if p.improvisations_per_pass > 0 else p.budget
+        for _ in range(in_a_row):
+            if spent >= p.budget:
+                break
+            improvisations += 1
+            progress = min((spent + 1.0) / p.budget, 1.0)
+            par = p.par_min + (p.par_max - p.par_min) * progress  # [IHS] eq. 3
+            for j in range(3):  # [IHS] eq. 4
+                ratio = p.bandwidth_min[j] / p.bandwidth_max[j]
+                bandwidth[j] = p.bandwidth_max[j] * exp(log(ratio) * progress)
+            _improvise(memory, low, high, par, bandwidth, p.consideration_rate, rng, new)
+            total = score_sum(packed, points, new[0], new[1], new[2], sums[worst])
+            if total > sums[worst]:
+                memory[worst] = new
+                sums[worst] = total
+                if total > sums[best]:
+                    best = worst
+                worst = int(np.argmin(sums))
+            if evaluations < len(history):
+                history[evaluations] = sums[best]
+            evaluations += 1
+            spent = improvisations if p.count_improvisations else evaluations
+        if p.improvisations_per_pass <= 0:
+            break
+        # HIDE: one pass of DE/rand-to-best/1 over the memory ([M] 5, [DE]); a better row is used at once.
+        for i in range(hms):
+            if spent >= p.budget:
+                break
+            r1 = int(rng.random() * hms)
+            r2 = int(rng.random() * hms)
+            for j in range(3):
+                value = (
+                    memory[i, j]
+                    + p.attraction * (memory[best, j] - memory[i, j])
+                    + p.differential_weight * (memory[r1, j] - memory[r2, j])
+                )
+                new[j] = min(max(value, low[j]), high[j])
+            total = score_sum(packed, points, new[0], new[1], new[2], sums[i])
+            if total > sums[i]:
+                memory[i] = new
+                sums[i] = total
+                if total > sums[best]:
+                    best = i
+            if evaluations < len(history):
+                history[evaluations] = sums[best]
+            evaluations += 1
+            if not p.count_improvisations:
+                spent = evaluations
+        worst = int(np.argmin(sums))
+    return best, evaluations
+
+
+@njit(cache=True, nogil=True)
+def search(
+    packed: F32,
+    points: F32,
+    few_points: F32,
+    centre: F64,
+    half_widths: F64,
+    parameters: SearchParameters,
+    rng: Generator,
+    pose: F64,
+    information: F64,
+    history: F64,
+) -> tuple[float, int, int, int]:
+    """Search the box with restarts; writes the best `pose` (3,) and its `information` (3, 3), see `polish`.
+
+    The restarts improvise on `few_points` (an even choice of the points, for speed), each ends with a polish on
+    all `points`, and the pose that is fittest on all points wins. With `agreement` = k the search ends as soon as k
+    restarts have arrived at the same best pose: an easy match stops early, a hard one goes on. Only the first one is
+    told the prediction, or agreement would be no evidence.
+    Returns the fitness on all points, the evaluations, the restarts made and why it stopped.
+    """
+    p = parameters
+    n = max(len(points), 1)
+    memory = np.empty((p.memory_size, 3), dtype=np.float64)
+    sums = np.empty(p.memory_size, dtype=np.float64)
+    candidate = np.empty(3, dtype=np.float64)
+    candidate_information = np.zeros((3, 3), dtype=np.float64)
+    none = np.empty(0, dtype=np.float64)
+    best_total = -1.0
+    agreed = 0
+    evaluations = 0
+    restart = 0
+    stopped = STOPPED_BUDGET
+    while restart < p.restarts:
+        row, spent = improve_memory(
+            packed,
+            few_points,
+            centre,
+            half_widths,
+            p,
+            rng,
+            memory,
+            sums,
+            history if restart == 0 else none,
+            restart == 0,
+        )
+        restart += 1
+        evaluations += spent
+        candidate[:] = memory[row]
+        if p.polish_iterations > 0:
+            total, spent = polish(packed, points, candidate, p.polish_iterations, candidate_information)
+        else:
+            total = score_sum(packed, points, candidate[0], candidate[1], candidate[2], -2.0)
+            spent = 0 if len(few_points) == len(points) else 1
+        evaluations += spent
+        same = (
+            agreed > 0
+            and abs(candidate[0] - pose[0]) < 1.0
+            and abs(candidate[1] - pose[1]) < 1.0
+            and abs(candidate[2] - pose[2]) < 0.02
+        )
+        if same:
+            agreed += 1
+        elif total > best_total:
+            agreed = 1
+        if total > best_total:
+            best_total = total
+            pose[:] = candidate
+            information[:] = candidate_information
+        if p.restarts > 1 and agreed >= p.agreement:
+            stopped = STOPPED_AGREEMENT
+            break
+    return best_total / n, evaluations, restart, stopped

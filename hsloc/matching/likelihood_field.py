@@ -1,0 +1,131 @@
+"""The field that a scan is matched against: exp(-d / sigma), d being the distance to the nearest wall.
+
+[P] III-B scores a point by exp(-d) with d in metres; sigma generalises its unit. The field is computed on the nodes of
+a grid and is bilinear between them. A node lies in the *centre* of a cell of the map, so that a wall through the
+centres of cells is found where it is, without half a cell of bias.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.errors import MapError
+from hsloc.kernels.fitness import fitness_many, pack, point_scores
+from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hsloc.model.occupancy_grid import OccupancyGrid
+
+    F32 = NDArray[np.float32]
+    F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+class LikelihoodField:
+    """Scores in [0, 1] on the nodes of a grid, packed for the kernels.
+
+    `packed` is float32 of shape (h - 1, w - 1, 4), see hsloc/kernels/fitness.py. `T_map_field` is the pose in the map
+    of node [0, 0], with the x axis along the columns; `resolution` is the distance of two nodes in metres; `sigma` the
+    decay of the score in metres.
+    """
+
+    packed: F32
+    resolution: float
+    T_map_field: Pose2
+    sigma: float
+    walls: F64 | None = None
+    """The points of the map, shape (n, 2) in metres in the map frame, for matchers that pair points (ICP)."""
+
+    @staticmethod
+    def from_scores(
+        scores: F32, resolution: float, T_map_field: Pose2, sigma: float, walls: F64 | None = None
+    ) -> LikelihoodField:
+        """From scores on the nodes, shape (h, w)."""
+        height, width = scores.shape
+        packed = np.empty((height - 1, width - 1, 4), dtype=np.float32)
+        pack(np.ascontiguousarray(scores, dtype=np.float32), packed, 0, height - 1, 0, width - 1)
+        return LikelihoodField(packed, resolution, T_map_field, sigma, walls)
+
+    @staticmethod
+    def from_grid(grid: OccupancyGrid, sigma: float = 0.2, margin: float = 1.0) -> LikelihoodField:
+        """Of the occupied cells of a map (exact Euclidean distance transform), with a `margin` in metres around it.
+
+        Raises MapError for a map without an occupied cell.
+        """
+        from scipy.ndimage import distance_transform_edt
+
+        occupied = grid.occupied()
+        if not occupied.any():
+            raise MapError("the map has no occupied cell; check occupied_thresh and negate in its YAML")
+        pad = max(int(np.ceil(margin / grid.resolution)), 1)
+        distance = distance_transform_edt(~np.pad(occupied, pad)) * grid.resolution
+        scores = np.exp(-distance / sigma).astype(np.float32)
+        corner = (0.5 - pad) * grid.resolution
+        T_map_field = grid.origin @ Pose2(corner, corner, 0.0)
+        return LikelihoodField.from_scores(scores, grid.resolution, T_map_field, sigma, grid.centres(occupied))
+
+    @staticmethod
+    def from_points(
+        points: F64, sigma: float, resolution: float, margin: float, max_distance: float | None = None
+    ) -> LikelihoodField:
+        """Of a set of points, shape (n, 2) in metres: the distances at the nodes are exact.
+
+        `margin` metres around the points are covered; beyond `max_distance` (default: never) the score is zero.
+        """
+        from scipy.spatial import cKDTree
+
+        if len(points) == 0:
+            raise MapError("a map needs at least one point")
+        low = points.min(axis=0) - margin
+        high = points.max(axis=0) + margin
+        width, height = (int(n) for n in np.ceil((high - low) / resolution).astype(int) + 1)
+        xs = low[0] + resolution * np.arange(width)
+        ys = low[1] + resolution * np.arange(height)
+        tree = cKDTree(points)
+        bound = np.inf if max_distance is None else max_distance
+        scores = np.empty((height, width), dtype=np.float32)
+        for row in range(height):
+            nodes = np.column_stack((xs, np.full(width, ys[row])))
+            distance, _ = tree.query(nodes, distance_upper_bound=bound)
+            scores[row] = np.exp(-distance / sigma)
+        T_map_field = Pose2(float(low[0]), float(low[1]), 0.0)
+        return LikelihoodField.from_scores(scores, resolution, T_map_field, sigma, points)
+
+    def to_cells(self, pose: Pose2) -> F64:
+        """A pose in the map as (x, y, theta) in cells of the field, shape (3,)."""
+        if self.T_map_field.theta == 0.0:
+            x, y, theta = pose.x - self.T_map_field.x, pose.y - self.T_map_field.y, pose.theta
+        else:
+            local = self.T_map_field.between(pose)
+            x, y, theta = local.x, local.y, local.theta
+        return np.array((x / self.resolution, y / self.resolution, theta))
+
+    def from_cells(self, cells: F64) -> Pose2:
+        """The inverse of `to_cells`."""
+        return self.T_map_field @ Pose2(
+            float(cells[0]) * self.resolution, float(cells[1]) * self.resolution, wrap_angle(float(cells[2]))
+        )
+
+    def scale(self, points: F64) -> F32:
+        """Points in metres, shape (n, 2), in cells as the kernels want them: float32, contiguous."""
+        return np.ascontiguousarray(points / self.resolution, dtype=np.float32)
+
+    def fitness(self, points: F64, pose: Pose2) -> float:
+        """Mean score of points (n, 2), in metres and seen from `pose`; 0 for no point."""
+        return float(fitness_many(self.packed, self.scale(points), self.to_cells(pose)[None, :])[0])
+
+    def distances(self, points: F64, pose: Pose2 = IDENTITY) -> F64:
+        """Distance in metres from each point, seen from `pose`, to the nearest wall, as the field tells it.
+
+        Infinite outside the field.
+        """
+        scores = np.empty(len(points), dtype=np.float32)
+        x, y, theta = self.to_cells(pose)
+        point_scores(self.packed, self.scale(points), x, y, theta, scores)
+        with np.errstate(divide="ignore"):
+            return -self.sigma * np.log(np.maximum(scores.astype(np.float64), 0.0))

@@ -1,0 +1,48 @@
+"""The box of poses that is searched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.model.pose2 import Pose2, wrap_angle
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """[LB, UB] of [P]: a box of poses around `centre`, with half-widths in metres, metres and radians."""
+
+    centre: Pose2
+    half_x: float
+    half_y: float
+    half_theta: float
+
+    @staticmethod
+    def from_covariance(
+        centre: Pose2, covariance: NDArray[np.float64], sigmas: float, minimum: tuple[float, float]
+    ) -> Window:
+        """The box of `sigmas` standard deviations, at least `minimum` = (metres, radians) and at most half a turn."""
+        spread = sigmas * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        return Window(
+            centre,
+            max(float(spread[0]), minimum[0]),
+            max(float(spread[1]), minimum[0]),
+            min(max(float(spread[2]), minimum[1]), np.pi),
+        )
+
+    def half_widths(self) -> NDArray[np.float64]:
+        """(half_x, half_y, half_theta), shape (3,)."""
+        return np.array((self.half_x, self.half_y, self.half_theta))
+
+    def contains(self, pose: Pose2) -> bool:
+        """Whether a pose lies in the box, its border included."""
+        return (
+            abs(pose.x - self.centre.x) <= self.half_x
+            and abs(pose.y - self.centre.y) <= self.half_y
+            and abs(wrap_angle(pose.theta - self.centre.theta)) <= self.half_theta
+        )

@@ -1,0 +1,182 @@
+"""Compare trajectories with a reference (APE, RPE, per axis) or with checked relations; figures as evo's.
+
+Files are TUM (`t x y z qx qy qz qw`). With --relations a single file is an estimate of its own and needs no
+reference.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import TYPE_CHECKING
+
+from hsloc.errors import EvaluationError
+
+if TYPE_CHECKING:
+    from hsloc.evaluation.metrics import Evaluation
+    from hsloc.evaluation.relations import Relations, RelationsResult
+    from hsloc.evaluation.rpe import Delta
+    from hsloc.evaluation.statistics import Statistics
+    from hsloc.model import Trajectory
+
+HELP = "compare trajectories with a reference"
+
+COLUMNS = ("rmse", "mean", "median", "std", "min", "max", "sse")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Files, how to pair and align them, and what to print."""
+    parser.add_argument("files", nargs="+", metavar="TUM", help="REFERENCE ESTIMATE [ESTIMATE ...]")
+    parser.add_argument(
+        "--alignment", "-a", choices=("none", "origin", "se2", "se3"), default="none",
+        help="move the estimate onto the reference first: by its first pose, or by least squares (default: none)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--t-max-diff", type=_not_negative, default=0.01, metavar="S",
+        help="pair poses at most this far apart in time, seconds (default: 0.01)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--t-offset", type=float, default=0.0, metavar="S", help="seconds to add to the estimate's stamps"
+    )
+    parser.add_argument(
+        "--association", choices=("nearest", "interpolation"), default="nearest",
+        help="take the nearest pose, or interpolate the denser trajectory at the stamps of the other",
+    )  # fmt: skip
+    parser.add_argument(
+        "--delta", type=_positive, default=1.0, metavar="N", help="length of the RPE's pieces (default: 1)"
+    )
+    parser.add_argument("--delta-unit", choices=("m", "s", "frames"), default="m", help="its unit (default: m)")
+    parser.add_argument("--all-pairs", action="store_true", help="RPE: a piece starts at every pose")
+    parser.add_argument("--relations", metavar="FILE", help="score by relations too: `t1 t2 x y z roll pitch yaw`")
+    parser.add_argument(
+        "--no-reference", action="store_true", help="with --relations: all files are estimates, none the reference"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Evaluate each estimate and print one table, or JSON."""
+    from hsloc.evaluation.metrics import format_json
+    from hsloc.evaluation.relations import read_relations
+    from hsloc.evaluation.rpe import Delta
+    from hsloc.evaluation.tum import read_tum
+
+    files: list[str] = arguments.files
+    alone = arguments.relations is not None and (arguments.no_reference or len(files) == 1)
+    if not alone and len(files) == 1:
+        print("hsloc eval: error: give REFERENCE and at least one ESTIMATE, or --relations", file=sys.stderr)
+        return 2
+    if arguments.no_reference and arguments.relations is None:
+        print("hsloc eval: error: --no-reference needs --relations FILE", file=sys.stderr)
+        return 2
+    delta = Delta(arguments.delta, arguments.delta_unit, arguments.all_pairs)
+    relations = None if arguments.relations is None else read_relations(arguments.relations)
+    reference = None if alone else read_tum(files[0])
+    results = {
+        path: _evaluate(path, read_tum(path), reference, relations, delta, arguments)
+        for path in files[0 if alone else 1 :]
+    }
+    if arguments.json:
+        document = {
+            "reference": None if alone else files[0],
+            "relations": arguments.relations,
+            "estimates": [
+                {
+                    "estimate": path,
+                    **({} if evaluation is None else evaluation.to_dict()),
+                    **({} if scored is None else {"relations": scored.to_dict()}),
+                }
+                for path, (evaluation, scored) in results.items()
+            ],
+        }
+        sys.stdout.write(format_json(document))
+    else:
+        print("\n".join(_report(results, delta)))
+    return 0
+
+
+Result = tuple["Evaluation | None", "RelationsResult | None"]
+
+
+def _evaluate(
+    path: str,
+    estimate: Trajectory,
+    reference: Trajectory | None,
+    relations: Relations | None,
+    delta: Delta,
+    arguments: argparse.Namespace,
+) -> Result:
+    from hsloc.evaluation.metrics import evaluate
+    from hsloc.evaluation.relations import evaluate_relations
+
+    try:
+        evaluation = None
+        if reference is not None:
+            evaluation = evaluate(
+                estimate,
+                reference,
+                alignment=arguments.alignment,
+                max_difference_s=arguments.t_max_diff,
+                association=arguments.association,
+                offset_s=arguments.t_offset,
+                deltas=(delta,),
+            )
+        return evaluation, None if relations is None else evaluate_relations(estimate, relations)
+    except EvaluationError as error:
+        raise EvaluationError(f"{path}: {error}") from error
+
+
+def _report(results: dict[str, Result], delta: Delta) -> list[str]:
+    """The lines of the table: each measure once, and under it a row for each estimate."""
+    measures: dict[str, dict[str, Statistics]] = {}
+    lines = []
+    for path, (evaluation, scored) in results.items():
+        if evaluation is not None:
+            lines.append(
+                f"{path}: {evaluation.matched} pairs (unmatched: {evaluation.unmatched_estimate} of the estimate, "
+                f"{evaluation.unmatched_reference} of the reference), alignment {evaluation.alignment}, "
+                f"path {evaluation.length_estimate:.2f} m of {evaluation.length_reference:.2f} m"
+            )
+            x, y, theta = evaluation.axis_rmse
+            lines.append(f"  RMSE by axis: x {x:.4f} m, y {y:.4f} m, theta {theta:.5f} rad")
+            relative = evaluation.rpe[0].statistics
+            measures.setdefault("APE translation (m)", {})[path] = evaluation.ape.trans_part
+            measures.setdefault("APE rotation (deg)", {})[path] = evaluation.ape.angle_deg
+            measures.setdefault(f"RPE translation (m) per {delta}", {})[path] = relative.trans_part
+            measures.setdefault(f"RPE rotation (deg) per {delta}", {})[path] = relative.angle_deg
+        if scored is not None:
+            lines.append(f"{path}: {scored.matched} relations matched, {scored.unmatched} not")
+            measures.setdefault("relations translation (m)", {})[path] = scored.statistics.trans_part
+            measures.setdefault("relations rotation (deg)", {})[path] = scored.statistics.angle_deg
+    return [*lines, "", *_table(measures)]
+
+
+def _table(measures: dict[str, dict[str, Statistics]]) -> list[str]:
+    rows: list[tuple[str, ...]] = [("", *COLUMNS, "n")]
+    for measure, by_path in measures.items():
+        rows.append((measure, *("" for _ in COLUMNS), ""))
+        for path, statistics in by_path.items():
+            numbers = [f"{getattr(statistics, name):.4f}" if statistics.count else "-" for name in COLUMNS]
+            rows.append((f"  {path}", *numbers, str(statistics.count)))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return [
+        "  ".join(
+            cell.ljust(width) if column == 0 else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def _not_negative(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a number of at least 0")
+    return value

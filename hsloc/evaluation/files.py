@@ -1,0 +1,37 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from typing import TYPE_CHECKING
+
+from hsloc.errors import OutputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+    from typing import BinaryIO
+
+
+def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Let `write` fill a file beside `path`, then move it there: a reader never sees half a file.
+
+    Raises `OutputError` where the folder is missing or not writable.
+    """
+    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with beside.open("wb") as stream:
+            write(stream)
+        beside.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from error
+    finally:
+        # Gone already after a good run; after a bad one nothing half-written may stay behind.
+        with contextlib.suppress(OSError):
+            beside.unlink()
+
+
+def write_text_atomically(path: Path, text: str) -> None:
+    """Write UTF-8 text with `\\n` line ends, whole or not at all; raises `OutputError`."""
+    write_atomically(path, lambda stream: stream.write(text.encode("utf-8")))

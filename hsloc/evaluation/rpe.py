@@ -1,0 +1,106 @@
+"""RPE, the relative pose error: how well each piece of the path keeps its shape (evo's `evo_rpe`).
+
+J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012. The pieces are chosen on the
+estimate, as evo does by default.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+
+from hsloc.errors import EvaluationError
+from hsloc.evaluation.association import seconds
+from hsloc.evaluation.statistics import PoseErrors
+from hsloc.model.pose2 import relative_poses
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hsloc.evaluation.association import Pairs
+
+    Indices = NDArray[np.intp]
+
+DeltaUnit = Literal["frames", "m", "s"]
+DELTA_UNITS: tuple[DeltaUnit, ...] = get_args(DeltaUnit)
+
+RELATIVE_TOLERANCE = 0.1
+"""With all pairs, how much longer or shorter than delta a piece may be, as a part of delta (evo's default)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Delta:
+    """Length of a piece: `value` frames, metres of path, or seconds.
+
+    Pieces follow each other end to end; with `all_pairs` a piece starts at every pose.
+    Raises `EvaluationError` for a length that is not positive, or a part of a frame.
+    """
+
+    value: float = 1.0
+    unit: DeltaUnit = "frames"
+    all_pairs: bool = False
+
+    def __post_init__(self) -> None:
+        if self.unit not in DELTA_UNITS:
+            raise EvaluationError(f"delta unit {self.unit!r} is unknown; choose one of {', '.join(DELTA_UNITS)}")
+        if not 0.0 < self.value < float("inf"):
+            raise EvaluationError(f"delta is {self.value:g} {self.unit}; it must be positive")
+        if self.unit == "frames" and self.value != int(self.value):
+            raise EvaluationError(f"delta is {self.value:g} frames; it must be whole")
+
+    def __str__(self) -> str:
+        return f"{self.value:g} {self.unit}"
+
+
+def rpe(pairs: Pairs, delta: Delta) -> PoseErrors:
+    """Errors of the pieces of a path; none where the path is shorter than one piece."""
+    starts, ends = pieces(pairs, delta)
+    moved_reference = relative_poses(pairs.reference[starts], pairs.reference[ends])
+    moved_estimate = relative_poses(pairs.estimate[starts], pairs.estimate[ends])
+    return PoseErrors.of(relative_poses(moved_reference, moved_estimate))
+
+
+def pieces(pairs: Pairs, delta: Delta) -> tuple[Indices, Indices]:
+    """First and last row of each piece, in order."""
+    if delta.unit == "frames":
+        step = int(delta.value)
+        starts = np.arange(0, len(pairs) - step, 1 if delta.all_pairs else step)
+        return starts, starts + step
+    if delta.unit == "m":
+        steps = np.sqrt(np.square(np.diff(pairs.estimate[:, :2], axis=0)).sum(axis=1))
+        return _all_pieces(steps, delta.value) if delta.all_pairs else _pieces_end_to_end(steps, delta.value)
+    # Time, unlike the path, may run backwards in a log: its pieces are cut in the order of time.
+    order = np.argsort(pairs.stamps_ns, kind="stable")
+    steps = np.diff(seconds(pairs.stamps_ns[order] - pairs.stamps_ns[order[0]]))
+    starts, ends = _all_pieces(steps, delta.value) if delta.all_pairs else _pieces_end_to_end(steps, delta.value)
+    return order[starts], order[ends]
+
+
+def _pieces_end_to_end(steps: NDArray[np.float64], length: float) -> tuple[Indices, Indices]:
+    """Cut as soon as the steps since the last cut add up to `length`, and start afresh there."""
+    cuts = [0]
+    gone = 0.0
+    for row, step in enumerate(steps.tolist(), start=1):
+        gone += step
+        if gone >= length:
+            cuts.append(row)
+            gone = 0.0
+    bounds = np.array(cuts, dtype=np.intp)
+    return bounds[:-1], bounds[1:]
+
+
+def _all_pieces(steps: NDArray[np.float64], length: float) -> tuple[Indices, Indices]:
+    """From every row to the later row (the first of several) whose way from it is nearest to `length`."""
+    way = np.concatenate(((0.0,), np.cumsum(steps)))
+    starts = np.arange(len(way) - 1)
+    after = np.clip(np.searchsorted(way, way[starts] + length, side="left"), starts + 1, len(way) - 1)
+    # Where the robot stands, many rows share one way: the first row of the plateau, but after the start.
+    before = np.maximum(np.searchsorted(way, way[after - 1], side="left"), starts + 1)
+    after = np.maximum(np.searchsorted(way, way[after], side="left"), starts + 1)
+    miss_before = np.abs(way[before] - way[starts] - length)
+    miss_after = np.abs(way[after] - way[starts] - length)
+    ends = np.where(miss_before <= miss_after, before, after)
+    near = np.minimum(miss_before, miss_after) <= RELATIVE_TOLERANCE * length
+    return starts[near], ends[near]

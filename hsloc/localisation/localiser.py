@@ -1,0 +1,233 @@
+"""The localiser: where a robot is on a known map, scan by scan.
+
+Predict with odometry as in an EKF, match inside the window that the predicted covariance gives, test, update ([P] V).
+While the pose is unknown the relocaliser has the word.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import radians
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.errors import ConfigError
+from hsloc.localisation.motion import OdometryNoise, fuse, predict_covariance
+from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
+from hsloc.matching.window import Window
+from hsloc.model.estimate import Estimate, Status
+from hsloc.model.events import Odometry, Scan
+from hsloc.model.pose2 import IDENTITY, Pose2
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+    from numpy.typing import NDArray
+
+    from hsloc.matching.likelihood_field import LikelihoodField
+    from hsloc.matching.match import Match, Matcher
+    from hsloc.model.occupancy_grid import OccupancyGrid
+
+    F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocaliserParameters:
+    """When a scan is matched, in which window, and what is believed. Names as in AMCL where the meaning is the same."""
+
+    update_min_d: float = 0.2
+    """A scan is matched after so many metres (m)."""
+    update_min_a: float = 0.2
+    """Or after so much turning (rad)."""
+    min_points: int = 10
+    """A scan with fewer hits is not matched ([P]: more than 5)."""
+    window_sigmas: float = 3.0
+    """Half-width of the window in standard deviations of the prediction."""
+    window_min: float = 0.15
+    """But at least so many metres (m)."""
+    window_min_angle: float = radians(5.0)
+    """And so much of an angle (rad)."""
+    min_fitness: float = 0.3
+    """A match below is refused, whatever was usual before."""
+    usual_fraction: float = 0.7
+    """A match below this part of the usual fitness (of the matches before) is refused."""
+    suspicious_fraction: float = 0.9
+    """Below this part of the usual fitness a match is tried again in wider windows."""
+    lost_after: int = 5
+    """The pose is lost after so many refused matches in a row."""
+    fuse: bool = True
+    """Weigh match and prediction by their covariances (EKF); otherwise the match is the new pose ([P])."""
+    initial_sigma: float = 0.5
+    """Standard deviation of a given start in x and y (m)."""
+    initial_sigma_angle: float = radians(15.0)
+    """And in theta (rad)."""
+    odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
+    relocaliser: RelocaliserParameters = field(default_factory=RelocaliserParameters)
+
+    def __post_init__(self) -> None:
+        for name in ("update_min_d", "update_min_a", "min_fitness"):
+            if not getattr(self, name) >= 0.0:
+                raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be 0 or more")
+        for name in ("window_sigmas", "window_min", "window_min_angle", "initial_sigma", "initial_sigma_angle"):
+            if not getattr(self, name) > 0.0:
+                raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be positive")
+
+
+_WIDER = ((0.5, radians(20.0)), (2.0, radians(45.0)))
+"""Half-widths (m, rad) of the windows tried after a suspicious match."""
+_FORGET = 0.05
+"""Weight of a new match in the usual fitness."""
+
+
+class Localiser:
+    """State: `T_map_odom`, the covariance, and the odometry at the last match. An `Estimator`."""
+
+    def __init__(
+        self,
+        grid: OccupancyGrid,
+        likelihood: LikelihoodField,
+        matcher: Matcher,
+        parameters: LocaliserParameters,
+        rng: Generator,
+        initial_pose: Pose2 | None = None,
+    ) -> None:
+        self._field = likelihood
+        self._matcher = matcher
+        self._parameters = parameters
+        self._rng = rng
+        self._odometry: Odometry | None = None
+        self._T_odom_match: Pose2 | None = None
+        self._T_map_odom = IDENTITY
+        self._T_map_match = IDENTITY if initial_pose is None else initial_pose
+        self._covariance = np.diag(
+            (parameters.initial_sigma**2, parameters.initial_sigma**2, parameters.initial_sigma_angle**2)
+        )
+        self._usual: float | None = None
+        self._rejected = 0
+        self._start_given = initial_pose is not None
+        self._relocaliser = Relocaliser(grid, likelihood, matcher, parameters, rng)
+        self._searching = initial_pose is None
+
+    @property
+    def T_map_odom(self) -> Pose2:
+        """The transform that a ROS localiser would publish."""
+        return self._T_map_odom
+
+    def update(self, event: Odometry | Scan) -> Estimate | None:
+        """Take an event; the estimate at its stamp, or None before the first odometry."""
+        if isinstance(event, Odometry):
+            return self._follow(event)
+        if self._odometry is None:
+            return None
+        return self._search(event) if self._searching else self._localise(event)
+
+    def _follow(self, odometry: Odometry) -> Estimate:
+        """Between matches: compose with the odometry."""
+        if self._T_odom_match is None:
+            self._anchor(self._T_map_match, odometry.T_odom_base)
+        self._odometry = odometry
+        status = Status.SEARCHING if self._searching else Status.PREDICTED
+        return Estimate(odometry.stamp_ns, self._T_map_odom @ odometry.T_odom_base, status)
+
+    def _localise(self, scan: Scan) -> Estimate:
+        odometry = self._odometry
+        assert odometry is not None
+        assert self._T_odom_match is not None
+        p = self._parameters
+        motion = self._T_odom_match.between(odometry.T_odom_base)
+        predicted = self._T_map_match @ motion
+        first = self._usual is None and self._rejected == 0
+        if not first and np.hypot(motion.x, motion.y) < p.update_min_d and abs(motion.theta) < p.update_min_a:
+            return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
+        covariance = predict_covariance(
+            self._covariance, self._T_map_match, motion, p.odometry_noise.covariance(motion)
+        )
+        points = scan.points_base()
+        if len(points) < p.min_points:
+            self._take(predicted, covariance, odometry)
+            return Estimate(scan.stamp_ns, predicted, Status.NO_RETURNS, covariance, reason=f"{len(points)} returns")
+        match, evaluations = self._match(points, predicted, covariance)
+        reason = self._refusal(match)
+        if reason:
+            return self._refuse(scan, predicted, covariance, match, evaluations, reason, odometry)
+        pose, covariance = (
+            fuse(predicted, covariance, match.pose, match.covariance) if p.fuse else (match.pose, match.covariance)
+        )
+        self._rejected = 0
+        self._usual = match.fitness if self._usual is None else self._usual + _FORGET * (match.fitness - self._usual)
+        self._take(pose, covariance, odometry)
+        return Estimate(scan.stamp_ns, pose, Status.MATCHED, covariance, match.fitness, evaluations)
+
+    def _match(self, points: F64, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
+        """Match in the window of the prediction; a suspicious match must beat those of wider windows."""
+        p = self._parameters
+        window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
+        best = self._matcher.match(points, self._field, window, self._rng)
+        evaluations = best.evaluations
+        for half, half_angle in _WIDER if self._usual is not None else ():
+            if best.fitness >= p.suspicious_fraction * (self._usual or 0.0):
+                break
+            wide = Window(
+                predicted, max(window.half_x, half), max(window.half_y, half), max(window.half_theta, half_angle)
+            )
+            match = self._matcher.match(points, self._field, wide, self._rng)
+            evaluations += match.evaluations
+            # A little better is no reason to jump far: ambiguous places look alike.
+            if match.fitness > best.fitness + 0.05:
+                best = match
+        return best, evaluations
+
+    def _refusal(self, match: Match) -> str:
+        """Why a match is not believed; empty if it is."""
+        p = self._parameters
+        if match.fitness < p.min_fitness:
+            return f"fitness {match.fitness:.2f} below {p.min_fitness:.2f}"
+        if self._usual is not None and match.fitness < p.usual_fraction * self._usual:
+            return f"fitness {match.fitness:.2f} far below the usual {self._usual:.2f}"
+        return ""
+
+    def _refuse(
+        self,
+        scan: Scan,
+        predicted: Pose2,
+        covariance: F64,
+        match: Match,
+        evaluations: int,
+        reason: str,
+        odometry: Odometry,
+    ) -> Estimate:
+        """The prediction stands; after too many refusals the pose is lost."""
+        self._rejected += 1
+        self._take(predicted, covariance, odometry)
+        status = Status.REJECTED
+        if self._rejected >= self._parameters.lost_after:
+            self._searching = True
+            self._relocaliser.start()
+            status, reason = Status.SEARCHING, f"lost: {reason}"
+        return Estimate(scan.stamp_ns, predicted, status, covariance, match.fitness, evaluations, reason)
+
+    def _search(self, scan: Scan) -> Estimate:
+        """Let the relocaliser see the scan; take its answer when it is sure."""
+        odometry = self._odometry
+        assert odometry is not None
+        verdict = self._relocaliser.update(scan, odometry.T_odom_base)
+        pose = self._T_map_odom @ odometry.T_odom_base if verdict.pose is None else verdict.pose
+        status = Status.SEARCHING
+        if verdict.is_sure:
+            self._searching = False
+            self._rejected = 0
+            self._usual = verdict.fitness
+            status = Status.RELOCALISED
+        self._take(pose, verdict.covariance, odometry)
+        return Estimate(
+            scan.stamp_ns, pose, status, verdict.covariance, verdict.fitness, verdict.evaluations, verdict.reason
+        )
+
+    def _take(self, pose: Pose2, covariance: F64, odometry: Odometry) -> None:
+        self._covariance = covariance
+        self._anchor(pose, odometry.T_odom_base)
+
+    def _anchor(self, T_map_base: Pose2, T_odom_base: Pose2) -> None:
+        self._T_map_match = T_map_base
+        self._T_odom_match = T_odom_base
+        self._T_map_odom = T_map_base @ T_odom_base.inverse()

@@ -1,0 +1,230 @@
+"""The relocaliser: where on the whole map the robot could be, until one hypothesis wins.
+
+The free space is cut into tiles; HIDE searches each of them over all headings, and what it finds becomes a hypothesis.
+Each further scan moves the hypotheses with the odometry, matches them again in a small window and adds to their record.
+Hypotheses that fall behind are dropped, those that meet are merged. The winner must have been ahead of all others
+over several scans and some way: in a place that exists twice, nobody is sure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import hypot, pi, radians
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.matching.harmony_search import HarmonySearch
+from hsloc.matching.window import Window
+from hsloc.model.pose2 import Pose2, wrap_angle
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+    from numpy.typing import NDArray
+
+    from hsloc.localisation.localiser import LocaliserParameters
+    from hsloc.matching.likelihood_field import LikelihoodField
+    from hsloc.matching.match import Match, Matcher
+    from hsloc.model.events import Scan
+    from hsloc.model.occupancy_grid import OccupancyGrid
+
+    F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelocaliserParameters:
+    """How the whole map is searched, and when one answer is believed."""
+
+    tile: float = 1.5
+    """Side of a tile of free space (m)."""
+    sectors: int = 4
+    """Headings are searched in so many parts."""
+    budget: int = 240
+    """Fitness evaluations in each tile and sector."""
+    search_points: int = 60
+    """Points of the scan used while searching tiles."""
+    hypotheses: int = 60
+    """At most so many are kept."""
+    step_min_d: float = 0.3
+    """A scan counts after so many metres (m)."""
+    step_min_a: float = 0.3
+    """Or after so much turning (rad)."""
+    min_scans: int = 4
+    """Scans before anything is believed."""
+    min_fitness: float = 0.35
+    """Mean fitness of the winner at least."""
+    lead: float = 0.08
+    """The winner's mean fitness must be ahead of every other's by this."""
+    restart_below: float = 0.3
+    """If the best falls below this mean fitness, the search begins anew."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """What the relocaliser thinks after a scan."""
+
+    pose: Pose2 | None
+    covariance: F64
+    fitness: float | None
+    evaluations: int
+    is_sure: bool
+    reason: str
+
+
+@dataclass(slots=True, eq=False)
+class _Hypothesis:
+    pose: Pose2
+    covariance: F64
+    fitness: float
+    total: float
+    scans: int
+
+    @property
+    def mean(self) -> float:
+        return self.total / self.scans
+
+
+_UNKNOWN = np.diag((1e6, 1e6, pi**2))
+_NEAR = 0.5
+_NEAR_ANGLE = radians(15.0)
+_STEP_WINDOW = (0.25, radians(8.0))
+
+
+class Relocaliser:
+    """Searches the whole map; its state is a list of hypotheses."""
+
+    def __init__(
+        self,
+        grid: OccupancyGrid,
+        likelihood: LikelihoodField,
+        matcher: Matcher,
+        parameters: LocaliserParameters,
+        rng: Generator,
+    ) -> None:
+        self._field = likelihood
+        self._matcher = matcher
+        self._parameters = parameters.relocaliser
+        self._min_points = parameters.min_points
+        self._noise = parameters.odometry_noise
+        self._rng = rng
+        self._tiles = _tiles(grid, self._parameters.tile)
+        self._hypotheses: list[_Hypothesis] = []
+        self._T_odom_last: Pose2 | None = None
+
+    def start(self) -> None:
+        """Forget everything."""
+        self._hypotheses = []
+        self._T_odom_last = None
+
+    def update(self, scan: Scan, T_odom_base: Pose2) -> Verdict:
+        """Take a scan and the odometry at its stamp."""
+        p = self._parameters
+        motion = Pose2() if self._T_odom_last is None else self._T_odom_last.between(T_odom_base)
+        moved = hypot(motion.x, motion.y) >= p.step_min_d or abs(motion.theta) >= p.step_min_a
+        if self._hypotheses and not moved:
+            return self._verdict(motion, 0, False)
+        points = scan.points_base()
+        if len(points) < max(self._min_points, 20):
+            return self._verdict(motion, 0, False)
+        self._T_odom_last = T_odom_base
+        if self._hypotheses and max(h.mean for h in self._hypotheses) >= p.restart_below:
+            evaluations = self._advance(points, motion)
+        else:
+            evaluations = self._begin(points)
+        return self._verdict(Pose2(), evaluations, True)
+
+    def _begin(self, points: F64) -> int:
+        """Search every tile; keep the fittest poses that differ."""
+        p = self._parameters
+        quick = self._quick_matcher()
+        half_angle = pi / p.sectors
+        found: list[Match] = []
+        evaluations = 0
+        for x, y in self._tiles:
+            for sector in range(p.sectors):
+                centre = Pose2(x, y, wrap_angle(2.0 * pi * sector / p.sectors))
+                window = Window(centre, 0.6 * p.tile, 0.6 * p.tile, 1.1 * half_angle)
+                match = quick.match(points, self._field, window, self._rng)
+                evaluations += match.evaluations
+                found.append(match)
+        found.sort(key=lambda match: -match.fitness)
+        kept: list[_Hypothesis] = []
+        for match in found:
+            if len(kept) >= p.hypotheses or match.fitness < 0.6 * found[0].fitness:
+                break
+            if not any(_same(match.pose, other.pose) for other in kept):
+                kept.append(_Hypothesis(match.pose, match.covariance, match.fitness, match.fitness, 1))
+        self._hypotheses = kept
+        return evaluations
+
+    def _advance(self, points: F64, motion: Pose2) -> int:
+        """Move the hypotheses, match them again, drop those that fell behind and merge those that met."""
+        evaluations = 0
+        half, half_angle = _STEP_WINDOW
+        spread = 3.0 * np.sqrt(np.diag(self._noise.covariance(motion)))
+        half = max(half, float(spread[:2].max()))
+        half_angle = max(half_angle, float(spread[2]))
+        quick = self._quick_matcher()
+        for hypothesis in self._hypotheses:
+            window = Window(hypothesis.pose @ motion, half, half, half_angle)
+            match = quick.match(points, self._field, window, self._rng)
+            evaluations += match.evaluations
+            hypothesis.pose = match.pose
+            hypothesis.covariance = match.covariance
+            hypothesis.fitness = match.fitness
+            hypothesis.total += match.fitness
+            hypothesis.scans += 1
+        self._hypotheses.sort(key=lambda h: -h.total)
+        best = self._hypotheses[0].mean
+        kept: list[_Hypothesis] = []
+        for hypothesis in self._hypotheses:
+            behind = hypothesis.mean < best - 2.0 * self._parameters.lead
+            if not behind and not any(_same(hypothesis.pose, other.pose) for other in kept):
+                kept.append(hypothesis)
+        self._hypotheses = kept
+        return evaluations
+
+    def _verdict(self, motion: Pose2, evaluations: int, fresh: bool) -> Verdict:
+        if not self._hypotheses:
+            return Verdict(None, _UNKNOWN, None, evaluations, False, "searching the whole map")
+        p = self._parameters
+        best = self._hypotheses[0]
+        rival = self._hypotheses[1].mean if len(self._hypotheses) > 1 else 0.0
+        sure = fresh and best.scans >= p.min_scans and best.mean >= p.min_fitness and best.mean - rival >= p.lead
+        reason = f"{len(self._hypotheses)} hypotheses, best {best.mean:.2f}, next {rival:.2f}, {best.scans} scans"
+        covariance = best.covariance if sure else _UNKNOWN
+        fitness = best.fitness if fresh else None
+        return Verdict(best.pose @ motion, covariance, fitness, evaluations, sure, reason)
+
+    def _quick_matcher(self) -> HarmonySearch | Matcher:
+        """The matcher with a small budget and one restart; a matcher without a budget stays as it is."""
+        if isinstance(self._matcher, HarmonySearch):
+            return replace(
+                self._matcher,
+                budget=self._parameters.budget,
+                count_improvisations=False,
+                restarts=1,
+                search_points=self._parameters.search_points,
+                polish_iterations=10,
+            )
+        return self._matcher
+
+
+def _same(first: Pose2, second: Pose2) -> bool:
+    return first.distance(second) < _NEAR and abs(wrap_angle(first.theta - second.theta)) < _NEAR_ANGLE
+
+
+def _tiles(grid: OccupancyGrid, side: float) -> list[tuple[float, float]]:
+    """Centres (metres, map frame) of the tiles in which a fair part of the cells is free."""
+    free = grid.free()
+    step = max(round(side / grid.resolution), 1)
+    centres: list[tuple[float, float]] = []
+    for row in range(0, free.shape[0], step):
+        for column in range(0, free.shape[1], step):
+            tile = free[row : row + step, column : column + step]
+            if tile.sum() >= 0.04 * step * step:
+                middle = grid.origin @ Pose2(
+                    (column + tile.shape[1] / 2) * grid.resolution, (row + tile.shape[0] / 2) * grid.resolution, 0.0
+                )
+                centres.append((middle.x, middle.y))
+    return centres

@@ -146,9 +146,7 @@ def occupancy_grid(grid: OccupancyGrid, stamp_ns: int, frame_id: str) -> bytes:
     info = _MAP_INFO.pack(seconds, nanoseconds, grid.resolution, width, height)
     padding = b"\0" * (-(8 + len(names) + len(info)) % 8)
     cells = np.ascontiguousarray(grid.cells, dtype=np.int8).tobytes()
-    return b"".join(
-        (ENCAPSULATION, stamp, names, info, padding, _pose(grid.origin), _COUNT.pack(len(cells)), cells)
-    )
+    return b"".join((ENCAPSULATION, stamp, names, info, padding, _pose(grid.origin), _COUNT.pack(len(cells)), cells))
 
 
 def pose_stamped(stamp_ns: int, pose: Pose2, frame_id: str) -> bytes:

@@ -6,7 +6,7 @@ Everything is projected to the plane in one place, at the end: `laser_mounting`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import sqrt
+from math import acos, atan2, hypot, sqrt
 
 from hsloc.model import Pose2
 
@@ -76,3 +76,101 @@ class Transform3:
         turned = Transform3((0.0, 0.0, 0.0), (-x, -y, -z, w))
         tx, ty, tz = turned.rotate(self.translation)
         return Transform3((-tx, -ty, -tz), turned.rotation)
+
+
+MOVED_METRES = 1e-3
+MOVED_RADIANS = 2e-3
+"""From here on a mounting counts as moving: the noise of a joint's encoder stays below."""
+
+
+class FrameTree:
+    """Frames and their parents, as far as a log states them; what comes later overrides."""
+
+    def __init__(self) -> None:
+        self._links: dict[str, tuple[str, Transform3]] = {}
+        self._moving: set[str] = set()
+
+    def add(self, parent: str, child: str, transform: Transform3) -> None:
+        """State (or restate) a frame's pose in its parent's."""
+        transform = transform.normalised()
+        known = self._links.get(child)
+        if known is not None and (known[0] != parent or _moved(known[1], transform)):
+            self._moving.add(child)
+        self._links[child] = (parent, transform)
+
+    def __contains__(self, frame: str) -> bool:
+        return frame in self._links or any(parent == frame for parent, _ in self._links.values())
+
+    def frames(self) -> list[str]:
+        """All frames, sorted."""
+        return sorted(self._links.keys() | {parent for parent, _ in self._links.values()})
+
+    def children(self) -> set[str]:
+        """All frames that have a parent."""
+        return set(self._links)
+
+    def is_moving(self, frame: str) -> bool:
+        """Whether the frame's pose in its parent's changed."""
+        return frame in self._moving
+
+    def _ancestry(self, frame: str) -> list[str]:
+        """The frame, its parent, and so on; ends at the root, or where a loop would close."""
+        line = [frame]
+        while (link := self._links.get(line[-1])) and link[0] not in line:
+            line.append(link[0])
+        return line
+
+    def path(self, target: str, source: str) -> tuple[list[str], list[str]] | None:
+        """Frames to climb from target and from source to their nearest common ancestor; None without one."""
+        up_target, up_source = self._ancestry(target), self._ancestry(source)
+        common = next((frame for frame in up_source if frame in up_target), None)
+        if common is None:
+            return None
+        return up_target[: up_target.index(common)], up_source[: up_source.index(common)]
+
+    def lookup(self, target: str, source: str) -> Transform3 | None:
+        """T_target_source, or None where the frames are not connected."""
+        path = self.path(target, source)
+        if path is None:
+            return None
+        from_target, from_source = (self._climb(frames) for frames in path)
+        return from_target.inverse() @ from_source
+
+    def _climb(self, frames: list[str]) -> Transform3:
+        """The pose of the first frame in the parent of the last."""
+        total = Transform3()
+        for frame in frames:
+            total = self._links[frame][1] @ total
+        return total
+
+
+def _moved(first: Transform3, second: Transform3) -> bool:
+    change = first.inverse() @ second
+    x, y, z, w = change.rotation
+    angle = 2.0 * atan2(sqrt(x * x + y * y + z * z), abs(w))
+    return hypot(*change.translation) > MOVED_METRES or angle > MOVED_RADIANS
+
+
+@dataclass(frozen=True, slots=True)
+class Mounting:
+    """How a laser is mounted, as far as the plane can tell.
+
+    `flipped` lasers are upside-down: their angles count clockwise. `tilt` (radians) is the angle between the
+    laser's plane and the base's.
+    """
+
+    T_base_laser: Pose2
+    flipped: bool = False
+    tilt: float = 0.0
+
+
+def laser_mounting(T_base_laser: Transform3) -> Mounting:
+    """Project a mounting to the plane.
+
+    As AMCL does (it moves angle_min and angle_min + angle_increment to the base and takes the sign of what comes
+    out): the laser's x axis gives the direction, the sign of its z axis says whether angles are negated.
+    """
+    ux, uy, _ = T_base_laser.rotate((1.0, 0.0, 0.0))
+    *_, up = T_base_laser.rotate((0.0, 0.0, 1.0))
+    x, y, _ = T_base_laser.translation
+    return Mounting(Pose2(x, y, atan2(uy, ux)), up < 0.0, acos(min(abs(up), 1.0)))

@@ -57,9 +57,7 @@ class LogWriter:
         self._schemas: dict[str, int] = {}
         self._sequences: dict[int, int] = {}
         if self.target.is_dir():
-            raise OutputError(
-                f"{self.target}: is a folder; name a file to write, such as {self.target / 'run.mcap'}"
-            )
+            raise OutputError(f"{self.target}: is a folder; name a file to write, such as {self.target / 'run.mcap'}")
         try:
             self._stream: BinaryIO = self._partial.open("wb")
         except OSError as error:
@@ -213,9 +211,7 @@ class LogWriter:
     def _add(self, topic: str, typename: str, stamp_ns: int, data: bytes, log_time_ns: int | None) -> None:
         log_time = stamp_ns if log_time_ns is None else log_time_ns
         if not 0 <= log_time < 2**64:
-            raise OutputError(
-                f"{self.target}: log time {log_time} ns of {topic} does not fit MCAP (0 to 2^64 - 1)"
-            )
+            raise OutputError(f"{self.target}: log time {log_time} ns of {topic} does not fit MCAP (0 to 2^64 - 1)")
         try:
             channel = self._channels.get((topic, typename)) or self._register(topic, typename)
             sequence = self._sequences[channel]
@@ -236,6 +232,4 @@ class LogWriter:
 
     def _error(self, error: OSError) -> OutputError:
         reason = error.strerror or str(error)
-        return OutputError(
-            f"{self.target}: cannot be written ({reason}); check the folder, its rights and free space"
-        )
+        return OutputError(f"{self.target}: cannot be written ({reason}); check the folder, its rights and free space")

@@ -1,0 +1,65 @@
+"""What a log file is to the reader: channels, and raw messages in the order of their log time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from hsloc.log.summary import Losses, TopicStatistics
+
+RawMessage = tuple[int, int, int, "memoryview | bytes"]
+"""(log time in ns, position in the file, id of the channel, payload). Positions are unique in a file."""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One stream of messages: the type in ROS 2's spelling, and how payload and schema are encoded.
+
+    `message_encoding` is `cdr`, `ros1`, `json`, `protobuf` ..., `schema_encoding` is `ros2msg`, `ros2idl`,
+    `ros1msg` ... or empty where the log holds no definition.
+    """
+
+    id: int
+    topic: str
+    typename: str
+    message_encoding: str
+    schema_encoding: str = ""
+    schema: bytes = b""
+
+
+class Container(Protocol):
+    """A file, or a folder that is one recording.
+
+    Law: `messages` yields every readable message of the wanted channels exactly once, in the order of
+    (log time, position) as far as a bounded memory allows; what it cannot read it counts in `losses`. It raises
+    nothing but LogError. `losses_at_opening` holds what was already lost when the file was opened.
+    """
+
+    @property
+    def path(self) -> Path: ...  # noqa: D102
+    @property
+    def format(self) -> str: ...  # noqa: D102
+    @property
+    def profile(self) -> str: ...  # noqa: D102
+    @property
+    def channels(self) -> Mapping[int, Channel]: ...  # noqa: D102
+    @property
+    def statistics(self) -> Mapping[int, TopicStatistics]: ...  # noqa: D102
+    @property
+    def metadata(self) -> Mapping[str, Mapping[str, str]]: ...  # noqa: D102
+    @property
+    def losses_at_opening(self) -> Losses: ...  # noqa: D102
+    @property
+    def warnings(self) -> Sequence[str]: ...  # noqa: D102
+
+    def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
+        """Messages of the wanted channels."""
+        ...
+
+    def verify(self) -> Losses:
+        """Read everything and count what is damaged."""
+        ...

@@ -1,0 +1,194 @@
+"""Feeds: from a decoded message of a chosen topic to events of the model."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import TYPE_CHECKING, Any, Protocol
+
+from hsloc.log import definitions
+from hsloc.model import Odometry, Pose2, Scan, Truth
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from hsloc.log.decode import LinkMessage, OdometryMessage, PoseMessage, ScanMessage
+    from hsloc.log.frames import Mountings
+    from hsloc.log.ordering import TopicClock
+    from hsloc.log.summary import Losses
+    from hsloc.log.transforms import Transform3
+    from hsloc.model import Event
+
+    Stamped = tuple[TopicClock, Event]
+
+MAP_FRAME = "map"
+MAX_ABS = 1e7
+"""Coordinates beyond (metres) are taken for damage; the Earth's circumference is 4e7."""
+
+
+class Feed(Protocol):
+    """Turns messages into events. What holds no usable values is counted as invalid and gives nothing."""
+
+    @property
+    def topic(self) -> str: ...  # noqa: D102
+    @property
+    def typename(self) -> str: ...  # noqa: D102
+    @property
+    def clocks(self) -> tuple[TopicClock, ...]: ...  # noqa: D102
+
+    def events(self, message: Any, log_time_ns: int) -> Iterable[Stamped]:
+        """The events of one message."""
+        ...
+
+
+def is_usable(pose: Pose2) -> bool:
+    """Whether a pose is finite and on this planet."""
+    return pose.is_finite() and abs(pose.x) < MAX_ABS and abs(pose.y) < MAX_ABS
+
+
+class ScanFeed:
+    """sensor_msgs/LaserScan to Scan, with the laser's mounting."""
+
+    typename = definitions.LASER_SCAN
+
+    def __init__(self, clock: TopicClock, mountings: Mountings, losses: Losses) -> None:
+        self.topic = clock.topic
+        self.clocks = (clock,)
+        self._clock = clock
+        self._mountings = mountings
+        self._losses = losses
+
+    def events(self, message: ScanMessage, log_time_ns: int) -> Iterable[Stamped]:
+        """One scan."""
+        stamp = self._clock.stamp(message.stamp_ns, log_time_ns)
+        if stamp is None:
+            return ()
+        _, frame, angle_min, increment, time_increment, range_min, range_max, ranges, intensities = message
+        if (
+            not (isfinite(angle_min) and isfinite(increment) and range_max > 0.0)
+            or abs(angle_min) > 1e3
+            or abs(increment) > 1e3
+        ):
+            self._losses.invalid_messages[self.topic] += 1
+            return ()
+        mounting = self._mountings.of(frame)
+        if mounting.flipped:
+            angle_min, increment = -angle_min, -increment
+        if not isfinite(time_increment):
+            time_increment = 0.0
+        scan = Scan(
+            stamp,
+            ranges,
+            angle_min,
+            increment,
+            range_min if isfinite(range_min) else 0.0,
+            range_max,
+            time_increment,
+            mounting.T_base_laser,
+            frame,
+            intensities,
+        )
+        return ((self._clock, scan),)
+
+
+class OdometryFeed:
+    """nav_msgs/Odometry to Odometry, or to Truth."""
+
+    typename = definitions.ODOMETRY
+
+    def __init__(self, clock: TopicClock, losses: Losses, is_truth: bool, T_child_base: Pose2 | None = None) -> None:
+        """`T_child_base` leads from the frame that the messages speak of to the base, where these differ."""
+        self.topic = clock.topic
+        self.clocks = (clock,)
+        self._clock = clock
+        self._losses = losses
+        self._is_truth = is_truth
+        self._T_child_base = T_child_base
+
+    def events(self, message: OdometryMessage, log_time_ns: int) -> Iterable[Stamped]:
+        """One pose."""
+        stamp = self._clock.stamp(message.stamp_ns, log_time_ns)
+        if stamp is None:
+            return ()
+        if not is_usable(message.pose):
+            self._losses.invalid_messages[self.topic] += 1
+            return ()
+        pose = message.pose if self._T_child_base is None else message.pose @ self._T_child_base
+        if self._is_truth:
+            return ((self._clock, Truth(stamp, pose)),)
+        return ((self._clock, Odometry(stamp, pose, message.covariance)),)
+
+
+class PoseFeed:
+    """geometry_msgs/PoseStamped and PoseWithCovarianceStamped to Truth."""
+
+    def __init__(self, clock: TopicClock, losses: Losses, typename: str) -> None:
+        self.typename = typename
+        self.topic = clock.topic
+        self.clocks = (clock,)
+        self._clock = clock
+        self._losses = losses
+
+    def events(self, message: PoseMessage, log_time_ns: int) -> Iterable[Stamped]:
+        """One pose."""
+        stamp = self._clock.stamp(message.stamp_ns, log_time_ns)
+        if stamp is None:
+            return ()
+        if not is_usable(message.pose):
+            self._losses.invalid_messages[self.topic] += 1
+            return ()
+        return ((self._clock, Truth(stamp, message.pose)),)
+
+
+class TransformFeed:
+    """tf2_msgs/TFMessage to Odometry (odom -> base) and Truth (map -> odom -> base), as asked for."""
+
+    typename = definitions.TF_MESSAGE
+
+    def __init__(
+        self,
+        topic: str,
+        frames: tuple[str | None, str],
+        odometry: TopicClock | None,
+        truth: TopicClock | None,
+        losses: Losses,
+    ) -> None:
+        """`frames` are the odometry's (None where the map is the base's parent) and the base's."""
+        self.topic = topic
+        self.clocks = tuple(clock for clock in (odometry, truth) if clock is not None)
+        self._odom_frame, self._base_frame = frames
+        self._odometry = odometry
+        self._truth = truth
+        self._losses = losses
+        self._T_map_odom: Transform3 | None = None
+
+    def events(self, message: list[LinkMessage], log_time_ns: int) -> Iterable[Stamped]:
+        """Events of the links that matter."""
+        found: list[Stamped] = []
+        for link in message:
+            if link.parent == MAP_FRAME and link.child == self._odom_frame:
+                self._T_map_odom = link.transform.normalised()
+            elif link.child == self._base_frame and link.parent == (self._odom_frame or MAP_FRAME):
+                found += self._base(link, log_time_ns)
+        return found
+
+    def _base(self, link: LinkMessage, log_time_ns: int) -> Iterable[Stamped]:
+        transform = link.transform.normalised()
+        pose = transform.to_pose2()
+        if not is_usable(pose):
+            self._losses.invalid_messages[self.topic] += 1
+            return
+        if self._odometry is not None:
+            stamp = self._odometry.stamp(link.stamp_ns, log_time_ns)
+            if stamp is not None:
+                yield self._odometry, Odometry(stamp, pose)
+        if self._truth is None:
+            return
+        stamp = self._truth.stamp(link.stamp_ns, log_time_ns)
+        if stamp is None:
+            return
+        if self._odom_frame is None:
+            yield self._truth, Truth(stamp, pose)
+        elif self._T_map_odom is not None:
+            T_map_base = (self._T_map_odom @ transform).to_pose2()
+            if is_usable(T_map_base):
+                yield self._truth, Truth(stamp, T_map_base)

@@ -1,0 +1,125 @@
+"""Where the laser stands on the robot, and which frame is the robot: from /tf_static, /tf, or the user."""
+
+from __future__ import annotations
+
+from math import degrees, radians
+from typing import TYPE_CHECKING
+
+from hsloc.log import definitions
+from hsloc.log.decoders import Undecodable, canonical_type, decoder_for, is_decodable
+from hsloc.log.summary import Losses
+from hsloc.log.topics import TF, TF_STATIC, has_name
+from hsloc.log.transforms import FrameTree, Mounting, Transform3, laser_mounting
+from hsloc.model import IDENTITY, Pose2
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from hsloc.log.container import Container
+    from hsloc.log.decode import LinkMessage
+
+BASE_FRAMES = ("base_footprint", "base_link", "base")
+"""Names to try where no odometry names the base, in this order."""
+TILT_WARNING = radians(3.0)
+
+
+def read_links(containers: Sequence[Container], topic: str, limit: int | None = None) -> Iterator[LinkMessage]:
+    """All transforms on a topic, in the order of the log; at most `limit` messages of each file."""
+    for container in containers:
+        decoders = {
+            channel.id: decoder_for(channel)
+            for channel in container.channels.values()
+            if has_name(channel, topic)
+            and canonical_type(channel.typename) == definitions.TF_MESSAGE
+            and is_decodable(channel)
+        }
+        if not decoders:
+            continue
+        # Damage is counted when the log is read for its events.
+        for number, (_, _, channel, data) in enumerate(container.messages(decoders.keys(), Losses())):
+            if limit is not None and number >= limit:
+                break
+            try:
+                yield from decoders[channel](data)
+            except Undecodable:
+                continue
+
+
+class Mountings:
+    """The mounting of each laser frame; `warnings` grows with what had to be assumed."""
+
+    def __init__(self, containers: Sequence[Container], base_frame: str | None, override: Pose2 | None) -> None:
+        self._containers = containers
+        self._override = override
+        self._static = FrameTree()
+        for link in read_links(containers, TF_STATIC):
+            self._static.add(link.parent, link.child, link.transform)
+        self._all: FrameTree | None = None
+        self._known: dict[str, tuple[Mounting, str]] = {}
+        self.warnings: list[str] = []
+        self.base_frame = base_frame if base_frame is not None else self._guessed_base()
+
+    def of(self, laser_frame: str) -> Mounting:
+        """The mounting of a laser's frame."""
+        return self.found(laser_frame)[0]
+
+    def found(self, laser_frame: str) -> tuple[Mounting, str]:
+        """The mounting, and where it comes from: `option`, `/tf_static`, `/tf` or `identity`."""
+        known = self._known.get(laser_frame)
+        if known is None:
+            known = self._known[laser_frame] = self._find(laser_frame)
+        return known
+
+    def between(self, target: str, source: str) -> Transform3 | None:
+        """T_target_source from all that the log knows, or None."""
+        transform = self._static.lookup(target, source)
+        return transform if transform is not None else self._whole_tree().lookup(target, source)
+
+    def _find(self, laser: str) -> tuple[Mounting, str]:
+        if self._override is not None:
+            return Mounting(self._override), "option"
+        base = self.base_frame
+        if base is not None and base == laser:
+            return Mounting(IDENTITY), "same frame"
+        if base is not None:
+            transform, source = self._static.lookup(base, laser), TF_STATIC
+            if transform is None:
+                tree = self._whole_tree()
+                transform, source = tree.lookup(base, laser), TF
+                self._warn_if_moving(tree, base, laser)
+            if transform is not None:
+                mounting = laser_mounting(transform)
+                if mounting.tilt > TILT_WARNING:
+                    self.warnings.append(
+                        f"the laser {laser} is tilted by {degrees(mounting.tilt):.1f} deg; "
+                        "ranges are used as if it were level"
+                    )
+                return mounting, source
+        self.warnings.append(
+            f"no transform from {base or 'the base'} to {laser or 'the laser'} in /tf_static or /tf: the laser is "
+            "taken to stand in the base's place; give --laser-pose x,y,yaw"
+        )
+        return Mounting(IDENTITY), "identity"
+
+    def _whole_tree(self) -> FrameTree:
+        """Static and dynamic transforms, the latest of each; static ones win."""
+        if self._all is None:
+            self._all = FrameTree()
+            static = self._static.children()
+            for link in read_links(self._containers, TF):
+                if link.child not in static:
+                    self._all.add(link.parent, link.child, link.transform)
+            for link in read_links(self._containers, TF_STATIC):
+                self._all.add(link.parent, link.child, link.transform)
+        return self._all
+
+    def _warn_if_moving(self, tree: FrameTree, base: str, laser: str) -> None:
+        path = tree.path(base, laser)
+        moving = sorted(frame for frame in (path[0] + path[1] if path else ()) if tree.is_moving(frame))
+        if moving:
+            self.warnings.append(
+                f"the laser's mounting moves during the log ({', '.join(moving)}); its last pose is taken for all"
+            )
+
+    def _guessed_base(self) -> str | None:
+        return next((frame for frame in BASE_FRAMES if frame in self._static), None)

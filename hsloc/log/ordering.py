@@ -1,0 +1,142 @@
+"""Events in a total, repeatable order of time, with a bounded memory.
+
+Logs are written in the order of arrival; estimators want the order of measurement, the header stamps'. Both can
+be wrong: stamps of real logs run backwards, jump, or are missing. So each topic has an *effective* stamp that never
+runs backwards within the topic (the order of the log is right there), and events are ordered by
+
+    (effective stamp, raised or not, odometry < scan < truth, order of the log)
+
+where *raised* are those whose own stamp had run backwards: they keep their order among each other.
+"""
+
+from __future__ import annotations
+
+from operator import itemgetter
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from hsloc.log.summary import Losses
+    from hsloc.model import Event
+
+KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH = 0, 1, 2
+
+WINDOW_NS = 2_000_000_000
+"""An event waits at most this long (log time) for events of other topics that belong before it."""
+JUMP_NS = 10_000_000_000
+"""A stamp further than this from the topic's last one (beyond what the log time advanced) is not trusted, unless
+the next one agrees with it."""
+MAX_PENDING = 20_000
+_BATCH = 64
+
+
+class TopicClock:
+    """Effective stamps of one topic.
+
+    `shares_log_clock` says whether header stamps and log times are of one clock, so that a missing stamp can be
+    replaced.
+    """
+
+    __slots__ = ("_last_log_ns", "_last_own_ns", "_losses", "_suspect", "kind", "last_ns", "shares_log_clock", "topic")
+
+    def __init__(self, topic: str, kind: int, losses: Losses, shares_log_clock: bool = True) -> None:
+        self.topic = topic
+        self.kind = kind
+        self.shares_log_clock = shares_log_clock
+        self.last_ns: int | None = None
+        self._last_log_ns = 0
+        self._last_own_ns = 0
+        self._suspect = False
+        self._losses = losses
+
+    def stamp(self, stamp_ns: int, log_time_ns: int) -> int | None:
+        """The stamp to use for a message: its own, the log's where it has none, None where it must be dropped."""
+        if stamp_ns != 0 or log_time_ns == 0:
+            return stamp_ns
+        if not self.shares_log_clock:
+            self._losses.stamps_zero_dropped[self.topic] += 1
+            return None
+        self._losses.stamps_zero[self.topic] += 1
+        return log_time_ns
+
+    def effective(self, stamp_ns: int, log_time_ns: int) -> tuple[int, bool]:
+        """(effective stamp, whether it was raised) for the topic's next message."""
+        last = self.last_ns
+        if last is not None and stamp_ns < self._last_own_ns:
+            self._losses.stamps_backwards[self.topic] += 1
+        self._last_own_ns = stamp_ns
+        if last is None:
+            self.last_ns, self._last_log_ns = stamp_ns, log_time_ns
+            return stamp_ns, False
+        advance = max(log_time_ns - self._last_log_ns, 0)
+        self._last_log_ns = log_time_ns
+        if -JUMP_NS <= stamp_ns - last <= JUMP_NS + advance:
+            self._suspect = False
+            if stamp_ns >= last:
+                self.last_ns = stamp_ns
+                return stamp_ns, False
+            return last, True
+        self._losses.stamp_jumps[self.topic] += 1
+        if self._suspect:  # Two in a row: the clock was set.
+            self._suspect = False
+            self.last_ns = stamp_ns
+            return stamp_ns, False
+        self._suspect = True
+        return last, True
+
+
+Keyed = tuple[int, int, int, int, int, "Event"]
+"""(effective stamp, raised, kind, number, log time, event); the number makes keys unique."""
+
+
+class Reorder:
+    """Takes events in the order of the log, gives them in the order of time."""
+
+    def __init__(self, clocks: Sequence[TopicClock], losses: Losses) -> None:
+        self._clocks = clocks
+        self._losses = losses
+        self._pending: list[Keyed] = []
+        self._number = 0
+        self._released_ns: int | None = None
+
+    def push(self, clock: TopicClock, event: Event, log_time_ns: int) -> bool:
+        """Take an event; true when it is time to ask for `ready`."""
+        effective, raised = clock.effective(event.stamp_ns, log_time_ns)
+        self._number += 1
+        kind = 0 if raised else clock.kind
+        self._pending.append((effective, raised, kind, self._number, log_time_ns, event))
+        return len(self._pending) % _BATCH == 0
+
+    def ready(self) -> Iterator[tuple[int, Event]]:
+        """Events that nothing can come before any more, or that waited long enough, with effective stamps."""
+        pending = self._pending
+        pending.sort(key=itemgetter(0, 1, 2, 3))
+        cut = self._cut(pending)
+        released, self._pending = pending[:cut], pending[cut:]
+        return self._released(released)
+
+    def rest(self) -> Iterator[tuple[int, Event]]:
+        """Everything that still waits, at the end of the log."""
+        released, self._pending = sorted(self._pending, key=itemgetter(0, 1, 2, 3)), []
+        return self._released(released)
+
+    def _cut(self, pending: list[Keyed]) -> int:
+        stamps = [clock.last_ns for clock in self._clocks]
+        known = [stamp for stamp in stamps if stamp is not None]
+        floor = min(known) if len(known) == len(stamps) else None
+        newest = max(item[4] for item in pending) if pending else 0
+        aged = newest - WINDOW_NS
+        cut = 0
+        for index, item in enumerate(pending):
+            if (floor is not None and item[0] < floor) or item[4] < aged:
+                cut = index + 1
+        return max(cut, len(pending) // 2) if len(pending) > MAX_PENDING else cut
+
+    def _released(self, items: list[Keyed]) -> Iterator[tuple[int, Event]]:
+        for effective, *_, event in items:
+            if self._released_ns is not None and effective < self._released_ns:
+                self._losses.late_messages += 1
+            else:
+                self._released_ns = effective
+            yield effective, event

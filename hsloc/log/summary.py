@@ -1,0 +1,194 @@
+"""What a log holds, what is read from it and how, and what was lost on the way."""
+
+from __future__ import annotations
+
+from collections import Counter
+from copy import deepcopy
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from hsloc.model import IDENTITY, Pose2
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+NANOSECONDS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """How to read a log. None means: find out.
+
+    `truth_topic` may be `"tf"`: the truth is then map -> odom -> base of /tf. `base_frame` names the frame of the
+    robot's base, `laser_pose` overrides the mounting T_base_laser that the log states. `start_s` and `end_s` cut
+    a half-open window, in seconds from the first event of the chosen topics. Without `require_scan` or
+    `require_odometry` a missing or ambiguous topic is a warning, not an error.
+    """
+
+    scan_topic: str | None = None
+    odom_topic: str | None = None
+    truth_topic: str | None = None
+    base_frame: str | None = None
+    laser_pose: Pose2 | None = None
+    start_s: float | None = None
+    end_s: float | None = None
+    require_scan: bool = True
+    require_odometry: bool = True
+
+
+@dataclass(slots=True)
+class TopicStatistics:
+    """Counts and times of one topic, filled message by message or from an index."""
+
+    count: int = 0
+    first_ns: int | None = None
+    last_ns: int | None = None
+    largest_gap_ns: int = 0
+
+    def add(self, first_ns: int, last_ns: int, count: int, inner_gap_ns: int) -> None:
+        """Add `count` messages between two log times, with their largest gap between neighbours."""
+        if self.last_ns is not None:
+            self.largest_gap_ns = max(self.largest_gap_ns, first_ns - self.last_ns)
+        self.largest_gap_ns = max(self.largest_gap_ns, inner_gap_ns)
+        self.first_ns = first_ns if self.first_ns is None else min(self.first_ns, first_ns)
+        self.last_ns = last_ns if self.last_ns is None else max(self.last_ns, last_ns)
+        self.count += count
+
+
+@dataclass(frozen=True, slots=True)
+class TopicSummary:
+    """A topic: its message type as in ROS 2, how it is encoded, how many messages, how often (by log time)."""
+
+    topic: str
+    typename: str
+    encoding: str
+    count: int
+    first_ns: int | None
+    last_ns: int | None
+    largest_gap_s: float
+
+    @property
+    def rate_hz(self) -> float:
+        """Mean rate; 0 where it cannot be told."""
+        if self.count < 2 or self.first_ns is None or self.last_ns is None or self.last_ns <= self.first_ns:
+            return 0.0
+        return (self.count - 1) * NANOSECONDS / (self.last_ns - self.first_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class LogSummary:
+    """What a log holds and what hsloc takes from it.
+
+    `start_ns` and `end_ns` are log times of the first and last message of any topic (0 and 0 in an empty log);
+    `origin_ns` is the stamp of the first event, from which `ReadOptions.start_s` counts. `extrinsics` says where
+    T_base_laser comes from: `/tf_static`, `/tf`, `option`, `file format` or `identity`. `order` is `stamp` (events
+    in the order of their header stamps) or `log` (in the order of the log, where that is the true one).
+    """
+
+    paths: tuple[Path, ...]
+    format: str
+    profile: str = ""
+    start_ns: int = 0
+    end_ns: int = 0
+    origin_ns: int = 0
+    topics: tuple[TopicSummary, ...] = ()
+    scan_topic: str | None = None
+    odom_topic: str | None = None
+    truth_topic: str | None = None
+    reference_candidates: tuple[str, ...] = ()
+    odom_frame: str | None = None
+    base_frame: str | None = None
+    laser_frame: str | None = None
+    T_base_laser: Pose2 = IDENTITY
+    laser_flipped: bool = False
+    extrinsics: str = "identity"
+    order: str = "stamp"
+    metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last message, seconds of log time."""
+        return (self.end_ns - self.start_ns) / NANOSECONDS
+
+
+REASONS_KEPT = 50
+
+
+@dataclass(slots=True)
+class Losses:
+    """What could not be read, counted while reading, and oddities of time that were put in order.
+
+    `reasons` are lines for people, at most 50 of them.
+    """
+
+    damaged_chunks: int = 0
+    unknown_compression: Counter[str] = field(default_factory=Counter)
+    bytes_lost: int = 0
+    truncated_files: int = 0
+    undecodable_messages: Counter[str] = field(default_factory=Counter)
+    invalid_messages: Counter[str] = field(default_factory=Counter)
+    stamps_backwards: Counter[str] = field(default_factory=Counter)
+    stamp_jumps: Counter[str] = field(default_factory=Counter)
+    stamps_zero: Counter[str] = field(default_factory=Counter)
+    stamps_zero_dropped: Counter[str] = field(default_factory=Counter)
+    late_messages: int = 0
+    reasons: list[str] = field(default_factory=list)
+
+    @property
+    def data_lost(self) -> bool:
+        """Whether part of the input is missing from what was read (the command line then ends with 3)."""
+        return bool(
+            self.damaged_chunks
+            or self.unknown_compression
+            or self.bytes_lost
+            or self.truncated_files
+            or self.undecodable_messages
+        )
+
+    def note(self, reason: str) -> None:
+        """Keep a line for people, once."""
+        if len(self.reasons) < REASONS_KEPT and reason not in self.reasons:
+            self.reasons.append(reason)
+
+    def add(self, other: Losses) -> None:
+        """Add what another part of the log lost."""
+        self.damaged_chunks += other.damaged_chunks
+        self.bytes_lost += other.bytes_lost
+        self.truncated_files += other.truncated_files
+        self.late_messages += other.late_messages
+        self.unknown_compression.update(other.unknown_compression)
+        self.undecodable_messages.update(other.undecodable_messages)
+        self.invalid_messages.update(other.invalid_messages)
+        self.stamps_backwards.update(other.stamps_backwards)
+        self.stamp_jumps.update(other.stamp_jumps)
+        self.stamps_zero.update(other.stamps_zero)
+        self.stamps_zero_dropped.update(other.stamps_zero_dropped)
+        for reason in other.reasons:
+            self.note(reason)
+
+    def copy(self) -> Losses:
+        """An independent copy."""
+        return deepcopy(self)
+
+    def lines(self) -> list[str]:
+        """Everything counted, in words; empty where nothing happened."""
+        named = (
+            ("messages could not be decoded", self.undecodable_messages),
+            ("messages hold no usable values and were skipped", self.invalid_messages),
+            ("stamps run backwards; the order of the log was kept", self.stamps_backwards),
+            ("stamps jump out of line and were not trusted for the order", self.stamp_jumps),
+            ("messages without stamp; the log's time was taken", self.stamps_zero),
+            ("messages without stamp were dropped", self.stamps_zero_dropped),
+        )
+        plain = (
+            (self.damaged_chunks, "damaged chunks were skipped"),
+            (self.bytes_lost, "bytes were lost"),
+            (self.truncated_files, "files end too early (cut off, or never closed)"),
+            (self.late_messages, "messages came later than the window of reordering"),
+        )
+        found = [f"{count} {text}" for count, text in plain if count]
+        found += [f"{n} chunks in unknown compression {name!r}" for name, n in self.unknown_compression.items()]
+        found += [f"{n} {text}: {topic}" for text, counter in named for topic, n in sorted(counter.items())]
+        return found

@@ -1,0 +1,191 @@
+"""Read and write maps: an image and its YAML, with nav2's meaning of every pixel."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from hsloc.errors import MapError, OutputError
+from hsloc.maps.metadata import MapMetadata, metadata_text, read_metadata
+from hsloc.model import OccupancyGrid
+from hsloc.model.occupancy_grid import FREE, OCCUPIED, UNKNOWN
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from PIL.Image import Image
+
+    Plane = NDArray[np.float64]
+
+FREE_PIXEL, UNKNOWN_PIXEL, OCCUPIED_PIXEL = 254, 205, 0
+UNKNOWN_PROBABILITY = (255 - UNKNOWN_PIXEL) / 255
+"""0.19608: what pixel 205 says. A free_thresh at or above makes the unknown free."""
+MAX_CELLS = 100_000_000
+IMAGES = (".pgm", ".png", ".bmp", ".pnm")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadedMap:
+    """A map, and what its user should know about it."""
+
+    grid: OccupancyGrid
+    warnings: tuple[str, ...] = ()
+
+
+class _Pixels(NamedTuple):
+    """Brightness 0 .. 1 and opacity, first row on top.
+
+    For grey images they stand for each level of grey once, and `level` says which level each pixel has.
+    """
+
+    shade: Plane
+    opaque: NDArray[np.bool_]
+    level: NDArray[Any] | None = None
+
+
+def load_map(path: Path | str) -> OccupancyGrid:
+    """The map of a map.yaml; see `read_map`."""
+    return read_map(path).grid
+
+
+def read_map(path: Path | str) -> LoadedMap:
+    """Read map.yaml and its image (PGM plain or raw, PNG, BMP), as nav2's map_io does.
+
+    An image may be named too, if its YAML stands beside it. Raises MapError.
+    """
+    path = Path(path)
+    if path.suffix.lower() in IMAGES:
+        beside = path.with_suffix(".yaml")
+        if not beside.exists():
+            raise MapError(f"{path}: is the image of a map; its resolution and origin should be in {beside}")
+        path = beside
+    if path.is_dir():
+        raise MapError(f"{path}: is a folder; name the map's .yaml file")
+    metadata = read_metadata(path)
+    pixels = _read_image(path, metadata)
+    cells = _cells(metadata, pixels.shade, pixels.opaque)
+    if pixels.level is not None:
+        cells = cells[pixels.level]
+    grid = OccupancyGrid(np.ascontiguousarray(np.flipud(cells)), metadata.resolution, metadata.origin)
+    return LoadedMap(grid, _warnings(path, metadata, pixels, grid))
+
+
+def _read_image(path: Path, metadata: MapMetadata) -> _Pixels:
+    from PIL import Image
+
+    image = metadata.image
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(image) as opened:
+                width, height = opened.size
+                if width * height > MAX_CELLS:
+                    raise MapError(f"{image}: {width} x {height} cells are too many, at most {MAX_CELLS} are read")
+                opened.load()
+                return _planes(opened, metadata.mode)
+    except FileNotFoundError as error:
+        raise MapError(f"{path}: its image {image} does not exist") from error
+    except MapError:
+        raise
+    except Exception as error:  # Decoders of images raise whatever they please on damage.
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise MapError(f"{image}: cannot be read as an image ({reason})") from error
+
+
+def _planes(image: Image, mode: str) -> _Pixels:
+    if image.mode == "P":
+        image = image.convert("RGBA" if "transparency" in image.info else "RGB")
+    elif image.mode == "1":
+        image = image.convert("L")
+    values = np.asarray(image)
+    if values.ndim == 2:
+        deep = image.mode.startswith("I")  # 16 bits of grey, held in 16 or 32
+        if not deep and values.dtype != np.uint8:
+            raise ValueError(f"pixels of mode {image.mode}")
+        largest = 65535 if deep else 255
+        shade = np.arange(largest + 1) / float(largest)
+        return _Pixels(shade, np.ones(shade.shape, dtype=bool), np.clip(values, 0, largest))
+    bands = values.astype(np.float64) / 255.0
+    has_alpha = image.mode in ("LA", "RGBA")
+    opaque = values[..., -1] == 255 if has_alpha else np.ones(bands.shape[:2], dtype=bool)
+    colours = bands[..., :-1] if has_alpha else bands
+    if colours.shape[-1] == 1:
+        colours = np.repeat(colours, 3, axis=-1)
+    # nav2 averages alpha in with the colours in trinary mode, "to preserve existing behavior".
+    if has_alpha and mode == "trinary":
+        colours = np.concatenate((colours, bands[..., -1:]), axis=-1)
+    return _Pixels(colours.mean(axis=-1), opaque)
+
+
+def _cells(metadata: MapMetadata, shade: Plane, opaque: NDArray[np.bool_]) -> NDArray[np.int8]:
+    """Occupancy of each pixel, or level of grey."""
+    if metadata.mode == "raw":
+        percent = np.round(shade * 255.0)
+        return np.where(percent <= OCCUPIED, percent, UNKNOWN).astype(np.int8)
+    p = shade if metadata.negate else 1.0 - shade
+    occupied, free = p >= metadata.occupied_thresh, p <= metadata.free_thresh
+    between: Plane | int = UNKNOWN
+    if metadata.mode == "scale":
+        span = max(metadata.occupied_thresh - metadata.free_thresh, 1e-12)
+        between = np.clip(np.rint((p - metadata.free_thresh) / span * 100.0), 0, 100)
+    cells = np.where(occupied, OCCUPIED, np.where(free, FREE, between))
+    if metadata.mode == "scale":
+        cells = np.where(opaque, cells, UNKNOWN)
+    return cells.astype(np.int8)
+
+
+def _warnings(path: Path, metadata: MapMetadata, pixels: _Pixels, grid: OccupancyGrid) -> tuple[str, ...]:
+    found = []
+    probability = pixels.shade if metadata.negate else 1.0 - pixels.shade
+    unknown = np.abs(probability - UNKNOWN_PROBABILITY) < 1e-6
+    if pixels.level is not None:
+        unknown = unknown[pixels.level]
+    if metadata.mode == "trinary" and metadata.free_thresh >= UNKNOWN_PROBABILITY and unknown.any():
+        found.append(
+            f"{path}: free_thresh {metadata.free_thresh} makes free of {int(unknown.sum())} pixels of value 205, "
+            "which mean unknown; write free_thresh: 0.196 if they do"
+        )
+    if not grid.occupied().any():
+        found.append(f"{path}: the map has no occupied cell; check negate and occupied_thresh")
+    return tuple(found)
+
+
+def save_map(grid: OccupancyGrid, target: Path | str) -> Path:
+    """Write a trinary map as nav2's map saver does; returns the path of the YAML.
+
+    `target` is a folder (then map.pgm and map.yaml are written in it) or a path without suffix (or with .yaml):
+    `save_map(grid, "out/office")` writes out/office.pgm and out/office.yaml. Occupied is 65 and more, free is 20
+    and less, as in nav2. Raises OutputError.
+    """
+    target = Path(target)
+    if target.is_dir():
+        target = target / "map"
+    elif target.suffix == ".yaml":
+        target = target.with_suffix("")
+    image, text = target.with_name(target.name + ".pgm"), target.with_name(target.name + ".yaml")
+    pixels = np.full(grid.cells.shape, UNKNOWN_PIXEL, dtype=np.uint8)
+    pixels[(grid.cells >= 0) & (grid.cells <= 20)] = FREE_PIXEL
+    pixels[grid.cells >= 65] = OCCUPIED_PIXEL
+    height, width = grid.cells.shape
+    _write(image, f"P5\n{width} {height}\n255\n".encode() + np.flipud(pixels).tobytes())
+    _write(text, metadata_text(image.name, grid.resolution, grid.origin).encode())
+    return text
+
+
+def _write(path: Path, data: bytes) -> None:
+    """All of it or nothing."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        partial.write_bytes(data)
+        partial.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise OutputError(
+            f"{path}: cannot be written ({error.strerror or error}); check the folder, its rights and free space"
+        ) from error

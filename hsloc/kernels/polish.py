@@ -45,8 +45,12 @@ def solve_damped(information: F64, gradient: F64, damping: float, step: F64) -> 
 
 
 @njit(cache=True, nogil=True)
-def polish(packed: F32, points: F32, pose: F64, iterations: int, information: F64) -> tuple[float, int]:
-    """Climb from `pose` (x, y in cells, theta), in place, for at most `iterations` steps.
+def polish(
+    packed: F32, points: F32, pose: F64, low: F64, high: F64, iterations: int, information: F64
+) -> tuple[float, int]:
+    """Climb from `pose` (x, y in cells, theta), in place, for at most `iterations` steps, within the box [low, high].
+
+    The box holds every step: along a corridor the equations are nearly singular, and a free step would run off.
 
     Returns the sum of the scores and the number of evaluations; `information` (3, 3) is left as it is at the
     pose returned. Never ends at a lower sum than it began with.
@@ -61,7 +65,9 @@ def polish(packed: F32, points: F32, pose: F64, iterations: int, information: F6
     damping = 1e-3
     for _ in range(iterations):
         solve_damped(information, gradient, damping, step)
-        trial[:] = pose + step
+        for j in range(3):
+            trial[j] = min(max(pose[j] + step[j], low[j]), high[j])
+            step[j] = trial[j] - pose[j]
         trial_total = normal_equations(packed, points, trial[0], trial[1], trial[2], trial_information, trial_gradient)
         evaluations += 1
         if trial_total > total:

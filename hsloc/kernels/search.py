@@ -193,6 +193,8 @@ def search(
     candidate = np.empty(3, dtype=np.float64)
     candidate_information = np.zeros((3, 3), dtype=np.float64)
     none = np.empty(0, dtype=np.float64)
+    low = centre - half_widths
+    high = centre + half_widths
     best_total = -1.0
     agreed = 0
     evaluations = 0
@@ -215,7 +217,7 @@ def search(
         evaluations += spent
         candidate[:] = memory[row]
         if p.polish_iterations > 0:
-            total, spent = polish(packed, points, candidate, p.polish_iterations, candidate_information)
+            total, spent = polish(packed, points, candidate, low, high, p.polish_iterations, candidate_information)
         else:
             total = score_sum(packed, points, candidate[0], candidate[1], candidate[2], -2.0)
             spent = 0 if len(few_points) == len(points) else 1

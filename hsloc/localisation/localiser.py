@@ -14,10 +14,10 @@ import numpy as np
 
 from hsloc.errors import ConfigError
 from hsloc.localisation.motion import OdometryNoise, fuse, predict_covariance
-from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
+from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters, Verdict
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Status
-from hsloc.model.events import Odometry, Scan
+from hsloc.model.events import Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY, Pose2
 
 if TYPE_CHECKING:
@@ -51,8 +51,8 @@ class LocaliserParameters:
     """A match below is refused, whatever was usual before."""
     usual_fraction: float = 0.7
     """A match below this part of the usual fitness (of the matches before) is refused."""
-    suspicious_fraction: float = 0.9
-    """Below this part of the usual fitness a match is tried again in wider windows."""
+    convincing_fraction: float = 0.9
+    """After a refusal a match in a wider window must reach this part of the usual fitness."""
     lost_after: int = 5
     """The pose is lost after so many refused matches in a row."""
     fuse: bool = True
@@ -73,8 +73,10 @@ class LocaliserParameters:
                 raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be positive")
 
 
-_WIDER = ((0.5, radians(20.0)), (2.0, radians(45.0)))
-"""Half-widths (m, rad) of the windows tried after a suspicious match."""
+_WIDER = (0.5, radians(20.0))
+"""Half-widths (m, rad) of the window tried after a refused match: what a wheel may slip."""
+_BETTER = 0.1
+"""So much fitter must a match outside the window of the prediction be: ambiguous places look alike."""
 _FORGET = 0.05
 """Weight of a new match in the usual fitness."""
 
@@ -95,7 +97,8 @@ class Localiser:
         self._matcher = matcher
         self._parameters = parameters
         self._rng = rng
-        self._odometry: Odometry | None = None
+        self._count = 0
+        self._search_began = 0
         self._T_odom_match: Pose2 | None = None
         self._T_map_odom = IDENTITY
         self._T_map_match = IDENTITY if initial_pose is None else initial_pose
@@ -113,28 +116,24 @@ class Localiser:
         """The transform that a ROS localiser would publish."""
         return self._T_map_odom
 
-    def update(self, event: Odometry | Scan) -> Estimate | None:
-        """Take an event; the estimate at its stamp, or None before the first odometry."""
+    def update(self, event: Odometry | PairedScan) -> Estimate:
+        """Take an event; the estimate at its stamp."""
+        if self._T_odom_match is None:
+            self._anchor(self._T_map_match, event.T_odom_base)
         if isinstance(event, Odometry):
             return self._follow(event)
-        if self._odometry is None:
-            return None
         return self._search(event) if self._searching else self._localise(event)
 
     def _follow(self, odometry: Odometry) -> Estimate:
         """Between matches: compose with the odometry."""
-        if self._T_odom_match is None:
-            self._anchor(self._T_map_match, odometry.T_odom_base)
-        self._odometry = odometry
+        self._count += 1
         status = Status.SEARCHING if self._searching else Status.PREDICTED
         return Estimate(odometry.stamp_ns, self._T_map_odom @ odometry.T_odom_base, status)
 
-    def _localise(self, scan: Scan) -> Estimate:
-        odometry = self._odometry
-        assert odometry is not None
-        assert self._T_odom_match is not None
+    def _localise(self, paired: PairedScan) -> Estimate:
+        scan, T_odom_base = paired.scan, paired.T_odom_base
         p = self._parameters
-        motion = self._T_odom_match.between(odometry.T_odom_base)
+        motion = (self._T_odom_match or T_odom_base).between(T_odom_base)
         predicted = self._T_map_match @ motion
         first = self._usual is None and self._rejected == 0
         if not first and np.hypot(motion.x, motion.y) < p.update_min_d and abs(motion.theta) < p.update_min_a:
@@ -144,36 +143,36 @@ class Localiser:
         )
         points = scan.points_base()
         if len(points) < p.min_points:
-            self._take(predicted, covariance, odometry)
+            self._take(predicted, covariance, T_odom_base)
             return Estimate(scan.stamp_ns, predicted, Status.NO_RETURNS, covariance, reason=f"{len(points)} returns")
         match, evaluations = self._match(points, predicted, covariance)
         reason = self._refusal(match)
         if reason:
-            return self._refuse(scan, predicted, covariance, match, evaluations, reason, odometry)
+            return self._refuse(paired, predicted, covariance, match, evaluations, reason)
         pose, covariance = (
             fuse(predicted, covariance, match.pose, match.covariance) if p.fuse else (match.pose, match.covariance)
         )
         self._rejected = 0
         self._usual = match.fitness if self._usual is None else self._usual + _FORGET * (match.fitness - self._usual)
-        self._take(pose, covariance, odometry)
+        self._take(pose, covariance, T_odom_base)
         return Estimate(scan.stamp_ns, pose, Status.MATCHED, covariance, match.fitness, evaluations)
 
     def _match(self, points: F64, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
-        """Match in the window of the prediction; a suspicious match must beat those of wider windows."""
+        """Match in the window of the prediction; a refused match may give way to one in a wider window."""
         p = self._parameters
         window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
         best = self._matcher.match(points, self._field, window, self._rng)
         evaluations = best.evaluations
-        for half, half_angle in _WIDER if self._usual is not None else ():
-            if best.fitness >= p.suspicious_fraction * (self._usual or 0.0):
-                break
+        if self._usual is not None and self._refusal(best):
             wide = Window(
-                predicted, max(window.half_x, half), max(window.half_y, half), max(window.half_theta, half_angle)
+                predicted,
+                max(window.half_x, _WIDER[0]),
+                max(window.half_y, _WIDER[0]),
+                max(window.half_theta, _WIDER[1]),
             )
             match = self._matcher.match(points, self._field, wide, self._rng)
             evaluations += match.evaluations
-            # A little better is no reason to jump far: ambiguous places look alike.
-            if match.fitness > best.fitness + 0.05:
+            if match.fitness >= max(best.fitness + _BETTER, p.convincing_fraction * self._usual):
                 best = match
         return best, evaluations
 
@@ -188,44 +187,57 @@ class Localiser:
 
     def _refuse(
         self,
-        scan: Scan,
+        paired: PairedScan,
         predicted: Pose2,
         covariance: F64,
         match: Match,
         evaluations: int,
         reason: str,
-        odometry: Odometry,
     ) -> Estimate:
         """The prediction stands; after too many refusals the pose is lost."""
         self._rejected += 1
-        self._take(predicted, covariance, odometry)
+        self._take(predicted, covariance, paired.T_odom_base)
         status = Status.REJECTED
         if self._rejected >= self._parameters.lost_after:
             self._searching = True
+            self._search_began = self._count
             self._relocaliser.start()
             status, reason = Status.SEARCHING, f"lost: {reason}"
-        return Estimate(scan.stamp_ns, predicted, status, covariance, match.fitness, evaluations, reason)
+        return Estimate(paired.scan.stamp_ns, predicted, status, covariance, match.fitness, evaluations, reason)
 
-    def _search(self, scan: Scan) -> Estimate:
+    def _search(self, paired: PairedScan) -> Estimate:
         """Let the relocaliser see the scan; take its answer when it is sure."""
-        odometry = self._odometry
-        assert odometry is not None
-        verdict = self._relocaliser.update(scan, odometry.T_odom_base)
-        pose = self._T_map_odom @ odometry.T_odom_base if verdict.pose is None else verdict.pose
+        scan, T_odom_base = paired.scan, paired.T_odom_base
+        verdict = self._relocaliser.update(scan, T_odom_base, self._count)
+        pose = self._T_map_odom @ T_odom_base if verdict.pose is None else verdict.pose
         status = Status.SEARCHING
         if verdict.is_sure:
             self._searching = False
             self._rejected = 0
             self._usual = verdict.fitness
             status = Status.RELOCALISED
-        self._take(pose, verdict.covariance, odometry)
+        self._take(pose, verdict.covariance, T_odom_base)
         return Estimate(
-            scan.stamp_ns, pose, status, verdict.covariance, verdict.fitness, verdict.evaluations, verdict.reason
+            scan.stamp_ns,
+            pose,
+            status,
+            verdict.covariance,
+            verdict.fitness,
+            verdict.evaluations,
+            verdict.reason,
+            self._revision(verdict),
         )
 
-    def _take(self, pose: Pose2, covariance: F64, odometry: Odometry) -> None:
+    def _revision(self, verdict: Verdict) -> tuple[tuple[int, Pose2], ...]:
+        """The winner's way since the search began; its first pose holds back to that moment."""
+        if not verdict.track:
+            return ()
+        (_, first), *rest = verdict.track
+        return ((self._search_began, first), *rest)
+
+    def _take(self, pose: Pose2, covariance: F64, T_odom_base: Pose2) -> None:
         self._covariance = covariance
-        self._anchor(pose, odometry.T_odom_base)
+        self._anchor(pose, T_odom_base)
 
     def _anchor(self, T_map_base: Pose2, T_odom_base: Pose2) -> None:
         self._T_map_match = T_map_base

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _CELL_SIGMA = 1.0 / np.sqrt(12.0)
 """Standard deviation of a wall's place within its cell, in cells."""
-_CORRELATED = 10.0
+_CORRELATED = 30.0
 """Neighbouring beams see the same wall with the same error of the map: this many count as one."""
 
 

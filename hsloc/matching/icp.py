@@ -49,13 +49,14 @@ class Icp:
             return Match(window.centre, 0.0, np.diag(half**2 / 3.0), 0, StopReason.NO_POINTS)
         tree = _tree(field, field.walls)
         pose, stopped, rounds = window.centre, StopReason.BUDGET, 0
-        for rounds in range(1, self.iterations + 1):
+        for _ in range(self.iterations):
+            rounds += 1
             moved = pose @ points
             distance, nearest = tree.query(moved, distance_upper_bound=self.max_distance)
             paired = np.isfinite(distance)
             if paired.sum() < 3:
                 break
-            step = rigid_motion(moved[paired], field.walls[nearest[paired]])
+            step = rigid_motion(moved[paired], field.walls[np.asarray(nearest)[paired]])
             pose = step @ pose
             if max(abs(step.x), abs(step.y), abs(step.theta)) < self.tolerance:
                 stopped = StopReason.CONVERGED

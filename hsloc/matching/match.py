@@ -51,8 +51,8 @@ class Match:
 class Matcher(Protocol):
     """Finds the pose in a window that fits a scan best.
 
-    Law: the same points, field, window and state of `rng` give the same Match; the pose lies in the window, or within
-    reach of the local refinement from it; nothing but `rng` changes.
+    Law: the same points, field, window and state of `rng` give the same Match; the pose lies in the
+    window (ICP, which knows none, excepted); nothing but `rng` changes.
     """
 
     def match(self, points: NDArray[np.float64], field: LikelihoodField, window: Window, rng: Generator) -> Match:

@@ -1,7 +1,7 @@
 """NOUNS: frozen values without behaviour of their own beyond geometry."""
 
 from hsloc.model.estimate import Estimate, ScanDiagnostics, Status
-from hsloc.model.events import Event, Odometry, Scan, Truth
+from hsloc.model.events import Event, Odometry, PairedScan, Scan, Truth
 from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle, wrap_angles
 from hsloc.model.trajectory import Trajectory
@@ -12,6 +12,7 @@ __all__ = [
     "Event",
     "OccupancyGrid",
     "Odometry",
+    "PairedScan",
     "Pose2",
     "Scan",
     "ScanDiagnostics",

@@ -41,7 +41,8 @@ class Estimate:
 
     `covariance` is 3 x 3 over (x, y, theta) in the map frame (m^2, m rad, rad^2). `fitness` is in (0, 1] where
     a scan was matched, else None. `evaluations` counts the fitness evaluations spent. `reason` says in words
-    why a scan was skipped or refused.
+    why a scan was skipped or refused. `revision` corrects what was said before, where the estimator now knows better:
+    pairs (k, T_map_odom), each valid from the k-th odometry message (from 0) until the next pair's.
     """
 
     stamp_ns: int
@@ -51,6 +52,7 @@ class Estimate:
     fitness: float | None = None
     evaluations: int = 0
     reason: str = ""
+    revision: tuple[tuple[int, Pose2], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -77,4 +77,12 @@ class Scan:
         return self.T_base_laser @ np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PairedScan:
+    """A scan, and where odometry says the base was at its stamp."""
+
+    scan: Scan
+    T_odom_base: Pose2
+
+
 Event = Odometry | Scan | Truth

@@ -1,0 +1,160 @@
+"""All parameters of a run, composed of the algorithms' own dataclasses; YAML in and out; unknown keys refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from dataclasses import dataclass, field, replace
+from math import isfinite
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from hsloc.errors import ConfigError
+from hsloc.localisation.localiser import LocaliserParameters
+from hsloc.matching.harmony_search import HarmonySearch
+from hsloc.matching.hide import Hide
+from hsloc.matching.icp import Icp
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hsloc.matching.match import Matcher
+
+T = TypeVar("T")
+
+MATCHERS = ("hide", "harmony_search", "icp")
+PRESETS = ("default", "paper", "paper-literal")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldParameters:
+    """The field that scans are matched against."""
+
+    sigma: float = 0.2
+    """Decay of a point's score with its distance to the nearest wall (m); [P]: 1 m."""
+    margin: float = 1.0
+    """The field reaches so far beyond the map (m)."""
+
+    def __post_init__(self) -> None:
+        if not (self.sigma > 0.0 and self.margin >= 0.0):
+            raise ConfigError(f"likelihood_field: sigma {self.sigma} must be positive, margin {self.margin} 0 or more")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Config:
+    """Everything that decides a run beside its input and its seed."""
+
+    matcher: str = "hide"
+    """One of hide, harmony_search, icp."""
+    hide: Hide = field(default_factory=Hide)
+    harmony_search: HarmonySearch = field(default_factory=HarmonySearch)
+    icp: Icp = field(default_factory=Icp)
+    likelihood_field: FieldParameters = field(default_factory=FieldParameters)
+    localiser: LocaliserParameters = field(default_factory=LocaliserParameters)
+
+    def __post_init__(self) -> None:
+        if self.matcher not in MATCHERS:
+            raise ConfigError(f"matcher is {self.matcher!r}; it must be one of {', '.join(MATCHERS)}")
+
+    def make_matcher(self) -> Matcher:
+        """The matcher that is chosen."""
+        chosen: Matcher = getattr(self, self.matcher)
+        return chosen
+
+
+def preset(name: str) -> Config:
+    """A named set of parameters.
+
+    `default` is the project's own. `paper` and `paper-literal` localise as [P] does: the matchers' presets of that name
+    with the report's budget for localisation, (HRT, NFE) = (4, 20) and NI = 20 improvisations, sigma = 1 m, every scan,
+    a window of one standard deviation, and the match is the new pose.
+    """
+    if name == "default":
+        return Config()
+    if name not in PRESETS:
+        raise ConfigError(f"preset is {name!r}; it must be one of {', '.join(PRESETS)}")
+    literal = name == "paper-literal"
+    hide = Hide.paper_literal() if literal else Hide.paper()
+    harmony_search = HarmonySearch.paper_literal() if literal else HarmonySearch.paper()
+    return Config(
+        # The budget must count improvisations: 20 evaluations would not even fill the memory.
+        hide=replace(hide, improvisations_per_pass=4, budget=20, count_improvisations=True),
+        harmony_search=replace(harmony_search, budget=20, count_improvisations=True),
+        likelihood_field=FieldParameters(sigma=1.0, margin=3.0),
+        localiser=LocaliserParameters(update_min_d=0.0, update_min_a=0.0, min_points=6, window_sigmas=1.0, fuse=False),
+    )
+
+
+def to_dict(value: Any) -> Any:
+    """A dataclass as plain dictionaries, in the order of its fields."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_dict(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, tuple | list):
+        return [to_dict(item) for item in value]
+    return value
+
+
+def from_dict(kind: type[T], values: Any, base: T | None = None, where: str = "config") -> T:
+    """A dataclass from plain dictionaries; what is not named keeps the value of `base`, or the default.
+
+    Raises ConfigError for an unknown key or a value of the wrong type, naming it.
+    """
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where} is {values!r}; it must be a table of keys and values")
+    hints = typing.get_type_hints(kind)
+    names = [f.name for f in dataclasses.fields(typing.cast("Any", kind))]
+    for key in values:
+        if key not in names:
+            raise ConfigError(f"{where} has the unknown key {key!r}; known are {', '.join(names)}")
+    start = kind() if base is None else base
+    changes = {key: _convert(hints[key], value, getattr(start, key), f"{where}.{key}") for key, value in values.items()}
+    return typing.cast("T", replace(typing.cast("Any", start), **changes))
+
+
+def _convert(hint: Any, value: Any, base: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return from_dict(typing.cast("type[Any]", hint), value, base, where)
+    if isinstance(hint, types.UnionType):
+        if value is None and type(None) in hint.__args__:
+            return None
+        hint = next(kind for kind in hint.__args__ if kind is not type(None))
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        if not isfinite(value):
+            raise ConfigError(f"{where} is {value}; it must be finite")
+        return float(value)
+    if typing.get_origin(hint) is tuple and isinstance(value, list | tuple):
+        return tuple(value)
+    if hint in (int, str, bool) and type(value) is hint:
+        return value
+    raise ConfigError(f"{where} is {value!r}; it must be of type {getattr(hint, '__name__', hint)}")
+
+
+def load(path: Path, base: Config | None = None) -> Config:
+    """A configuration from a YAML file, on top of `base`."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        values = YAML(typ="safe", pure=True).load(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
+    try:
+        return from_dict(Config, {} if values is None else values, base)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def dump(config: Config) -> str:
+    """A configuration as YAML, which `load` reads back."""
+    from io import StringIO
+
+    from ruamel.yaml import YAML
+
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = False
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    stream = StringIO()
+    yaml.dump(to_dict(config), stream)
+    return stream.getvalue()

@@ -1,0 +1,97 @@
+"""The replay engine: events in, estimates out, in one repeatable order.
+
+Pull-based: the next event is read when the estimator is done with the last, so that nothing is ever dropped and the
+clock has no say. A scan is paired with the odometry at its own stamp: that of a message with just this stamp if there
+is one, else interpolated between the messages before and after, for which the scan waits.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Protocol
+
+from hsloc.model.events import Odometry, PairedScan, Scan, Truth
+from hsloc.model.pose2 import IDENTITY, Pose2
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from hsloc.model.estimate import Estimate
+    from hsloc.model.events import Event
+
+_RECENT = 64
+"""Odometry messages remembered for pairing; logs with jumping clocks need more than two."""
+_WAITING = 64
+"""Scans that may wait for odometry; then the last odometry must do."""
+
+
+class Estimator(Protocol):
+    """Localiser or mapper. Law: the same events and seed give the same estimates; the truth never reaches it."""
+
+    def update(self, event: Odometry | PairedScan) -> Estimate:
+        """Take the next event; the estimate at its stamp."""
+        ...
+
+
+def replay(
+    events: Iterable[Event], estimator: Estimator
+) -> Iterator[tuple[Odometry | PairedScan | Truth, Estimate | None]]:
+    """Each event with what the estimator says to it (None for the truth, which it does not see)."""
+    for event in pair(events):
+        yield event, None if isinstance(event, Truth) else estimator.update(event)
+
+
+def pair(events: Iterable[Event]) -> Iterator[Odometry | PairedScan | Truth]:
+    """Pair the scans with odometry; other events pass through in their order.
+
+    A log without any odometry gives scans paired with the identity.
+    """
+    recent: deque[Odometry] = deque(maxlen=_RECENT)
+    waiting: deque[Scan] = deque()
+    for event in events:
+        if isinstance(event, Truth):
+            yield event
+        elif isinstance(event, Scan):
+            exact = _exact(recent, event.stamp_ns)
+            if exact is not None and not waiting:
+                yield PairedScan(event, exact)
+                continue
+            waiting.append(event)
+            if len(waiting) > _WAITING:
+                yield _paired(waiting.popleft(), recent, None)
+        else:
+            while waiting and waiting[0].stamp_ns < event.stamp_ns:
+                yield _paired(waiting.popleft(), recent, event)
+            recent.append(event)
+            yield event
+            while waiting and waiting[0].stamp_ns <= event.stamp_ns:
+                yield _paired(waiting.popleft(), recent, None)
+    while waiting:
+        yield _paired(waiting.popleft(), recent, None)
+
+
+def _paired(scan: Scan, recent: deque[Odometry], following: Odometry | None) -> PairedScan:
+    return PairedScan(scan, _at(scan.stamp_ns, recent, following))
+
+
+def _exact(recent: deque[Odometry], stamp_ns: int) -> Pose2 | None:
+    for odometry in reversed(recent):
+        if odometry.stamp_ns == stamp_ns:
+            return odometry.T_odom_base
+    return None
+
+
+def _at(stamp_ns: int, recent: deque[Odometry], following: Odometry | None) -> Pose2:
+    """The odometry at a stamp: exact, else between neighbours in the log that enclose it, else the last."""
+    exact = _exact(recent, stamp_ns)
+    if exact is not None:
+        return exact
+    after = following
+    for before in reversed(recent):
+        if after is not None and before.stamp_ns < stamp_ns <= after.stamp_ns:
+            fraction = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+            return before.T_odom_base.interpolate(after.T_odom_base, fraction)
+        after = before
+    if recent:
+        return recent[-1].T_odom_base
+    return following.T_odom_base if following is not None else IDENTITY

@@ -1,0 +1,87 @@
+"""Convert a log (CARMEN, Wean, ROS 1 or ROS 2 bag, MCAP) to MCAP of ROS 2 messages."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+from hsloc.cli.arguments import add_read_arguments, read_options
+from hsloc.cli.info import pose_text
+from hsloc.cli.progress import ProgressLine
+
+if TYPE_CHECKING:
+    import argparse
+
+    from hsloc.log.convert import Conversion
+    from hsloc.log.summary import LogSummary
+
+HELP = "convert a log to MCAP"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `hsloc convert`."""
+    parser.add_argument("log", metavar="IN", help="the log, or a folder with its parts")
+    parser.add_argument("out", metavar="OUT.mcap", help="the file to write")
+    add_read_arguments(parser)
+    parser.add_argument("--force", action="store_true", help="overwrite OUT.mcap")
+    parser.add_argument("--json", action="store_true", help="print the counts as JSON")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but losses and errors")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Convert; returns the exit code: 3 where part of the input was lost."""
+    from dataclasses import replace
+    from pathlib import Path
+
+    from hsloc.errors import OutputError
+    from hsloc.log.convert import convert_log
+    from hsloc.log.reader import open_log
+
+    target = Path(arguments.out)
+    if target.exists() and not target.is_dir():
+        if Path(arguments.log).exists() and target.samefile(arguments.log):
+            raise OutputError(f"{target}: is the input itself; name another file")
+        if not arguments.force:
+            raise OutputError(f"{target}: exists; give --force to overwrite it, or name another file")
+    options = replace(read_options(arguments), require_odometry=False)
+    log = open_log(arguments.log, options)
+    span = max(log.summary.end_ns - log.summary.origin_ns, 1)
+    with ProgressLine(arguments.quiet) as line:
+        conversion = convert_log(
+            log, target, lambda stamp: line.show("convert", (stamp - log.summary.origin_ns) / span)
+        )
+    _report(arguments, log.summary, conversion)
+    return 3 if conversion.losses.data_lost else 0
+
+
+def _report(arguments: argparse.Namespace, summary: LogSummary, conversion: Conversion) -> None:
+    from json import dumps
+
+    losses = conversion.losses.lines()
+    if arguments.json:
+        values = {
+            "path": str(conversion.path),
+            "format": summary.format,
+            "scans": conversion.scans,
+            "odometry": conversion.odometry,
+            "truths": conversion.truths,
+            "map": conversion.has_map,
+            "stamps_backwards": conversion.stamps_backwards,
+            "data_lost": conversion.losses.data_lost,
+            "losses": losses + conversion.losses.reasons,
+            "warnings": list(summary.warnings),
+        }
+        print(dumps(values))
+        return
+    if not arguments.quiet:
+        parts = [f"{conversion.scans} scans", f"{conversion.odometry} odometry messages"]
+        parts += [f"{conversion.truths} poses of the truth"] if conversion.truths else []
+        parts += ["a map"] if conversion.has_map else []
+        print(f"{conversion.path}: {', '.join(parts)}, from {summary.format}")
+        print(f"laser: {pose_text(summary.T_base_laser)} on the base ({summary.extrinsics})")
+        print(f"stamps that run backwards: {conversion.stamps_backwards}, kept as they are")
+        for warning in summary.warnings:
+            print(f"hsloc: warning: {warning}", file=sys.stderr)
+    if not arguments.quiet or conversion.losses.data_lost:
+        for line in losses + conversion.losses.reasons:
+            print(f"hsloc: warning: {line}", file=sys.stderr)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
     from hsloc.log.reader import Log
     from hsloc.log.summary import LogSummary, Losses
+    from hsloc.model import Pose2
 
 HELP = "say what is in a log"
 

@@ -7,9 +7,10 @@ import json
 import sys
 from dataclasses import fields, replace
 from math import isfinite, radians
-from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from hsloc.cli.arguments import pose, seed, to_pose
+from hsloc.cli.progress import ProgressLine
 from hsloc.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--waypoints", metavar="FILE", help="the way: a text of points `x y`; closed where the last is the first"
     )
     what.add_argument("--list", action="store_true", help="list worlds and scenarios, and end")
-    what.add_argument("--seed", type=int, metavar="N", help="of all noise (default: 0)")
+    what.add_argument("--seed", type=seed, metavar="N", help="of all noise (default: 0)")
     what.add_argument("--duration", type=float, metavar="S", help="seconds to record (default: as long as the way is)")
     what.add_argument("--laps", type=float, metavar="N", help="times round the way (default: the scenario's)")
     what.add_argument("--speed", type=float, metavar="M/S", help="the robot's top speed")
@@ -58,9 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     lidar.add_argument("--dropout", type=float, metavar="P", help="share of readings that are lost, 0 to 1")
     lidar.add_argument(
         "--mounting",
-        type=_numbers(3),
+        type=pose,
         metavar="X,Y,YAW",
-        help="of the laser on the base: m, m, deg (write --mounting=-0.1,0,90 for a leading minus)",
+        help="of the laser on the base, metres and radians (write --mounting=-0.1,0,1.57 for a leading minus)",
     )
     lidar.add_argument("--upside-down", action="store_true", default=None, help="the laser hangs head down")
     lidar.add_argument(
@@ -119,12 +120,17 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     world = load_world(arguments.world or preset(arguments.scenario).world, arguments.waypoints)
     scenario = build_scenario(arguments, world)
-    progress = None if arguments.quiet or not sys.stderr.isatty() else _progress(scenario)
-    try:
-        recording = record(scenario, arguments.out, world, overwrite=arguments.force, progress=progress)
-    finally:
-        if progress is not None:
-            print("\r\033[K", end="", file=sys.stderr)
+    if not arguments.quiet:
+        for note in world.notes:
+            print(f"hsloc: warning: {note}", file=sys.stderr)
+    way = world.lap_length() * scenario.laps_needed(world.lap_length())
+    with ProgressLine(arguments.quiet) as line:
+
+        def show(seconds: float, metres: float) -> None:
+            share = metres / way if scenario.duration_s is None else seconds / scenario.duration_s
+            line.show("record", share, f"{seconds:.0f} s, {metres:.0f} m, {seconds / line.elapsed:.0f} x real time")
+
+        recording = record(scenario, arguments.out, world, overwrite=arguments.force, progress=show)
     if arguments.json:
         print(json.dumps(_summary(recording, scenario)))
     elif not arguments.quiet:
@@ -137,7 +143,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def build_scenario(arguments: argparse.Namespace, world: World) -> Scenario:
     """The scenario that the arguments describe. Raises ConfigError for what does not fit together."""
-    from hsloc.model import Pose2
     from hsloc.simulation.odometer import Slip
     from hsloc.simulation.presets import ANY_WORLD, SCENARIOS, preset
     from hsloc.simulation.scenario import Kidnap
@@ -148,7 +153,6 @@ def build_scenario(arguments: argparse.Namespace, world: World) -> Scenario:
         base = SCENARIOS["paper"]
     else:
         base = SCENARIOS.get(world.name, ANY_WORLD)
-    mounting = arguments.mounting
     sensor = _changed(
         base.sensor,
         beams=("--beams", arguments.beams),
@@ -156,7 +160,7 @@ def build_scenario(arguments: argparse.Namespace, world: World) -> Scenario:
         range_max=("--range-max", arguments.range_max),
         range_noise=("--range-noise", arguments.range_noise),
         dropout=("--dropout", arguments.dropout),
-        mounting=("--mounting", mounting and Pose2(mounting[0], mounting[1], radians(mounting[2]))),
+        mounting=("--mounting", to_pose(arguments.mounting)),
         upside_down=("--upside-down", arguments.upside_down),
         motion_distortion=("--motion-distortion", arguments.motion_distortion),
     )
@@ -205,22 +209,6 @@ def _numbers(*counts: int) -> Callable[[str], tuple[float, ...]]:
         return values
 
     return parse
-
-
-def _progress(scenario: Scenario) -> Callable[[float, float], None]:
-    """Shows seconds, metres and the speed as a multiple of real time, at most ten times a second."""
-    began = shown = monotonic()
-
-    def show(seconds: float, metres: float) -> None:
-        nonlocal shown
-        now = monotonic()
-        if now - shown > 0.1:
-            shown = now
-            of = "" if scenario.duration_s is None else f" of {scenario.duration_s:.0f}"
-            line = f"\r{seconds:7.0f}{of} s  {metres:7.1f} m  {seconds / (now - began):6.0f} x real time\033[K"
-            print(line, end="", file=sys.stderr, flush=True)
-
-    return show
 
 
 def _summary(recording: Recording, scenario: Scenario) -> dict[str, Any]:

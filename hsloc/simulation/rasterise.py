@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.errors import ConfigError
 from hsloc.model import OccupancyGrid, Pose2
 from hsloc.model.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 ON_BORDER = 1e-6
 """A wall this close to a border between cells (as a fraction of a cell) lies on it, and occupies both sides:
 any choice of one side would shift the map by half a cell."""
+
+MAX_CELLS = 100_000_000
 
 
 def crossed_cells(segment: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -49,12 +52,15 @@ def rasterise(
 
     Occupied: every cell through which a wall passes. Free: what can be reached from the points `inside`, shape
     (m, 2), without crossing an occupied cell. Unknown: all else. The grid's origin is a multiple of `resolution`.
+    Raises ConfigError for a map of too many cells.
     """
     from scipy.ndimage import label
 
     shapes = np.concatenate((segments[:, :2], segments[:, 2:], inside))
     first = np.floor((shapes.min(axis=0) - margin) / resolution)
     columns, rows = (np.ceil((shapes.max(axis=0) + margin) / resolution) - first).astype(int)
+    if rows * columns > MAX_CELLS:
+        raise ConfigError(f"map_resolution {resolution} makes a map of {columns} x {rows} cells; choose it coarser")
     cells = np.full((rows, columns), UNKNOWN, dtype=np.int8)
     for segment in segments / resolution - np.tile(first, 2):
         crossed = crossed_cells(segment)

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from hsloc.simulation.world import World
 
 METADATA = "hsloc.scenario"
-"""Name of the metadata record: scenario (JSON), seed, world, its sha256, and the start pose."""
+"""Name of the metadata record of what was recorded: scenario (JSON), seed, world and its sha256."""
+INITIAL_POSE = "hsloc.initial_pose"
+"""Name of the metadata record of the start in the map: x, y (m), theta (rad), stamp_ns."""
 
 HEAD_DOWN = Transform3(rotation=(1.0, 0.0, 0.0, 0.0))
 """Half a turn about the x axis."""
@@ -114,9 +116,10 @@ def _write_head(writer: LogWriter, scenario: Scenario, world: World) -> None:
             "seed": str(scenario.seed),
             "world": world.name,
             "world_sha256": world.fingerprint(),
-            "start_pose": f"{start.x!r} {start.y!r} {start.theta!r}",
         },
     )
+    pose = {name: repr(value) for name, value in (("x", start.x), ("y", start.y), ("theta", start.theta))}
+    writer.metadata(INITIAL_POSE, {**pose, "stamp_ns": str(stamp)})
     if world.points is not None:
         rows = "".join(f"{x!r},{y!r}\n" for x, y in world.points.tolist())
         writer.attachment("map_points.csv", f"x_m,y_m\n{rows}".encode(), "text/csv", stamp)

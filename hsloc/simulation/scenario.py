@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, is_dataclass
-from math import ceil
+from math import ceil, tau
 from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import ConfigError
@@ -13,7 +13,7 @@ from hsloc.simulation.robot import DifferentialDrive, SteeredVehicle
 from hsloc.simulation.sensors import Lidar, PointSensor
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,23 +54,38 @@ class Scenario:
 
     def __post_init__(self) -> None:
         """Raises ConfigError for what cannot be driven or measured."""
-        _require(self.seed >= 0, "seed", self.seed, "must not be negative")
-        for name in ("odometry_rate_hz", "scan_rate_hz", "laps", "map_resolution"):
-            _require(getattr(self, name) > 0, name, getattr(self, name), "must be above 0")
-        for name in ("people", "scan_offset_s"):
-            _require(getattr(self, name) >= 0, name, getattr(self, name), "must not be negative")
-        _require(self.duration_s is None or self.duration_s > 0, "duration_s", self.duration_s, "must be above 0")
-        _require(self.robot.speed > 0, "robot.speed", self.robot.speed, "must be above 0")
-        sensor = self.sensor
-        _require(0 < sensor.beams <= 100_000, "sensor.beams", sensor.beams, "must be between 1 and 100000")
-        _require(sensor.range_max > 0, "sensor.range_max", sensor.range_max, "must be above 0")
-        if isinstance(sensor, Lidar):
-            _require(0 < sensor.field_of_view < 6.284, "sensor.field_of_view", sensor.field_of_view, "in (0, 2 pi]")
-            _require(0 <= sensor.dropout <= 1, "sensor.dropout", sensor.dropout, "must be between 0 and 1")
-            _require(sensor.range_noise >= 0, "sensor.range_noise", sensor.range_noise, "must not be negative")
+        for name, value, low, high in self._limits():
+            if value is not None and not low <= value <= high:
+                raise ConfigError(f"scenario: {name} is {value}; it must lie between {low:g} and {high:g}")
+
+    def _limits(self) -> Iterator[tuple[str, float | None, float, float]]:
+        """(name, value, least, most) of every number that has limits."""
+        yield "seed", self.seed, 0, 2**63
+        yield "odometry_rate_hz", self.odometry_rate_hz, 0.1, 10_000
+        yield "scan_rate_hz", self.scan_rate_hz, 0.01, 10_000
+        yield "scan_offset_s", self.scan_offset_s, 0, 1e6
+        yield "laps", self.laps, 1e-3, 10_000
+        yield "duration_s", self.duration_s, 1e-3, 1e6
+        yield "people", self.people, 0, 1000
+        yield "map_resolution", self.map_resolution, 1e-3, 100
+        yield "start_stamp_ns", self.start_stamp_ns, 0, 2**31 * 10**9
+        yield "robot.speed", self.robot.speed, 1e-3, 100
+        yield "robot.turn_rate", self.robot.turn_rate, 1e-3, 100
+        yield "sensor.beams", self.sensor.beams, 1, 100_000
+        yield "sensor.range_max", self.sensor.range_max, 1e-3, 1e6
+        if isinstance(self.sensor, Lidar):
+            yield "sensor.field_of_view", self.sensor.field_of_view, 1e-3, tau
+            yield "sensor.dropout", self.sensor.dropout, 0, 1
+            yield "sensor.range_noise", self.sensor.range_noise, 0, 100
         for item in fields(self.odometry):
-            value = getattr(self.odometry, item.name)
-            _require(value >= 0, f"odometry.{item.name}", value, "must not be negative")
+            yield f"odometry.{item.name}", getattr(self.odometry, item.name), 0, 1e6
+        for number, slip in enumerate(self.slips, 1):
+            yield f"slip {number}: at_s", slip.at_s, 0, 1e6
+            yield f"slip {number}: duration_s", slip.duration_s, 0, 1e6
+            yield f"slip {number}: factor", slip.factor, -100, 100
+        for number, kidnap in enumerate(self.kidnaps, 1):
+            yield f"kidnap {number}: at_s", kidnap.at_s, 0, 1e6
+            yield f"kidnap {number}: skip_s", kidnap.skip_s, 0, 1e6
 
     @property
     def odometry_period_ns(self) -> int:
@@ -137,8 +152,3 @@ def _build(kind: type, values: Mapping[str, Any]) -> Any:
     if unknown := sorted(set(values) - known):
         raise ConfigError(f"scenario: {kind.__name__} has no {unknown[0]!r}; it has {', '.join(sorted(known))}")
     return kind(**values)
-
-
-def _require(condition: bool, name: str, value: object, rule: str) -> None:
-    if not condition:
-        raise ConfigError(f"scenario: {name} {value}: {rule}")

@@ -1,7 +1,8 @@
-"""Worlds from files: a text of segments, or the report's points and waypoints."""
+"""Worlds from files: a text of segments, the report's points and waypoints, or a nav2 map."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,8 +10,10 @@ import numpy as np
 
 from hsloc.errors import ConfigError
 from hsloc.kernels.raycasting import cast_rays
+from hsloc.maps import read_map
 from hsloc.simulation.built_in import WORLDS, built_in
 from hsloc.simulation.planning import interior, plan_round_trip
+from hsloc.simulation.rasterise import outline
 from hsloc.simulation.world import World
 
 if TYPE_CHECKING:
@@ -18,21 +21,26 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
+MAPS = (".yaml", ".yml", ".pgm", ".png", ".bmp")
+"""Suffixes of nav2 maps; all else is read as text."""
+
 
 def load_world(source: str | Path, waypoints: str | Path | None = None) -> World:
     """A built-in world by name, or one from a file.
 
-    The file is a text of numbers, a row
+    The file is a nav2 map (`.yaml`: the borders of its occupied cells become walls), or a text of numbers, a row
     a line, separated by blanks or commas, `#` for comments: four columns are segments x0 y0 x1 y1, two are
     points seen through walls, all in metres. `waypoints` is such a text of two columns, and replaces the world's;
     it is a closed tour where the last point is the first. Without it a tour is planned, but for points.
-    Raises ConfigError.
+    Raises ConfigError, or MapError for a map that cannot be read.
     """
     path = Path(source)
     if str(source).replace("_", "-") in WORLDS and not path.is_file():
         world = built_in(str(source))
     elif not path.exists():
         raise ConfigError(f"world {str(source)!r} is neither built in ({', '.join(WORLDS)}) nor a file")
+    elif path.suffix.lower() in MAPS:
+        world = _from_map(path)
     else:
         world = _from_text(path, is_route_given=waypoints is not None)
     return world if waypoints is None else _with_waypoints(world, Path(waypoints))
@@ -80,9 +88,19 @@ def _from_text(path: Path, is_route_given: bool) -> World:
     return World(path.stem, rows, tour, closed=True)
 
 
-def _with_waypoints(world: World, path: Path) -> World:
-    from dataclasses import replace
+def _from_map(path: Path) -> World:
+    loaded = read_map(path)
+    grid = loaded.grid
+    height, width = grid.cells.shape
+    # a rim of open cells, so that occupied cells at the edge of the map have a border as well
+    occupied = np.pad(grid.occupied(), 1)
+    xs, ys = (np.arange(-1, count + 2) * grid.resolution for count in (width, height))
+    corners = outline(occupied, xs, ys).reshape(-1, 2)
+    segments = np.asarray(grid.origin @ corners).reshape(-1, 4)
+    return World(path.stem, segments, plan_round_trip(grid.free(), grid), closed=True, grid=grid, notes=loaded.warnings)
 
+
+def _with_waypoints(world: World, path: Path) -> World:
     waypoints = read_rows(path, (2,))
     closed = len(waypoints) > 2 and bool((waypoints[0] == waypoints[-1]).all())
     waypoints = waypoints[:-1] if closed else waypoints

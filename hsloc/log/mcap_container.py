@@ -68,6 +68,7 @@ class McapContainer:
         self.warnings: list[str] = []
         self.attachments: list[tuple[str, int]] = []
         self._schemas: dict[int, records.Schema] = {}
+        self._channels: dict[int, records.ChannelRecord] = {}
         self._segments: list[Segment] = []
         self._unpacked = 0
         try:
@@ -140,7 +141,9 @@ class McapContainer:
         return found
 
     def _unpack(self, head: ChunkHead, data: bytes) -> bytes:
-        if self._unpacked + head.size > max(FREE_UNPACKED_BYTES, MAX_TOTAL_RATIO * self._size):
+        if head.size <= records.MAX_CHUNK_BYTES and self._unpacked + head.size > max(
+            FREE_UNPACKED_BYTES, MAX_TOTAL_RATIO * self._size
+        ):
             raise Damage(f"the file would unpack to more than {MAX_TOTAL_RATIO} times its size")
         unpacked = records.decompress(head, data)
         self._unpacked += len(unpacked)
@@ -181,7 +184,7 @@ class McapContainer:
             (number,) = records.NUMBER.unpack_from(data, at + records.PREFIX.size)
         except StructError:
             return False
-        return number in (self._schemas if opcode == Opcode.SCHEMA else self.channels)
+        return number in (self._schemas if opcode == Opcode.SCHEMA else self._channels)
 
     def _define(self, opcode: int, content: bytes | memoryview, at: int, losses: Losses) -> None:
         """Take in a schema or channel; the first definition of a number stands."""
@@ -193,18 +196,7 @@ class McapContainer:
                 self._schemas.setdefault(schema.id, schema)
                 return
             record = records.parse_channel(content)
-            found = self._schemas.get(record.schema_id)
-            self.channels.setdefault(
-                record.id,
-                Channel(
-                    record.id,
-                    record.topic,
-                    long_name(found.name) if found else "",
-                    record.message_encoding,
-                    found.encoding if found else "",
-                    found.data if found else b"",
-                ),
-            )
+            self._channels.setdefault(record.id, record)
         except Damage as error:
             losses.damaged_chunks += 1
             losses.note(f"{self.path}: near byte {at}: {error}")
@@ -212,7 +204,9 @@ class McapContainer:
     def _read_what_the_index_does_not_tell(self) -> None:
         """Read the segments whose channels are unknown, and all of them if a channel is not defined."""
         indexed = {channel for s in self._segments for channel in s.channels or ()}
-        everything = not indexed <= self.channels.keys()
+        # Either may stand in the chunks alone, even where the summary repeats the other.
+        schemas = {record.schema_id for record in self._channels.values()} - {0}
+        everything = not (indexed <= self._channels.keys() and schemas <= self._schemas.keys())
         # What is damaged is counted when it is read for its own sake.
         ignored = Losses()
         with self.path.open("rb") as stream:
@@ -222,9 +216,16 @@ class McapContainer:
                 found = self._load(stream, segment, None, ignored)
                 if segment.channels is None:
                     self._segments[number] = segment._replace(channels=self._count(found))
+        self.channels = {number: self._channel(record) for number, record in sorted(self._channels.items())}
         unknown = {channel for s in self._segments for channel in s.channels or ()} - self.channels.keys()
         if unknown:
             self.warnings.append(f"{self.path}: messages on {len(unknown)} channels without definition are ignored")
+
+    def _channel(self, record: records.ChannelRecord) -> Channel:
+        schema = self._schemas.get(record.schema_id, records.Schema(0, "", "", b""))
+        return Channel(
+            record.id, record.topic, long_name(schema.name), record.message_encoding, schema.encoding, schema.data
+        )
 
     def _count(self, found: list[RawMessage]) -> frozenset[int] | None:
         """Add messages to the statistics; returns the channels, or None where nothing was readable."""

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 
+LOG_ABOVE = 25.0
+"""A curve whose highest value is this many times its median is drawn on a logarithmic scale."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
     """Values over seconds since the start, in order of time: two columns of length n."""

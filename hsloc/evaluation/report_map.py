@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import ceil, floor, log10
+from math import floor, log10
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +11,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from matplotlib.transforms import Affine2D
 
 from hsloc.evaluation import report_style as style
+from hsloc.evaluation.report_picture import picture_of
 from hsloc.model import Status
 
 if TYPE_CHECKING:
@@ -19,67 +19,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.evaluation.report_data import ReportData
+    from hsloc.evaluation.report_picture import Extent
     from hsloc.model import OccupancyGrid
 
     Floats = NDArray[np.float64]
 
-MARGIN = 0.05
-"""Free room around what is shown, as a part of the larger side."""
-LEAST_SIZE = 0.5
-"""Metres: a robot that stood still gets some ground to stand on."""
-
 HALO = [withStroke(linewidth=3.0, foreground="white")]
-
-
-@dataclass(frozen=True, slots=True)
-class Extent:
-    """The rectangle of the map frame that the panel shows, metres."""
-
-    x0: float
-    y0: float
-    x1: float
-    y1: float
-
-    @property
-    def width(self) -> float:
-        """Along x."""
-        return self.x1 - self.x0
-
-    @property
-    def height(self) -> float:
-        """Along y."""
-        return self.y1 - self.y0
-
-    @property
-    def aspect(self) -> float:
-        """Width by height."""
-        return self.width / self.height
-
-    def widened(self, aspect: float) -> Extent:
-        """The smallest rectangle around this one, with the same middle, that has another aspect."""
-        wider, higher = max(self.width, self.height * aspect), max(self.height, self.width / aspect)
-        x, y = (self.x0 + self.x1) / 2.0, (self.y0 + self.y1) / 2.0
-        return Extent(x - wider / 2.0, y - higher / 2.0, x + wider / 2.0, y + higher / 2.0)
-
-
-def shown_extent(data: ReportData, grid: OccupancyGrid | None, points: Floats | None) -> Extent:
-    """All of the known map, the trajectory and the reference. Odometry may leave the picture: it drifts."""
-    corners = [data.path]
-    if data.reference is not None:
-        corners.append(data.reference)
-    if points is not None:
-        corners.append(points)
-    if grid is not None:
-        corners.append(_known_corners(grid))
-    every = np.concatenate(corners)
-    every = every[np.isfinite(every).all(axis=1)]
-    if len(every) == 0:
-        return Extent(-1.0, -1.0, 1.0, 1.0)
-    low, high = every.min(axis=0), every.max(axis=0)
-    size = float((high - low).max())
-    size = max(size, LEAST_SIZE)
-    middle, half = (low + high) / 2.0, np.maximum(high - low, 0.08 * size) / 2.0 + MARGIN * size
-    return Extent(*(middle - half).tolist(), *(middle + half).tolist())
 
 
 def draw_map(
@@ -112,62 +57,16 @@ def draw_map(
         spine.set_color(style.RULE)
 
 
-def _known_corners(grid: OccupancyGrid) -> Floats:
-    """Corners in the map frame of the rectangle that holds all known cells, shape (4, 2); or of no cell, (0, 2)."""
-    known = grid.cells >= 0
-    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-    if len(rows) == 0:
-        return np.zeros((0, 2))
-    y0, y1, x0, x1 = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
-    corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], dtype=np.float64) * grid.resolution
-    return grid.origin @ corners
-
-
 def _draw_grid(axes: Axes, grid: OccupancyGrid, pixels: float) -> None:
-    known = grid.cells >= 0
-    if not known.any():
+    picture = picture_of(grid, pixels)
+    if picture is None:
         return
-    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-    row, column = int(rows[0]), int(columns[0])
-    cells = grid.cells[row : rows[-1] + 1, column : columns[-1] + 1]
-    factor = max(1, ceil(max(cells.shape) / pixels))
-    cells = darkest_of_blocks(cells, factor)
-    side = factor * grid.resolution
-    height, width = cells.shape
     image = axes.imshow(
-        grey_levels()[np.clip(cells, -1, 100)], origin="lower", zorder=1, interpolation="antialiased",
-        extent=(0.0, width * side, 0.0, height * side), aspect="equal",
+        picture.levels, origin="lower", zorder=1, interpolation="antialiased",
+        extent=(0.0, picture.width, 0.0, picture.height), aspect="equal",
     )  # fmt: skip
-    pose = grid.origin
-    corner = Affine2D().translate(column * grid.resolution, row * grid.resolution)
-    image.set_transform(corner.rotate(pose.theta).translate(pose.x, pose.y) + axes.transData)
-
-
-def darkest_of_blocks(cells: NDArray[np.int8], factor: int) -> NDArray[np.int8]:
-    """The map made smaller: each block of factor x factor cells becomes its most occupied one.
-
-    A mean would let walls that are one cell thick fade away.
-    """
-    if factor == 1:
-        return cells
-    height, width = (-(-side // factor) * factor for side in cells.shape)
-    padded = np.full((height, width), -1, dtype=np.int8)
-    padded[: cells.shape[0], : cells.shape[1]] = cells
-    blocks = padded.reshape(height // factor, factor, width // factor, factor)
-    result: NDArray[np.int8] = blocks.max(axis=(1, 3))
-    return result
-
-
-def grey_levels() -> NDArray[np.uint8]:
-    """RGBA of the values 0 (free) .. 100 (wall), and clear as the last row, which -1 (unknown) finds: (102, 4)."""
-    free, wall = (np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) for colour in (style.FREE, style.WALL))
-    part = np.linspace(0.0, 1.0, 101)[:, None]
-    levels = np.zeros((102, 4), dtype=np.uint8)
-    levels[:101, :3] = np.round(free * (1.0 - part) + wall * part)
-    levels[:101, 3] = 255
-    # Clear, but of the colour of the ground: a scaled picture mixes the colours of neighbours.
-    levels[101, :3] = [int(style.UNKNOWN[i : i + 2], 16) for i in (1, 3, 5)]
-    return levels
+    pose = picture.T_map_corner
+    image.set_transform(Affine2D().rotate(pose.theta).translate(pose.x, pose.y) + axes.transData)
 
 
 def _draw_paths(axes: Axes, data: ReportData) -> None:

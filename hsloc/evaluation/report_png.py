@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from hsloc.evaluation import report_style as style
 from hsloc.evaluation.files import write_atomically
 from hsloc.evaluation.report_data import prepare
-from hsloc.evaluation.report_map import Extent, draw_map, shown_extent
+from hsloc.evaluation.report_map import draw_map
+from hsloc.evaluation.report_picture import Extent, shown_extent
 from hsloc.evaluation.report_table import Row, summary, table_rows
 from hsloc.evaluation.report_time import Panel, draw_panel, draw_table, time_panels
 

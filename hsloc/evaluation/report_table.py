@@ -128,7 +128,7 @@ def _single_rows(data: ReportData, metrics: Mapping[str, object]) -> list[Row]:
         rows += _scan_rows(data.scans)
         spent = data.scans.evaluations[data.scans.evaluations > 0]
         if len(spent):
-            rows.append(Row("evaluations per match, median", (f"{np.median(spent):.0f}",)))
+            rows.append(Row("evaluations, median", (f"{np.median(spent):.0f}",)))
         fitness = data.scans.fitness[np.isfinite(data.scans.fitness)]
         if len(fitness):
             rows.append(Row("fitness, median", (f"{np.median(fitness):.3f}",)))

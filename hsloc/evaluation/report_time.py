@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
 
 from hsloc.evaluation import report_style as style
-from hsloc.evaluation.report_data import Curve
+from hsloc.evaluation.report_data import LOG_ABOVE, Curve
 from hsloc.model import Status
 
 if TYPE_CHECKING:
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from hsloc.evaluation.report_table import Row
 
 MOST_POINTS = 3000
-LOG_ABOVE = 25.0
-"""A curve whose highest value is this many times its median is drawn on a logarithmic scale."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,8 @@ from PIL import Image
 from hsloc.errors import OutputError
 from hsloc.evaluation.metrics import evaluate
 from hsloc.evaluation.report_data import Curve, prepare, reason_counts, status_counts
-from hsloc.evaluation.report_map import darkest_of_blocks, format_round_length, grey_levels, round_length, shown_extent
+from hsloc.evaluation.report_map import format_round_length, round_length
+from hsloc.evaluation.report_picture import darkest_of_blocks, grey_levels, shown_extent
 from hsloc.evaluation.report_png import draw_report
 from hsloc.evaluation.report_table import format_angle, format_duration, format_length, table_rows
 from hsloc.evaluation.report_time import time_panels

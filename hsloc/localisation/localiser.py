@@ -216,7 +216,7 @@ class Localiser:
             self._rejected = 0
             self._usual = verdict.fitness
             status = Status.RELOCALISED
-        self._take(pose, verdict.covariance, T_odom_base)
+        self._take(pose, self._covariance if verdict.covariance is None else verdict.covariance, T_odom_base)
         return Estimate(
             scan.stamp_ns,
             pose,

@@ -3,8 +3,8 @@
 The free space is cut into tiles; HIDE searches each of them over all headings, and what it finds becomes a hypothesis.
 Each further scan moves the hypotheses with the odometry, matches them again in a small window and adds to their record.
 Hypotheses that fall behind are dropped, those that meet are merged. The winner must be ahead of all others by a sum
-of fitness that grows over several scans and some way: in a place that exists twice, nobody is sure. Its way since the
-search began is told too, so that the trajectory can be completed backwards.
+of fitness that grows over several scans and some way: in a place that exists twice, nobody is sure. The scans
+seen until then are matched again, backwards, so that the trajectory can be completed.
 
 (Counting out the points whose beam runs through a wall was tried and made it worse: in the Wean Hall log a fifth of
 the beams at the true poses do, for doors are drawn shut.)
@@ -12,7 +12,8 @@ the beams at the true poses do, for doors are drawn shut.)
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections import deque
+from dataclasses import dataclass, replace
 from math import hypot, pi, radians
 from typing import TYPE_CHECKING
 
@@ -72,13 +73,13 @@ class Verdict:
     """What the relocaliser thinks after a scan."""
 
     pose: Pose2 | None
-    covariance: F64
+    covariance: F64 | None
     fitness: float | None
     evaluations: int
     is_sure: bool
     reason: str
     track: tuple[tuple[int, Pose2], ...] = ()
-    """Once it is sure: where the winner was, as (odometry messages before, T_map_odom)."""
+    """Once it is sure: the way since the search began, as (odometry messages before, T_map_odom)."""
 
 
 @dataclass(slots=True, eq=False)
@@ -88,17 +89,17 @@ class _Hypothesis:
     fitness: float
     total: float
     scans: int
-    track: list[tuple[int, Pose2]] = field(default_factory=list)
 
     @property
     def mean(self) -> float:
         return self.total / self.scans
 
 
-_UNKNOWN = np.diag((1e6, 1e6, pi**2))
 _NEAR = 0.5
 _NEAR_ANGLE = radians(15.0)
 _STEP_WINDOW = (0.25, radians(8.0))
+_REMEMBERED = 1000
+"""Scans of a search that are kept to retrace the way; older ones are forgotten, so that memory is bounded."""
 
 
 class Relocaliser:
@@ -121,16 +122,16 @@ class Relocaliser:
         self._tiles = _tiles(grid, self._parameters.tile)
         self._hypotheses: list[_Hypothesis] = []
         self._T_odom_last: Pose2 | None = None
-        self._odometry_count = 0
+        self._seen: deque[tuple[int, F64, Pose2]] = deque(maxlen=_REMEMBERED)
 
     def start(self) -> None:
         """Forget everything."""
         self._hypotheses = []
         self._T_odom_last = None
+        self._seen.clear()
 
     def update(self, scan: Scan, T_odom_base: Pose2, odometry_count: int) -> Verdict:
         """Take a scan, the odometry at its stamp, and how many odometry messages there were until now."""
-        self._odometry_count = odometry_count
         p = self._parameters
         motion = Pose2() if self._T_odom_last is None else self._T_odom_last.between(T_odom_base)
         moved = hypot(motion.x, motion.y) >= p.step_min_d or abs(motion.theta) >= p.step_min_a
@@ -140,13 +141,14 @@ class Relocaliser:
         if len(points) < max(self._min_points, 20):
             return self._verdict(motion, 0, False)
         self._T_odom_last = T_odom_base
+        self._seen.append((odometry_count, points, T_odom_base))
         if self._hypotheses and self._hypotheses[0].mean < p.restart_below:
             self._hypotheses = []
         evaluations = self._advance(points, motion)
         scans = self._hypotheses[0].scans if self._hypotheses else 1
         if scans <= p.seed_scans:
             evaluations += self._seed(points, scans)
-        self._keep(T_odom_base)
+        self._keep()
         return self._verdict(Pose2(), evaluations, True)
 
     def _seed(self, points: F64, scans: int) -> int:
@@ -185,7 +187,7 @@ class Relocaliser:
             hypothesis.scans += 1
         return evaluations
 
-    def _keep(self, T_odom_base: Pose2) -> None:
+    def _keep(self) -> None:
         """Drop the hypotheses that fell behind, merge those that met."""
         p = self._parameters
         self._hypotheses.sort(key=lambda h: -h.total)
@@ -194,22 +196,36 @@ class Relocaliser:
             if len(kept) >= p.hypotheses or hypothesis.total < self._hypotheses[0].total - p.drop:
                 break
             if not any(_same(hypothesis.pose, other.pose) for other in kept):
-                hypothesis.track.append((self._odometry_count, hypothesis.pose @ T_odom_base.inverse()))
                 kept.append(hypothesis)
         self._hypotheses = kept
 
     def _verdict(self, motion: Pose2, evaluations: int, fresh: bool) -> Verdict:
         if not self._hypotheses:
-            return Verdict(None, _UNKNOWN, None, evaluations, False, "searching the whole map")
+            return Verdict(None, None, None, evaluations, False, "searching the whole map")
         p = self._parameters
         best = self._hypotheses[0]
         lead = best.total - self._hypotheses[1].total if len(self._hypotheses) > 1 else p.drop
         sure = fresh and best.scans >= p.min_scans and best.mean >= p.min_fitness and lead >= p.lead
         reason = f"{len(self._hypotheses)} hypotheses, best {best.mean:.2f}, lead {lead:.2f}, {best.scans} scans"
-        covariance = best.covariance if sure else _UNKNOWN
+        covariance = best.covariance if sure else None
         fitness = best.fitness if fresh else None
-        track = tuple(best.track) if sure else ()
+        track = self._retrace(best.pose @ motion) if sure else ()
         return Verdict(best.pose @ motion, covariance, fitness, evaluations, sure, reason, track)
+
+    def _retrace(self, pose: Pose2) -> tuple[tuple[int, Pose2], ...]:
+        """The scans seen while searching, matched backwards from where the robot is now known to be."""
+        half, half_angle = _STEP_WINDOW
+        track: list[tuple[int, Pose2]] = []
+        T_odom_next: Pose2 | None = None
+        for count, points, T_odom_base in reversed(self._seen):
+            if T_odom_next is not None:
+                pose = pose @ T_odom_next.between(T_odom_base)
+            T_odom_next = T_odom_base
+            match = self._matcher.match(points, self._field, Window(pose, half, half, half_angle), self._rng)
+            if match.fitness >= self._parameters.min_fitness:
+                pose = match.pose
+            track.append((count, pose @ T_odom_base.inverse()))
+        return tuple(reversed(track))
 
     def _quick_matcher(self) -> HarmonySearch | Matcher:
         """The matcher with a small budget and one restart; a matcher without a budget stays as it is."""

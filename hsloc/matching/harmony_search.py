@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import ceil, log, radians
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 _GOLDEN = 0.6180339887498949
 _ALL = 10**9
+_ONE_BASIN = 0.5 * 0.5 * radians(20.0)
+"""A window of +-0.5 m and 20 degrees, m^2 rad: about what one optimum of an indoor scan draws in."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,8 +47,9 @@ class HarmonySearch:
       counts improvisations alone, as the program of [P] does. The evaluations reported are the true number always.
 
     Ours, and off in the presets of the papers: `restarts` of the whole search, ended early when `agreement` of them
-    found the same best pose; `search_points`, at most so many of the scan's points, evenly chosen, while searching;
-    `polish_iterations` Gauss-Newton steps on the interpolated field at the end of each restart, on all points.
+    found the same best pose (one more for each time the window is four times as large as +-0.5 m, 20 degrees);
+    `search_points`, at most so many of the scan's points, evenly chosen, while searching; `polish_iterations`
+    Gauss-Newton steps on the interpolated field at the end of each restart, on all points.
     """
 
     PAPER_BUDGET: ClassVar[int] = 250
@@ -61,7 +65,7 @@ class HarmonySearch:
     budget: int = 300
     count_improvisations: bool = False
     restarts: int = 24
-    agreement: int = 5
+    agreement: int = 3
     search_points: int = 100
     polish_iterations: int = 15
 
@@ -137,7 +141,7 @@ class HarmonySearch:
             budget=self.budget,
             count_improvisations=self.count_improvisations,
             restarts=self.restarts,
-            agreement=self.agreement,
+            agreement=self.agreement + _more_to_agree(window),
             polish_iterations=self.polish_iterations,
         )
 
@@ -201,6 +205,12 @@ def run_search(
         restarts=int(restarts),
         history=history[~np.isnan(history)] / len(few) if keep_history else None,
     )
+
+
+def _more_to_agree(window: Window) -> int:
+    """A larger window holds more false optima, and the same one is found twice by chance more often."""
+    size = window.half_x * window.half_y * window.half_theta / _ONE_BASIN
+    return max(ceil(log(size, 4.0)), 0) if size > 0.0 else 0
 
 
 def information_at(field: LikelihoodField, scaled: NDArray[np.float32], pose: F64) -> F64:

@@ -239,7 +239,7 @@ def _statistics(metrics: Mapping[str, object]) -> str:
         if key in metrics
     )
     return (
-        f'<section><h2>Errors against the reference</h2><p class="muted">{escape(about)}</p>'
+        f'<section><h2>Errors</h2><p class="muted">{escape(about)}</p>'
         f'<div class="scroll"><table><tr><td></td>{head}</tr>{"".join(rows)}</table></div></section>'
     )
 

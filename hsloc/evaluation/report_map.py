@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from matplotlib.transforms import Affine2D
 
 from hsloc.evaluation import report_style as style
-from hsloc.evaluation.report_picture import picture_of
+from hsloc.evaluation.report_picture import line_width, picture_of
 from hsloc.model import Status
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def draw_map(
         _draw_grid(axes, grid, pixels)
     if points is not None and len(points):
         axes.plot(points[:, 0], points[:, 1], ".", color=style.WALL, markersize=2.2, label="map points", zorder=2)
-    _draw_paths(axes, data)
+    _draw_paths(axes, data, line_width(data, extent))
     _draw_marks(axes, data)
     _draw_ends(axes, data, extent)
     _draw_scale_bar(axes, extent)
@@ -69,11 +69,11 @@ def _draw_grid(axes: Axes, grid: OccupancyGrid, pixels: float) -> None:
     image.set_transform(Affine2D().rotate(pose.theta).translate(pose.x, pose.y) + axes.transData)
 
 
-def _draw_paths(axes: Axes, data: ReportData) -> None:
+def _draw_paths(axes: Axes, data: ReportData, width: float) -> None:
     """In the order of the legend; what lies over what is said by zorder."""
     if len(data.path):
         known = np.where(data.believed[:, None], data.path, np.nan)
-        axes.plot(*known.T, color=style.BLUE, linewidth=3.0, label="trajectory", zorder=5, solid_capstyle="round")
+        axes.plot(*known.T, color=style.BLUE, linewidth=width, label="trajectory", zorder=5, solid_capstyle="round")
     if data.reference is not None and len(data.reference):
         axes.plot(*data.reference.T, color="black", linewidth=1.0, linestyle=(0, (5, 3)), label="reference", zorder=6)
     if data.odometry is not None and len(data.odometry):

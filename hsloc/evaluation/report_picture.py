@@ -25,6 +25,9 @@ MARGIN = 0.05
 LEAST_SIZE = 0.5
 """Metres: a robot that stood still gets some ground to stand on."""
 
+SURROUNDINGS = 10.0
+"""Metres of map shown around the path at least, where there are so many; more around a path that is longer."""
+
 
 @dataclass(frozen=True, slots=True)
 class Extent:
@@ -96,23 +99,37 @@ def picture_of(grid: OccupancyGrid, most_pixels: float) -> Picture | None:
 
 
 def shown_extent(data: ReportData, grid: OccupancyGrid | None, points: Floats | None) -> Extent:
-    """All of the known map, the trajectory and the reference. Odometry may leave the picture: it drifts."""
-    corners = [data.path]
-    if data.reference is not None:
-        corners.append(data.reference)
-    if points is not None:
-        corners.append(points)
-    if grid is not None:
-        corners.append(_known_corners(grid))
-    every = np.concatenate(corners)
-    every = every[np.isfinite(every).all(axis=1)]
+    """All of the trajectory and the reference, and the known map around them. Odometry may leave the picture.
+
+    Of a map that is far larger than the path only what lies within `SURROUNDINGS` of the path is shown.
+    """
+    ways = _finite(np.concatenate((data.path, np.zeros((0, 2)) if data.reference is None else data.reference)))
+    ground = _finite(
+        np.concatenate(
+            (np.zeros((0, 2)) if points is None else points, np.zeros((0, 2)) if grid is None else _known_corners(grid))
+        )
+    )
+    if len(ways) and len(ground):
+        low, high = ways.min(axis=0), ways.max(axis=0)
+        around = max(float((high - low).max()), SURROUNDINGS)
+        ground = np.clip(ground, low - around, high + around)
+    every = np.concatenate((ways, ground))
     if len(every) == 0:
         return Extent(-1.0, -1.0, 1.0, 1.0)
     low, high = every.min(axis=0), every.max(axis=0)
-    size = float((high - low).max())
-    size = max(size, LEAST_SIZE)
+    size = max(float((high - low).max()), LEAST_SIZE)
     middle, half = (low + high) / 2.0, np.maximum(high - low, 0.08 * size) / 2.0 + MARGIN * size
     return Extent(*(middle - half).tolist(), *(middle + half).tolist())
+
+
+def line_width(data: ReportData, extent: Extent) -> float:
+    """Width of the trajectory in pixels: a path that goes to and fro for long must not bury the map."""
+    laps = data.length_m / max(extent.width, extent.height)
+    return float(np.clip(3.0 * np.sqrt(5.0 / max(laps, 1e-9)), 1.6, 3.0))
+
+
+def _finite(xy: Floats) -> Floats:
+    return xy[np.isfinite(xy).all(axis=1)]
 
 
 def _known_bounds(grid: OccupancyGrid) -> tuple[int, int, int, int] | None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from hsloc.evaluation.report_picture import picture_of, shown_extent
+from hsloc.evaluation.report_picture import line_width, picture_of, shown_extent
 from hsloc.model import Status
 
 if TYPE_CHECKING:
@@ -37,8 +37,9 @@ def map_svg(data: ReportData, grid: OccupancyGrid | None, points: Floats | None)
     finest = max(extent.width, extent.height) / FINEST
     unit = max(extent.width, extent.height) / 900.0
     box = f"{-extent.width / 2:.6g} {-extent.height / 2:.6g} {extent.width:.6g} {extent.height:.6g}"
+    look = f"--u:{unit:.6g};--path:{line_width(data, extent):.2g}px"
     head = '<svg id="map" role="img" aria-label="map and trajectory" tabindex="0"'
-    parts = [f'{head} style="--u:{unit:.6g}" viewBox="{box}" data-x="{middle[0]:.9g}" data-y="{middle[1]:.9g}">']
+    parts = [f'{head} style="{look}" viewBox="{box}" data-x="{middle[0]:.9g}" data-y="{middle[1]:.9g}">']
     if grid is not None:
         parts.append(_layer("map", _image(grid, middle)))
     if points is not None and len(points):

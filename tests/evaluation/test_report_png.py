@@ -12,7 +12,7 @@ from hsloc.errors import OutputError
 from hsloc.evaluation.metrics import evaluate
 from hsloc.evaluation.report_data import Curve, prepare, reason_counts, status_counts
 from hsloc.evaluation.report_map import format_round_length, round_length
-from hsloc.evaluation.report_picture import darkest_of_blocks, grey_levels, shown_extent
+from hsloc.evaluation.report_picture import darkest_of_blocks, grey_levels, line_width, shown_extent
 from hsloc.evaluation.report_png import draw_report
 from hsloc.evaluation.report_table import format_angle, format_duration, format_length, table_rows
 from hsloc.evaluation.report_time import time_panels
@@ -106,6 +106,20 @@ def test_an_unknown_map_and_a_turned_one(run, tmp_path):
     known = turned.centres(grid.cells >= 0)
     assert extent.x0 < known[:, 0].min()
     assert extent.y1 > known[:, 1].max()
+
+
+def test_only_the_surroundings_of_a_short_path_are_shown(run):
+    grid = office(np.random.default_rng(0), width_m=300.0, height_m=60.0, resolution=0.2, noise=False)
+    short = Trajectory(run["trajectory"].stamps_ns[:2], np.array([[100.0, 0.0, 0.0], [104.0, 0.0, 0.0]]))
+    extent = shown_extent(prepare(short, None, None, None, {}), grid, None)
+    assert (extent.x0, extent.x1) == pytest.approx((90.0 - 1.2, 114.0 + 1.2))
+    assert (extent.y0, extent.y1) == pytest.approx((-10.0 - 1.2, 10.0 + 1.2))
+    path = prepare(run["trajectory"], None, None, None, {})
+    extent = shown_extent(path, run["grid"], None)
+    assert extent.width == pytest.approx(24.0 * 1.1, rel=0.01)
+    assert line_width(path, extent) == 3.0
+    many_laps = Trajectory(np.arange(4000, dtype=np.int64), np.tile([[0.0, 0, 0], [5, 0, 0]], (2000, 1)))
+    assert line_width(prepare(many_laps, None, None, None, {}), extent) == pytest.approx(1.6)
 
 
 def test_where_it_cannot_be_written(run, tmp_path):

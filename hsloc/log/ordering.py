@@ -90,6 +90,9 @@ Keyed = tuple[int, int, int, int, int, "Event"]
 """(effective stamp, raised, kind, number, log time, event); the number makes keys unique."""
 
 
+_KEY = itemgetter(0, 1, 2, 3)
+
+
 class Reorder:
     """Takes events in the order of the log, gives them in the order of time."""
 
@@ -97,12 +100,17 @@ class Reorder:
         self._clocks = clocks
         self._losses = losses
         self._pending: list[Keyed] = []
+        self._before_reset: list[Keyed] = []
         self._number = 0
         self._released_ns: int | None = None
 
     def push(self, clock: TopicClock, event: Event, log_time_ns: int) -> bool:
         """Take an event; true when it is time to ask for `ready`."""
+        last = clock.last_ns
         effective, raised = clock.effective(event.stamp_ns, log_time_ns)
+        if last is not None and effective < last:  # The clock was set back: what waits is of the time before.
+            self._before_reset += sorted(self._pending, key=_KEY)
+            self._pending = []
         self._number += 1
         kind = 0 if raised else clock.kind
         self._pending.append((effective, raised, kind, self._number, log_time_ns, event))
@@ -111,15 +119,24 @@ class Reorder:
     def ready(self) -> Iterator[tuple[int, Event]]:
         """Events that nothing can come before any more, or that waited long enough, with effective stamps."""
         pending = self._pending
-        pending.sort(key=itemgetter(0, 1, 2, 3))
+        pending.sort(key=_KEY)
         cut = self._cut(pending)
         released, self._pending = pending[:cut], pending[cut:]
-        return self._released(released)
+        yield from self._reset()
+        yield from self._released(released)
 
     def rest(self) -> Iterator[tuple[int, Event]]:
         """Everything that still waits, at the end of the log."""
-        released, self._pending = sorted(self._pending, key=itemgetter(0, 1, 2, 3)), []
-        return self._released(released)
+        released, self._pending = sorted(self._pending, key=_KEY), []
+        yield from self._reset()
+        yield from self._released(released)
+
+    def _reset(self) -> Iterator[tuple[int, Event]]:
+        """What was left of the time before a clock was set back."""
+        if self._before_reset:
+            released, self._before_reset = self._before_reset, []
+            yield from self._released(released)
+            self._released_ns = None
 
     def _cut(self, pending: list[Keyed]) -> int:
         stamps = [clock.last_ns for clock in self._clocks]

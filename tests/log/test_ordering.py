@@ -1,0 +1,144 @@
+"""The order of events: total, repeatable, and right where stamps are wrong."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from log_builders import SECOND, START, describe, make_scan
+
+from hsloc.log.ordering import KIND_ODOMETRY, KIND_SCAN, WINDOW_NS, Reorder, TopicClock
+from hsloc.log.summary import Losses
+from hsloc.model import Odometry, Pose2
+
+if TYPE_CHECKING:
+    from hsloc.model import Event
+
+MS = SECOND // 1000
+
+
+def order(arrivals: list[tuple[str, int, int]]) -> tuple[list[tuple[str, int]], Losses]:
+    """Send (kind, stamp, log time) in the order of arrival; returns (kind, stamp) as they come out."""
+    losses = Losses()
+    clocks = {
+        "odometry": TopicClock("/odom", KIND_ODOMETRY, losses),
+        "scan": TopicClock("/scan", KIND_SCAN, losses),
+    }
+    reorder = Reorder(list(clocks.values()), losses)
+    out: list[Event] = []
+    for kind, stamp, log_time in arrivals:
+        event: Event = make_scan(stamp) if kind == "scan" else Odometry(stamp, Pose2())
+        if reorder.push(clocks[kind], event, log_time):
+            out += [found for _, found in reorder.ready()]
+    out += [found for _, found in reorder.rest()]
+    return [describe(event)[:2] for event in out], losses
+
+
+def test_stamps_and_not_arrival_decide() -> None:
+    # A scan arrives when it is complete, 100 ms after its stamp; odometry at once.
+    arrivals = []
+    for number in range(500):
+        stamp = START + number * 20 * MS
+        arrivals.append(("odometry", stamp, stamp))
+        if number % 5 == 0:
+            arrivals.append(("scan", stamp - 100 * MS, stamp))
+    found, losses = order(arrivals)
+    assert [stamp for _, stamp in found] == sorted(stamp for _, stamp, _ in arrivals)
+    assert losses == Losses()
+
+
+def test_equal_stamps_odometry_comes_first() -> None:
+    found, _ = order([("scan", START, START), ("odometry", START, START)])
+    assert [kind for kind, _ in found] == ["odometry", "scan"]
+
+
+def test_stamps_that_run_backwards_keep_the_order_of_the_log() -> None:
+    # As in the Intel log: pairs of odometry and scan, whose stamps fall back by 0.9 s and catch up.
+    stamps = [0, 200, 400, 1300, 600, 800, 1000, 1400, 1600]
+    arrivals = [
+        (kind, START + stamp * MS, START + number * 200 * MS)
+        for number, stamp in enumerate(stamps)
+        for kind in ("odometry", "scan")
+    ]
+    found, losses = order(arrivals)
+    assert found == [(kind, stamp) for kind, stamp, _ in arrivals]
+    assert losses.stamps_backwards == {"/odom": 1, "/scan": 1}
+    assert losses.late_messages == 0
+
+
+def test_one_stamp_from_the_future_does_not_hold_up_what_follows() -> None:
+    arrivals = [("odometry", START + n * 20 * MS, START + n * 20 * MS) for n in range(200)]
+    arrivals[50] = ("odometry", START + 10**6 * SECOND, START + 1000 * MS)
+    found, losses = order(arrivals)
+    assert found == [(kind, stamp) for kind, stamp, _ in arrivals]
+    assert losses.stamp_jumps == {"/odom": 1}
+
+
+@pytest.mark.parametrize("step", [3600 * SECOND, -3600 * SECOND])
+def test_a_clock_that_is_set_goes_on_from_there(step: int) -> None:
+    arrivals = []
+    for n in range(400):
+        stamp = START + n * 20 * MS + (step if n >= 200 else 0)
+        arrivals += [(kind, stamp, START + n * 20 * MS) for kind in ("odometry", "scan")]
+    found, losses = order(arrivals)
+    assert sorted(found) == sorted((kind, stamp) for kind, stamp, _ in arrivals)
+    assert losses.stamp_jumps == {"/odom": 2, "/scan": 2}
+    for kind in ("odometry", "scan"):
+        assert [s for k, s in found if k == kind] == [s for k, s, _ in arrivals if k == kind]
+
+
+def test_a_gap_in_the_recording_is_no_jump() -> None:
+    arrivals = [("odometry", START + n * SECOND + (n > 5) * 1000 * SECOND, 0) for n in range(10)]
+    arrivals = [(kind, stamp, stamp + 5) for kind, stamp, _ in arrivals]
+    assert order(arrivals)[1] == Losses()
+
+
+def test_a_topic_that_fell_silent_holds_nothing_up_for_longer_than_the_window() -> None:
+    losses = Losses()
+    odometry, scan = TopicClock("/odom", KIND_ODOMETRY, losses), TopicClock("/scan", KIND_SCAN, losses)
+    reorder = Reorder([odometry, scan], losses)
+    reorder.push(scan, make_scan(START), START)
+    held = 0
+    for number in range(2000):
+        stamp = START + number * 20 * MS
+        if reorder.push(odometry, Odometry(stamp, Pose2()), stamp):
+            list(reorder.ready())
+        held = max(held, len(reorder._pending))
+    assert held < WINDOW_NS / (20 * MS) + 100
+
+
+def test_an_event_later_than_the_window_is_counted() -> None:
+    arrivals = [("odometry", START + n * 20 * MS, START + n * 20 * MS) for n in range(1000)]
+    arrivals.insert(900, ("scan", START + 100 * MS, START + 900 * 20 * MS))
+    found, losses = order(arrivals)
+    assert losses.late_messages == 1
+    assert len(found) == 1001
+
+
+def test_missing_stamps() -> None:
+    losses = Losses()
+    same, other = TopicClock("/a", 0, losses, True), TopicClock("/b", 0, losses, False)
+    assert same.stamp(0, START) == START
+    assert other.stamp(0, START) is None
+    assert same.stamp(5, START) == 5
+    assert same.stamp(0, 0) == 0  # a simulation's first message
+    assert (losses.stamps_zero, losses.stamps_zero_dropped) == ({"/a": 1}, {"/b": 1})
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_any_delays_below_the_window_come_out_sorted(data: st.DataObject) -> None:
+    arrivals = []
+    for kind, period, limit in (("odometry", 20, 100), ("scan", 100, 1500)):
+        delay = data.draw(st.integers(0, limit), label=kind)
+        jitter = data.draw(st.integers(0, period - 1))
+        for number in range(4000 // period):
+            stamp = START + number * period * MS
+            late = data.draw(st.integers(0, jitter)) if number % 7 == 0 else 0
+            arrivals.append((kind, stamp, stamp + (delay + late) * MS))
+    arrivals.sort(key=lambda arrival: arrival[2])
+    found, losses = order(arrivals)
+    assert found == [(k, s) for s, k in sorted((s, k) for k, s, _ in arrivals)]
+    assert losses == Losses()

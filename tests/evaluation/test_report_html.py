@@ -135,6 +135,13 @@ def test_any_part_may_be_missing(run, tmp_path, kept):
     write(tmp_path, trajectory=still, **{name: run[name] for name in kept})
 
 
+def test_a_map_of_points(run, tmp_path):
+    _, page = write(tmp_path, trajectory=run["trajectory"], points=np.array([[1.0, 2.0], [3.0, 4.0]]))
+    (dots,) = [attributes["d"] for attributes in page.all("path") if attributes.get("class") == "points"]
+    assert dots.count("h0") == 2
+    assert "points" in {attributes["data-toggle"] for attributes in page.all("input")}
+
+
 def test_why_scans_were_not_used(run, tmp_path):
     _, page = write(tmp_path, **run)
     count = sum(status == "rejected" for status in run["diagnostics"].status)

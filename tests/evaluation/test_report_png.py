@@ -79,6 +79,16 @@ def test_paths_of_any_size_and_shape(run, tmp_path, scale, stretch):
     assert pixels(tmp_path / "a.png")[0].shape == (1000, 1600, 3)
 
 
+def test_a_jump_of_metres_and_a_map_of_points(run, tmp_path):
+    jumped = Trajectory(run["trajectory"].stamps_ns, run["trajectory"].poses.copy())
+    jumped.poses[200:260, :2] += 40.0
+    points = np.random.default_rng(0).uniform(-10, 10, (300, 2))
+    draw_report(tmp_path / "a.png", title="jump", trajectory=jumped, reference=run["reference"], points=points)
+    draw_report(tmp_path / "b.png", title="jump", trajectory=jumped, reference=run["reference"])
+    with_points, without = (pixels(tmp_path / name)[0] for name in ("a.png", "b.png"))
+    assert (with_points != without).any(axis=2).sum() > 1000
+
+
 def test_no_pose_one_pose_and_a_reference_of_another_time(run, tmp_path):
     one = Trajectory(run["trajectory"].stamps_ns[:1], run["trajectory"].poses[:1])
     draw_report(tmp_path / "a.png", title="", trajectory=NOTHING)

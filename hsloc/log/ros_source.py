@@ -36,16 +36,23 @@ _CLOCKS_APART_NS = 5_000_000_000
 
 
 class First(NamedTuple):
-    """The first message of a topic, and whether its stamps are of the log's clock."""
+    """The first message of a topic that has a stamp, and when the topic started by the log's clock."""
 
     message: Any
     stamp_ns: int
     log_time_ns: int
+    start_log_ns: int
+    starts_unstamped: bool
 
     @property
     def shares_log_clock(self) -> bool:
         """Whether a missing stamp may be replaced by the log time."""
         return self.stamp_ns == 0 or abs(self.stamp_ns - self.log_time_ns) < _SAME_CLOCK_NS
+
+    @property
+    def origin_ns(self) -> int:
+        """The stamp of the topic's first event."""
+        return self.start_log_ns if self.starts_unstamped and self.shares_log_clock else self.stamp_ns
 
 
 class RosSource:
@@ -114,11 +121,13 @@ class RosSource:
         """The first message of a topic; the first one with a stamp, if that is soon."""
         if topic is None or topic == TF:
             return None
-        first = None
+        first: First | None = None
         for count, (log_time, message) in enumerate(self._messages(topic, typename)):
-            first = first or First(message, message.stamp_ns, log_time)
-            if message.stamp_ns != 0 or count >= _STAMPS_AT_OPENING:
-                return First(message, message.stamp_ns, log_time)
+            stamp = message.stamp_ns
+            start, unstamped = (first[3], first[4]) if first is not None else (log_time, stamp == 0 < log_time)
+            first = First(message, stamp, log_time, start, unstamped)
+            if stamp != 0 or count >= _STAMPS_AT_OPENING:
+                break
         return first
 
     def _first_truth(self) -> First | None:
@@ -218,12 +227,11 @@ class RosSource:
         stamps = []
         for first, topic in ((self._scan, self._choice.scan), (self._odom, self._choice.odom)):
             if first is not None:
-                unstamped = in_log_time or (first.stamp_ns == 0 and first.shares_log_clock)
-                stamps.append(first.log_time_ns if unstamped else first.stamp_ns)
+                stamps.append(first.start_log_ns if in_log_time else first.origin_ns)
             elif topic == TF:
                 stamps += self._first_transform(in_log_time)
         if not stamps and self._truth is not None:
-            stamps.append(self._truth.stamp_ns)
+            stamps.append(self._truth.start_log_ns if in_log_time else self._truth.origin_ns)
         return min(stamps, default=0)
 
     def _first_transform(self, in_log_time: bool) -> list[int]:

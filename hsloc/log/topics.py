@@ -72,6 +72,10 @@ def choose_topics(where: str, channels: Sequence[Channel], options: ReadOptions,
                 options.require_odometry,
                 choice.problems,
             )
+    if choice.truth is not None and choice.truth == choice.odom != TF:
+        if options.truth_topic is not None:
+            raise TopicError(f"{where}: {choice.odom} cannot be both odometry and truth; leave out --truth-topic")
+        choice.truth = None
     return choice
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -155,14 +156,26 @@ def status_counts(scans: Scans) -> dict[str, int]:
 
 
 def reason_counts(scans: Scans) -> list[tuple[str, str, int]]:
-    """(status, reason, how many scans) for all scans that were not used, the most frequent first."""
-    skipped = Counter(
-        (status, reason)
-        for status, reason in zip(scans.status, scans.reason, strict=True)
-        if reason or status in (Status.REJECTED, Status.NO_RETURNS, Status.SEARCHING)
-    )
-    ordered = sorted(skipped.items(), key=lambda entry: (-entry[1], entry[0]))
-    return [(status, reason, count) for (status, reason), count in ordered]
+    """(status, reason, how many scans) for all scans that were not used, the most frequent first.
+
+    Reasons that differ in their figures alone are one; the first of them stands for the others.
+    """
+    skipped: dict[tuple[str, str], list[str]] = {}
+    for status, reason in zip(scans.status, scans.reason, strict=True):
+        if reason or status in (Status.REJECTED, Status.NO_RETURNS, Status.SEARCHING):
+            skipped.setdefault((status, _FIGURES.sub("…", reason)), []).append(reason)
+    counts = [
+        (status, kind if len(set(reasons)) > 1 else reasons[0], reasons[0], len(reasons))
+        for (status, kind), reasons in skipped.items()
+    ]
+    counts.sort(key=lambda entry: (-entry[3], entry[:2]))
+    return [
+        (status, reason if reason == example else f"{reason} (first: {example})", count)
+        for status, reason, example, count in counts
+    ]
+
+
+_FIGURES = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
 def _first(diagnostics: ScanDiagnostics | None) -> int:

@@ -98,6 +98,7 @@ def _pair_rows(data: ReportData, metrics: Mapping[str, object]) -> list[Row]:
 
     add("APE rmse", "ape")
     add("APE max", "ape", name="max")
+    add("APE rmse where localised", "localised_only", "ape")
     if data.errors is not None and data.errors.odometry_alone is not None:
         alone = data.errors.odometry_alone.errors.statistics()
         rows.append(

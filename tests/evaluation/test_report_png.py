@@ -168,6 +168,16 @@ def test_lost_spans_and_counts(run):
     assert ("rejected", "fitness 0.41 below 0.55", counts["rejected"]) in reason_counts(scans)
 
 
+def test_reasons_that_differ_in_figures_are_one(run):
+    diagnostics = diagnostics_of(np.random.default_rng(0), run["reference"], rejected=0.2)
+    reasons = [f"fitness {0.3 + i / 1e4:.4f} below 0.55" if r else "" for i, r in enumerate(diagnostics.reason)]
+    object.__setattr__(diagnostics, "reason", tuple(reasons))
+    scans = prepare(run["trajectory"], None, None, diagnostics, {}).scans
+    counted = {status: (reason, count) for status, reason, count in reason_counts(scans)}
+    first = next(reason for reason, status in zip(reasons, diagnostics.status, strict=True) if status == "rejected")
+    assert counted["rejected"] == (f"fitness … below … (first: {first})", diagnostics.status.count("rejected"))
+
+
 def test_the_curves_are_the_errors(run):
     data = prepare(run["trajectory"], None, run["reference"], None, run["metrics"])
     rmse = float(np.sqrt(np.mean(data.errors.translation_m.values**2)))

@@ -38,7 +38,8 @@ class SearchParameters(NamedTuple):
     par_max: float
     bandwidth_max: tuple[float, float, float]
     """Of each coordinate, in cells, cells and radians."""
-    bandwidth_min: tuple[float, float, float]
+    bandwidth_ratio: float
+    """What is left of it at the end, as a part."""
     improvisations_per_pass: int
     """HRT; 0: no differential evolution (plain Harmony Search)."""
     attraction: float
@@ -109,6 +110,7 @@ def improve_memory(
 
     new = np.empty(3, dtype=np.float64)
     bandwidth = np.empty(3, dtype=np.float64)
+    log_ratio = log(p.bandwidth_ratio)
     improvisations = 0
     spent = 0 if p.count_improvisations else evaluations
     while spent < p.budget:
@@ -120,9 +122,9 @@ def improve_memory(
             improvisations += 1
             progress = min((spent + 1.0) / p.budget, 1.0)
             par = p.par_min + (p.par_max - p.par_min) * progress  # [IHS] eq. 3
-            for j in range(3):  # [IHS] eq. 4
-                ratio = p.bandwidth_min[j] / p.bandwidth_max[j]
-                bandwidth[j] = p.bandwidth_max[j] * exp(log(ratio) * progress)
+            shrunk = exp(log_ratio * progress)  # [IHS] eq. 4
+            for j in range(3):
+                bandwidth[j] = p.bandwidth_max[j] * shrunk
             _improvise(memory, low, high, par, bandwidth, p.consideration_rate, rng, new)
             total = score_sum(packed, points, new[0], new[1], new[2], sums[worst])
             if total > sums[worst]:
@@ -181,9 +183,9 @@ def search(
     """Search the box with restarts; writes the best `pose` (3,) and its `information` (3, 3), see `polish`.
 
     The restarts improvise on `few_points` (an even choice of the points, for speed), each ends with a polish on
-    all `points`, and the pose that is fittest on all points wins. With `agreement` = k the search ends as soon as k
-    restarts have arrived at the same best pose: an easy match stops early, a hard one goes on. Only the first one is
-    told the prediction, or agreement would be no evidence.
+    these; the pose that is fittest on all `points` wins and is polished on all of them. With `agreement` = k the
+    search ends as soon as k restarts have arrived at the same best pose: an easy match stops early, a hard one goes
+    on. Only the first restart is told the prediction, or agreement would be no evidence.
     Returns the fitness on all points, the evaluations, the restarts made and why it stopped.
     """
     p = parameters
@@ -191,7 +193,6 @@ def search(
     memory = np.empty((p.memory_size, 3), dtype=np.float64)
     sums = np.empty(p.memory_size, dtype=np.float64)
     candidate = np.empty(3, dtype=np.float64)
-    candidate_information = np.zeros((3, 3), dtype=np.float64)
     none = np.empty(0, dtype=np.float64)
     low = centre - half_widths
     high = centre + half_widths
@@ -217,10 +218,10 @@ def search(
         evaluations += spent
         candidate[:] = memory[row]
         if p.polish_iterations > 0:
-            total, spent = polish(packed, points, candidate, low, high, p.polish_iterations, candidate_information)
-        else:
-            total = score_sum(packed, points, candidate[0], candidate[1], candidate[2], -2.0)
-            spent = 0 if len(few_points) == len(points) else 1
+            _, spent = polish(packed, few_points, candidate, low, high, p.polish_iterations, information)
+            evaluations += spent
+        total = score_sum(packed, points, candidate[0], candidate[1], candidate[2], -2.0)
+        spent = 1
         evaluations += spent
         same = (
             agreed > 0
@@ -235,8 +236,10 @@ def search(
         if total > best_total:
             best_total = total
             pose[:] = candidate
-            information[:] = candidate_information
         if p.restarts > 1 and agreed >= p.agreement:
             stopped = STOPPED_AGREEMENT
             break
+    if p.polish_iterations > 0:
+        best_total, spent = polish(packed, points, pose, low, high, p.polish_iterations, information)
+        evaluations += spent
     return best_total / n, evaluations, restart, stopped

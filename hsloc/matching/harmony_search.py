@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 _GOLDEN = 0.6180339887498949
 _ALL = 10**9
-_ONE_BASIN = 0.5 * 0.5 * radians(20.0)
-"""A window of +-0.5 m and 20 degrees, m^2 rad: about what one optimum of an indoor scan draws in."""
+_ONE_BASIN = 0.35 * 0.35 * radians(14.0)
+"""A window of +-0.35 m and 14 degrees, m^2 rad: about what one optimum of an indoor scan draws in."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,9 +47,9 @@ class HarmonySearch:
       counts improvisations alone, as the program of [P] does. The evaluations reported are the true number always.
 
     Ours, and off in the presets of the papers: `restarts` of the whole search, ended early when `agreement` of them
-    found the same best pose (one more for each time the window is four times as large as +-0.5 m, 20 degrees);
+    found the same best pose (one more for each time the window is four times as large as +-0.35 m, 14 degrees);
     `search_points`, at most so many of the scan's points, evenly chosen, while searching; `polish_iterations`
-    Gauss-Newton steps on the interpolated field at the end of each restart, on all points.
+    Gauss-Newton steps on the interpolated field at the end of each restart, and for the winner on all points.
     """
 
     PAPER_BUDGET: ClassVar[int] = 250
@@ -65,7 +65,7 @@ class HarmonySearch:
     budget: int = 300
     count_improvisations: bool = False
     restarts: int = 24
-    agreement: int = 3
+    agreement: int = 2
     search_points: int = 100
     polish_iterations: int = 15
 
@@ -122,19 +122,18 @@ class HarmonySearch:
         return 0, 0.0, 0.0
 
     def _parameters(self, field: LikelihoodField, window: Window) -> SearchParameters:
-        bandwidth = (self.bandwidth_max, self.bandwidth_min)
         scale = np.array((1.0 / field.resolution, 1.0 / field.resolution, 1.0))
         if self.relative_bandwidth:
             scale *= half_widths_in(field, window)
-        high, low = (tuple(float(value * s) for s in scale) for value in bandwidth)
+        widest = scale * self.bandwidth_max
         passes, attraction, weight = self._differential_evolution()
         return SearchParameters(
             memory_size=self.memory_size,
             consideration_rate=self.consideration_rate,
             par_min=self.par_min,
             par_max=self.par_max,
-            bandwidth_max=(high[0], high[1], high[2]),
-            bandwidth_min=(low[0], low[1], low[2]),
+            bandwidth_max=(float(widest[0]), float(widest[1]), float(widest[2])),
+            bandwidth_ratio=self.bandwidth_min / self.bandwidth_max,
             improvisations_per_pass=passes,
             attraction=attraction,
             differential_weight=weight,

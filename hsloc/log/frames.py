@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import degrees, radians
 from typing import TYPE_CHECKING
 
+from hsloc.errors import LogFormatError
 from hsloc.log import definitions
 from hsloc.log.decoders import Undecodable, canonical_type, decoder_for, is_decodable
 from hsloc.log.summary import Losses
@@ -17,30 +18,39 @@ if TYPE_CHECKING:
 
     from hsloc.log.container import Container
     from hsloc.log.decode import LinkMessage
+    from hsloc.log.decoders import Decoder
 
 BASE_FRAMES = ("base_footprint", "base_link", "base")
 """Names to try where no odometry names the base, in this order."""
 TILT_WARNING = radians(3.0)
 
 
-def read_links(containers: Sequence[Container], topic: str, limit: int | None = None) -> Iterator[LinkMessage]:
-    """All transforms on a topic, in the order of the log; at most `limit` messages of each file."""
+def read_links(
+    containers: Sequence[Container], topic: str, limit: int | None = None, problems: list[str] | None = None
+) -> Iterator[LinkMessage]:
+    """All transforms on a topic, in the order of the log; at most `limit` messages of each file.
+
+    A log can be read without them: what stands in the way goes to `problems`.
+    """
     for container in containers:
-        decoders = {
-            channel.id: decoder_for(channel)
-            for channel in container.channels.values()
-            if has_name(channel, topic)
-            and canonical_type(channel.typename) == definitions.TF_MESSAGE
-            and is_decodable(channel)
-        }
+        decoders: dict[int, Decoder] = {}
+        for channel in container.channels.values():
+            if not has_name(channel, topic) or canonical_type(channel.typename) != definitions.TF_MESSAGE:
+                continue
+            try:
+                if is_decodable(channel):
+                    decoders[channel.id] = decoder_for(channel)
+            except LogFormatError as error:
+                if problems is not None:
+                    problems.append(f"transforms are not read: {error}")
         if not decoders:
             continue
         # Damage is counted when the log is read for its events.
-        for number, (_, _, channel, data) in enumerate(container.messages(decoders.keys(), Losses())):
+        for number, (_, _, channel_id, data) in enumerate(container.messages(decoders.keys(), Losses())):
             if limit is not None and number >= limit:
                 break
             try:
-                yield from decoders[channel](data)
+                yield from decoders[channel_id](data)
             except Undecodable:
                 continue
 
@@ -52,11 +62,11 @@ class Mountings:
         self._containers = containers
         self._override = override
         self._static = FrameTree()
-        for link in read_links(containers, TF_STATIC):
+        self.warnings: list[str] = []
+        for link in read_links(containers, TF_STATIC, problems=self.warnings):
             self._static.add(link.parent, link.child, link.transform)
         self._all: FrameTree | None = None
         self._known: dict[str, tuple[Mounting, str]] = {}
-        self.warnings: list[str] = []
         self.base_frame = base_frame if base_frame is not None else self._guessed_base()
 
     def of(self, laser_frame: str) -> Mounting:
@@ -106,7 +116,7 @@ class Mountings:
         if self._all is None:
             self._all = FrameTree()
             static = self._static.children()
-            for link in read_links(self._containers, TF):
+            for link in read_links(self._containers, TF, problems=self.warnings):
                 if link.child not in static:
                     self._all.add(link.parent, link.child, link.transform)
             for link in read_links(self._containers, TF_STATIC):

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 NO_RETURN_CM = 8183
 CLIP_REPEATS = 3
+CLIP_MIN = 5.0
 RANGE_MIN = 0.02
 """Metres; readings of zero are invalid."""
 
@@ -23,7 +24,8 @@ class RangeRule:
     The scanners of the classic logs measure in 13 bits of centimetres, of which the last are codes (telegram
     listing LMS2xx): 8183 is *more than the maximum*, 8184 to 8191 are *no valid value*. So 81.83 m becomes +inf
     (no return), and what is above it NaN. Some logs were clipped afterwards: where the largest reading below the
-    codes is a whole number of metres and occurs three times or more, it is the clipping value and becomes +inf.
+    codes is a whole number of metres (5 at least) and occurs three times or more, it is the clipping value and
+    becomes +inf.
     """
 
     largest: float = 0.0
@@ -43,7 +45,7 @@ class RangeRule:
     @property
     def clip(self) -> float | None:
         """The value at which readings were clipped, metres, or None."""
-        whole = self.largest >= 1.0 and abs(self.largest - round(self.largest)) < 1e-4
+        whole = self.largest >= CLIP_MIN and abs(self.largest - round(self.largest)) < 1e-4
         return self.largest if whole and self.repeats >= CLIP_REPEATS else None
 
     @property

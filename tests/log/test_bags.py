@@ -1,0 +1,133 @@
+"""ROS bags hold the same as the MCAP they were made from, and raise nothing but our errors when they are broken."""
+
+from __future__ import annotations
+
+import shutil
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from log_builders import describe, write_run
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from hsloc.errors import HslocError, LogFormatError
+from hsloc.log import definitions
+from hsloc.log.reader import open_log
+from hsloc.log.summary import Losses, ReadOptions
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+ROS1 = get_typestore(Stores.ROS1_NOETIC)
+ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", definitions.TF_MESSAGE))
+ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+
+
+@pytest.fixture(scope="module")
+def mcap(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("bags") / "run.mcap")
+
+
+def to_ros1(message: Any) -> Any:
+    """ROS 1's headers have a sequence number."""
+    if hasattr(message, "header"):
+        header = message.header
+        message.header = ROS1.types["std_msgs/msg/Header"](seq=0, stamp=header.stamp, frame_id="/" + header.frame_id)
+    for part in getattr(message, "transforms", ()):
+        to_ros1(part)
+    return message
+
+
+@pytest.fixture(scope="module")
+def bag1(mcap: Path) -> Path:
+    path = mcap.with_name("run.bag")
+    compressed = Writer1(path)
+    compressed.set_compression(Writer1.CompressionFormat.LZ4)
+    with AnyReader([mcap]) as reader, compressed as writer:
+        connections: dict[str, Any] = {}
+        for connection, log_time, raw in reader.messages():
+            name = connection.msgtype
+            if connection.topic not in connections:
+                connections[connection.topic] = writer.add_connection(connection.topic, name, typestore=ROS1)
+            message = to_ros1(reader.deserialize(raw, name))
+            writer.write(connections[connection.topic], log_time, ROS1.serialize_ros1(message, name))
+    return path
+
+
+@pytest.fixture(scope="module")
+def bag2(mcap: Path) -> Path:
+    path = mcap.with_name("bag2")
+    with AnyReader([mcap]) as reader, Writer2(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connections: dict[str, Any] = {}
+        for connection, log_time, raw in reader.messages():
+            if connection.topic not in connections:
+                connections[connection.topic] = writer.add_connection(
+                    connection.topic, connection.msgtype, typestore=ROS2
+                )
+            writer.write(connections[connection.topic], log_time, raw)
+    return path
+
+
+@pytest.mark.parametrize("which", ["bag1", "bag2", "bare"])
+def test_a_bag_gives_the_same_events_as_its_mcap(request: pytest.FixtureRequest, mcap: Path, which: str) -> None:
+    path: Path = request.getfixturevalue("bag2" if which == "bare" else which)
+    if which == "bare":
+        (path,) = path.glob("*.db3")
+    log, twin = open_log(path), open_log(mcap)
+    assert [describe(event) for event in log.events()] == [describe(event) for event in twin.events()]
+    assert log.losses == Losses()
+    assert log.verify() == Losses()
+    assert log.summary.extrinsics == "/tf_static"
+    assert log.summary.laser_frame == "laser"
+    assert log.summary.T_base_laser == twin.summary.T_base_laser
+    assert (log.summary.start_ns, log.summary.end_ns) == (twin.summary.start_ns, twin.summary.end_ns)
+    assert [(t.topic, t.typename, t.count) for t in log.summary.topics] == [
+        (t.topic, t.typename, t.count) for t in twin.summary.topics
+    ]
+    assert len(log.sha256()) == 64
+
+
+def test_the_folder_of_a_bag_without_metadata_is_read_file_by_file(tmp_path: Path, bag2: Path, mcap: Path) -> None:
+    shutil.copytree(bag2, tmp_path / "bag")
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    expected = [describe(event) for event in open_log(mcap).events()]
+    assert [describe(event) for event in open_log(tmp_path / "bag").events()] == expected
+
+
+def test_bag_and_mcap_together(bag1: Path, mcap: Path) -> None:
+    both = list(open_log([bag1, mcap]).events())
+    assert len(both) == 2 * len(list(open_log(mcap).events()))
+
+
+def test_a_cut_bag_is_one_line(tmp_path: Path, bag1: Path) -> None:
+    path = tmp_path / "cut.bag"
+    path.write_bytes(bag1.read_bytes()[:3000])
+    with pytest.raises(LogFormatError, match=r"cut\.bag: cannot be read as a ROS 1 bag") as caught:
+        open_log(path)
+    assert "\n" not in str(caught.value)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damaged_bags_raise_nothing_but_our_errors(
+    tmp_path_factory: pytest.TempPathFactory, bag1: Path, bag2: Path, data: st.DataObject
+) -> None:
+    source = data.draw(st.sampled_from([bag1, next(bag2.glob("*.db3"))]))
+    content = bytearray(source.read_bytes())
+    for _ in range(data.draw(st.integers(1, 5))):
+        content[data.draw(st.integers(20, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.mktemp("damaged") / source.name
+    path.write_bytes(content)
+    message = ""
+    try:
+        log = open_log(path, ReadOptions(require_scan=False, require_odometry=False))
+        count = sum(1 for _ in log.events())
+    except HslocError as error:
+        message, count = str(error), 0
+    assert count <= 130
+    assert "\n" not in message

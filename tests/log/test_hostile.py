@@ -1,0 +1,113 @@
+"""Any bytes: an error of ours or a log, in bounded time."""
+
+from __future__ import annotations
+
+import struct
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from log_builders import scan_payloads, write_raw, write_run
+from mcap.writer import CompressionType
+
+from hsloc.errors import HslocError
+from hsloc.log.reader import open_log
+from hsloc.log.summary import ReadOptions
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+ALL = ReadOptions(require_scan=False, require_odometry=False)
+LIMIT_S = 2.0
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    """Files of every shape to start from."""
+    folder = tmp_path_factory.mktemp("seeds")
+    files = [write_run(folder / "run.mcap", scans=6, truth=True)]
+    for number, options in enumerate(
+        [
+            {"compression": CompressionType.NONE},
+            {"compression": CompressionType.LZ4},
+            {"use_chunking": False},
+            {"repeat_channels": False, "repeat_schemas": False},
+        ]
+    ):
+        payloads = scan_payloads(6)
+        files.append(write_raw(folder / f"{number}.mcap", payloads, **options))  # type: ignore[arg-type]
+    return [file.read_bytes() for file in files]
+
+
+def read_all(path: Path) -> int:
+    """Everything that a log can be asked for; only errors of ours may come out."""
+    begin = time.perf_counter()
+    count = 0
+    try:
+        log = open_log(path, ALL)
+        count = sum(1 for _ in log.events())
+        log.map()
+        log.initial_pose()
+        log.verify()
+        assert isinstance(log.losses.lines(), list)
+    except HslocError as error:
+        assert "\n" not in str(error)  # noqa: PT017
+    assert time.perf_counter() - begin < LIMIT_S
+    return count
+
+
+@settings(max_examples=400, deadline=None)
+@given(data=st.data())
+def test_mutated_bytes(tmp_path_factory: pytest.TempPathFactory, seeds: list[bytes], data: st.DataObject) -> None:
+    content = bytearray(data.draw(st.sampled_from(seeds)))
+    for _ in range(data.draw(st.integers(1, 6))):
+        at = data.draw(st.integers(8, len(content) - 1))
+        kind = data.draw(st.sampled_from(["byte", "length", "delete", "insert", "copy"]))
+        if kind == "byte":
+            content[at] = data.draw(st.integers(0, 255))
+        elif kind == "length":
+            value = data.draw(st.sampled_from([0, 1, 9, 1 << 16, 1 << 31, (1 << 32) - 1, 1 << 62, (1 << 64) - 1]))
+            content[at : at + 8] = struct.pack("<Q", value)
+        elif kind == "delete":
+            del content[at : at + data.draw(st.integers(1, 64))]
+        elif kind == "insert":
+            content[at:at] = data.draw(st.binary(min_size=1, max_size=64))
+        else:
+            source = data.draw(st.integers(0, len(content) - 1))
+            content[at:at] = content[source : source + 200]
+        if len(content) < 20:
+            break
+    path = tmp_path_factory.mktemp("mutated") / "log.mcap"
+    path.write_bytes(content)
+    read_all(path)
+
+
+@settings(max_examples=100, deadline=None)
+@given(body=st.binary(max_size=400), seed=st.integers(0, 4))
+def test_random_records_behind_a_good_start(
+    tmp_path_factory: pytest.TempPathFactory, seeds: list[bytes], body: bytes, seed: int
+) -> None:
+    path = tmp_path_factory.mktemp("random") / "log.mcap"
+    path.write_bytes(seeds[seed][:60] + body)
+    read_all(path)
+
+
+def test_every_truncation_is_a_log_with_losses_or_an_error(tmp_path: Path, seeds: list[bytes]) -> None:
+    path = tmp_path / "log.mcap"
+    for content in seeds:
+        counts = []
+        for size in range(0, len(content), max(len(content) // 60, 1)):
+            path.write_bytes(content[:size])
+            counts.append(read_all(path))
+        # More of the file is never fewer events.
+        assert counts == sorted(counts)
+        path.write_bytes(content)
+        assert read_all(path) >= counts[-1] > 0
+
+
+def test_a_file_of_empty_records_is_walked_through(tmp_path: Path, seeds: list[bytes]) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(seeds[0][:8] + struct.pack("<BQ", 0x90, 0) * 200_000)
+    assert read_all(path) == 0

@@ -19,6 +19,7 @@ from hsloc.simulation.built_in import built_in
 from hsloc.simulation.presets import SCENARIOS
 from hsloc.simulation.recorder import record
 from hsloc.simulation.scenario import Kidnap, Scenario
+from hsloc.simulation.sensors import Lidar
 from hsloc.simulation.simulator import Tick, simulate
 
 SHORT = replace(SCENARIOS["kidnapped"], duration_s=4.0, kidnaps=(Kidnap(at_s=2.0, skip_s=10.0),))
@@ -148,7 +149,7 @@ def test_memory_does_not_grow_with_the_drive():
 
     peaks = []
     for seconds in (4.0, 40.0):
-        scenario = replace(SCENARIOS["corridor-loop"], duration_s=seconds)
+        scenario = replace(SCENARIOS["corridor-loop"], duration_s=seconds, sensor=Lidar(beams=5))
         world = built_in(scenario.world)
         tracemalloc.start()
         for _ in simulate(scenario, world):

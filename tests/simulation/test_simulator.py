@@ -18,7 +18,7 @@ from hsloc.simulation.scenario import Kidnap, Scenario
 from hsloc.simulation.sensors import Lidar
 from hsloc.simulation.simulator import events, simulate
 
-SHORT = replace(SCENARIOS["office"], duration_s=6.0)
+SHORT = replace(SCENARIOS["office"], duration_s=6.0, sensor=replace(SCENARIOS["office"].sensor, beams=72))
 OFFICE = built_in("office")
 
 
@@ -55,8 +55,8 @@ def test_distorted_scans_straighten_when_each_beam_is_put_where_it_was_measured(
     ticks, scans = split(replace(SHORT, sensor=sensor, duration_s=12.0))
     stamps = np.array([tick.stamp_ns for tick in ticks])
     straight, bent = [], []
-    for scan in scans[10:100]:
-        at = scan.stamp_ns + 1e9 * scan.time_increment * np.arange(360)
+    for scan in scans[10:100:3]:
+        at = scan.stamp_ns + 1e9 * scan.time_increment * np.arange(len(scan.ranges))
         index = np.clip(np.searchsorted(stamps, at, side="right") - 1, 0, len(ticks) - 2)
         fraction = (at - stamps[index]) / 20e6
         poses = [

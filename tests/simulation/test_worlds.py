@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from hsloc.errors import ConfigError
-from hsloc.model import Pose2
+from hsloc.maps import save_map
+from hsloc.model import OccupancyGrid, Pose2
 from hsloc.simulation.built_in import WORLDS, built_in
 from hsloc.simulation.floor_plan import floor_plan, inset, polygon
 from hsloc.simulation.presets import SCENARIOS
@@ -89,6 +90,37 @@ def test_a_world_of_segments_gets_a_way_that_keeps_clear(tmp_path):
     assert world.distance_to_walls(dense).min() > 0.3
     assert path[:, 0].min() < 3.0  # it visits both sides of the wall
     assert path[:, 0].max() > 7.0
+
+
+def test_a_world_from_a_map_has_the_borders_of_its_cells_for_walls(tmp_path):
+    cells = np.full((80, 120), 0, dtype=np.int8)
+    cells[0, :] = cells[-1, :] = cells[:, 0] = cells[:, -1] = 100
+    cells[0:40, 60] = 100
+    grid = OccupancyGrid(cells, 0.1, Pose2(-3.0, 2.0, 0.5))
+    world = load_world(save_map(grid, tmp_path / "hall"))
+    assert world.name == "hall"
+    corners = (np.array([(0, 0), (120, 0), (120, 80), (0, 80), (1, 1), (60, 40), (61, 40)]) * 0.1).astype(float)
+    assert world.distance_to_walls(grid.origin @ corners).max() < 1e-9
+    assert world.distance_to_walls(grid.origin @ np.array([(6.05, 4.5)]))[0] == pytest.approx(0.5)
+    np.testing.assert_array_equal(world.occupancy_grid(0.05).cells, cells)  # the map stays the map
+    path = world.path()
+    dense = np.concatenate([a + np.linspace(0, 1, 50)[:, None] * (b - a) for a, b in pairwise(path)])
+    assert world.distance_to_walls(dense).min() > 0.3
+
+
+def test_a_map_that_says_free_where_it_means_unknown_is_noted(tmp_path):
+    grid = OccupancyGrid(np.pad(np.zeros((40, 40), dtype=np.int8), 10, constant_values=-1), 0.1)
+    grid.cells[10, 10:50] = 100
+    yaml = save_map(grid, tmp_path / "m")
+    assert load_world(yaml).notes == ()
+    yaml.write_text(yaml.read_text().replace("0.196", "0.25"))
+    assert "free_thresh" in load_world(yaml).notes[0]
+
+
+def test_a_map_without_room_for_the_robot_is_refused(tmp_path):
+    yaml = save_map(OccupancyGrid(np.full((5, 5), 100, dtype=np.int8), 0.1), tmp_path / "m")
+    with pytest.raises(ConfigError, match="no free place is"):
+        load_world(yaml)
 
 
 def test_waypoints_replace_the_way(tmp_path):

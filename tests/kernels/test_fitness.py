@@ -1,0 +1,107 @@
+"""The kernels against their slow twins; the same tests run without the compiler (NUMBA_DISABLE_JIT=1)."""
+
+from __future__ import annotations
+
+import naive
+import numpy as np
+import pytest
+
+from hsloc.kernels.fitness import fitness_many, normal_equations, pack, point_scores, score_sum
+from hsloc.kernels.polish import polish, solve_damped
+
+
+@pytest.fixture
+def scene():
+    rng = np.random.default_rng(3)
+    scores = rng.random((30, 40)).astype(np.float32)
+    packed = np.empty((29, 39, 4), dtype=np.float32)
+    pack(scores, packed, 0, 29, 0, 39)
+    points = rng.uniform(-12.0, 12.0, (37, 2)).astype(np.float32)
+    return scores, packed, points
+
+
+@pytest.mark.parametrize("pose", [(20.0, 15.0, 0.3), (2.0, 27.5, -2.0), (-5.0, 3.0, 1.0), (500.0, 500.0, 0.0)])
+def test_the_sum_is_that_of_the_naive_twin_points_outside_count_nothing(scene, pose):
+    scores, packed, points = scene
+    expected = naive.score_sum(scores, points, *pose)
+    assert score_sum(packed, points, *pose, -2.0) == pytest.approx(expected, abs=2e-4)
+    assert fitness_many(packed, points, np.array([pose]))[0] == pytest.approx(expected / 37, abs=1e-5)
+
+
+def test_scores_of_the_points_add_up(scene):
+    _, packed, points = scene
+    each = np.empty(37, dtype=np.float32)
+    point_scores(packed, points, 20.0, 15.0, 0.3, each)
+    assert each.sum() == pytest.approx(score_sum(packed, points, 20.0, 15.0, 0.3, -2.0), abs=1e-4)
+
+
+def test_a_candidate_is_dropped_only_if_it_cannot_win(scene):
+    _, packed, points = scene
+    total = score_sum(packed, points, 20.0, 15.0, 0.3, -2.0)
+    assert score_sum(packed, points, 20.0, 15.0, 0.3, total - 1e-9) == total
+    assert score_sum(packed, points, 20.0, 15.0, 0.3, total) == -1.0
+    assert score_sum(packed, points, 20.0, 15.0, 0.3, 36.9) == -1.0
+
+
+def test_packing_part_of_a_field_touches_that_part_alone(scene):
+    scores, packed, _ = scene
+    changed = scores.copy()
+    changed[10:12, 10:12] = 0.0
+    again = packed.copy()
+    pack(changed, again, 9, 12, 9, 12)
+    whole = np.empty_like(packed)
+    pack(changed, whole, 0, 29, 0, 39)
+    assert np.array_equal(again, whole)
+
+
+def test_the_gradient_is_that_of_finite_differences(scene):
+    scores, packed, points = scene
+    pose = np.array([20.3, 14.6, 0.4])
+    information, gradient = np.empty((3, 3)), np.empty(3)
+    total = normal_equations(packed, points, *pose, information, gradient)
+    # Single precision, and the two kernels add in another order.
+    assert total == pytest.approx(score_sum(packed, points, *pose, -2.0), abs=1e-4)
+    jacobian = np.empty((37, 3))
+    inside = np.empty(37)
+    for i, point in enumerate(points):
+        inside[i] = naive.score_sum(scores, [point], *pose)
+        for j in range(3):
+            step = np.zeros(3)
+            step[j] = 1e-6
+            ahead, behind = (naive.score_sum(scores, [point], *(pose + sign * step)) for sign in (1, -1))
+            jacobian[i, j] = (ahead - behind) / 2e-6
+    used = inside > 0.0
+    np.testing.assert_allclose(information, jacobian[used].T @ jacobian[used], rtol=2e-3, atol=1e-3)
+    np.testing.assert_allclose(gradient, jacobian[used].T @ (1.0 - inside[used]), rtol=2e-3, atol=2e-3)
+
+
+def test_the_damped_step_solves_the_equations():
+    rng = np.random.default_rng(0)
+    factor = rng.normal(size=(3, 3))
+    information, gradient, step = factor @ factor.T + np.eye(3), rng.normal(size=3), np.empty(3)
+    solve_damped(information, gradient, 0.1, step)
+    damped = information + 0.1 * np.diag(np.diag(information))
+    np.testing.assert_allclose(damped @ step, gradient, atol=1e-6)
+
+
+def test_a_singular_system_gives_no_step():
+    step = np.ones(3)
+    solve_damped(np.zeros((3, 3)), np.ones(3), 0.0, step)
+    assert np.isfinite(step).all()
+
+
+def test_polish_climbs_and_stays_in_the_box(scene):
+    _, packed, points = scene
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        start = np.array([rng.uniform(5, 35), rng.uniform(5, 25), rng.uniform(-3, 3)])
+        before = score_sum(packed, points, *start, -2.0)
+        pose = start.copy()
+        half = np.array((0.5, 0.5, 0.05))
+        low, high = start - half, start + half
+        total, evaluations = polish(packed, points, pose, low, high, 15, np.zeros((3, 3)))
+        assert total >= before - 1e-4
+        assert total == pytest.approx(score_sum(packed, points, *pose, -2.0), abs=1e-4)
+        assert (pose >= low).all()
+        assert (pose <= high).all()
+        assert 1 <= evaluations <= 16

@@ -1,0 +1,89 @@
+"""Pairing of scans with odometry: exact, between, at the ends, and with clocks that run backwards."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hsloc.model import Estimate, Odometry, PairedScan, Pose2, Scan, Status, Truth
+from hsloc.replay.engine import pair, replay
+
+RANGES = np.ones(3, dtype=np.float32)
+
+
+def odometry(stamp, x):
+    return Odometry(stamp, Pose2(float(x), 0.0, 0.0))
+
+
+def scan(stamp):
+    return Scan(stamp, RANGES, 0.0, 0.1, 0.1, 10.0)
+
+
+def told(events):
+    """What comes out, in short: O stamp, S stamp x, T stamp."""
+    out = []
+    for event in pair(events):
+        if isinstance(event, PairedScan):
+            out.append(("S", event.scan.stamp_ns, round(event.T_odom_base.x, 9)))
+        else:
+            out.append(("O" if isinstance(event, Odometry) else "T", event.stamp_ns))
+    return out
+
+
+def test_a_scan_waits_for_the_odometry_after_it():
+    events = [odometry(0, 0), scan(5), odometry(10, 1), scan(12), odometry(20, 2)]
+    assert told(events) == [("O", 0), ("S", 5, 0.5), ("O", 10), ("S", 12, 1.2), ("O", 20)]
+
+
+def test_a_scan_with_the_stamp_of_an_odometry_takes_it():
+    assert told([odometry(0, 0), odometry(10, 1), scan(10), odometry(20, 5)])[2] == ("S", 10, 1.0)
+    assert told([scan(10), odometry(10, 1)]) == [("O", 10), ("S", 10, 1.0)]
+
+
+def test_at_the_ends_the_nearest_odometry_must_do():
+    assert told([scan(0), odometry(10, 1)]) == [("S", 0, 1.0), ("O", 10)]
+    assert told([odometry(0, 3), scan(5)]) == [("O", 0), ("S", 5, 3.0)]
+
+
+def test_a_log_without_odometry_gives_all_its_scans():
+    assert told([scan(k) for k in range(100)]) == [("S", k, 0.0) for k in range(100)]
+
+
+def test_clocks_that_run_backwards_pair_by_stamp():
+    events = [odometry(50, 1), scan(50), odometry(45, 2), scan(45), odometry(60, 3)]
+    assert told(events) == [("O", 50), ("S", 50, 1.0), ("O", 45), ("S", 45, 2.0), ("O", 60)]
+
+
+def test_a_late_scan_is_placed_among_recent_odometry():
+    events = [odometry(0, 0), odometry(10, 1), odometry(20, 2), scan(15), odometry(30, 3)]
+    assert ("S", 15, 1.5) in told(events)
+
+
+def test_order_of_scans_is_kept_and_none_is_lost():
+    events = [odometry(0, 0)]
+    for k in range(1, 300):
+        events += [scan(10 * k - 3), scan(10 * k - 2), odometry(10 * k, k)]
+    out = told(events)
+    scans = [entry for entry in out if entry[0] == "S"]
+    assert [stamp for _, stamp, _ in scans] == [event.stamp_ns for event in events if isinstance(event, Scan)]
+    for _, stamp, x in scans:
+        assert x == pytest.approx(stamp / 10.0)
+
+
+class Spy:
+    def __init__(self):
+        self.seen = []
+
+    def update(self, event):
+        self.seen.append(event)
+        return Estimate(0, Pose2(), Status.PREDICTED)
+
+
+def test_the_truth_never_reaches_the_estimator():
+    spy = Spy()
+    events = [odometry(0, 0), Truth(0, Pose2(9.0, 9.0, 0.0)), scan(0)]
+    out = list(replay(events, spy))
+    assert [type(event) for event in spy.seen] == [Odometry, PairedScan]
+    assert [(type(event), estimate is None) for event, estimate in out] == [
+        (Odometry, False), (Truth, True), (PairedScan, False)
+    ]  # fmt: skip

@@ -86,6 +86,7 @@ _SCAN = Struct("<7fI")
 _POSE = Struct("<7d")
 _MAP_INFO = Struct("<fII")
 _COVARIANCE_BYTES = 36 * 8
+_ZEROS = bytes(_COVARIANCE_BYTES)
 _PLANE = np.array((0, 1, 5, 6, 7, 11, 30, 31, 35))
 _BODY = 4
 """Offsets of CDR count from behind the encapsulation."""
@@ -154,6 +155,8 @@ def laser_scan(data: Payload) -> ScanMessage:
 @lru_cache(maxsize=64)
 def _plane_covariance(raw: bytes) -> NDArray[np.float64] | None:
     """3 x 3 of (x, y, yaw) from the 36 doubles; None where all of them are zero. Most logs repeat a few."""
+    if raw == _ZEROS:
+        return None
     values: NDArray[np.float64] = np.frombuffer(raw, dtype="<f8")[_PLANE].reshape(3, 3)
     if not values.any():
         return None

@@ -35,6 +35,8 @@ MAX_TOTAL_RATIO = 100
 FREE_UNPACKED_BYTES = 4 << 30
 """... but in any case as many as this: maps of unknown cells pack 1 : 8000."""
 MAX_METADATA = 1000
+_FEW = 4096
+"""Messages held back that are rather sorted anew with each segment (a sorted list is a heap as well)."""
 _LOOSE_BYTES = 1 << 20
 """Messages outside of chunks are taken together up to this size."""
 
@@ -86,23 +88,27 @@ class McapContainer:
         segments = [s for s in self._segments if s.channels is None or s.channels & chosen]
         heap: list[RawMessage] = []
         held = 0
-        last = -1
+        last = 0
         self._unpacked = 0
         try:
             with self.path.open("rb") as stream:
                 for index, segment in enumerate(segments):
                     horizon = segments[index + 1].start_ns if index + 1 < len(segments) else 1 << 64
                     found = self._load(stream, segment, chosen, losses)
-                    split = bisect_left(found, horizon, key=itemgetter(0)) if not heap else 0
-                    if split and found[0][0] < last:
-                        losses.late_messages += bisect_left(found, last, key=itemgetter(0))
-                    yield from found[:split]
-                    if split:
-                        last = max(last, found[split - 1][0])
-                    for message in found[split:]:
-                        # A copy, so that not the whole chunk stays in memory for one message.
-                        heapq.heappush(heap, (*message[:3], bytes(message[3])))
-                        held += len(message[3])
+                    if len(heap) < _FEW:
+                        found = sorted(heap + found) if heap else found
+                        split = bisect_left(found, horizon, key=itemgetter(0))
+                        if split:
+                            losses.late_messages += bisect_left(found, last, hi=split, key=itemgetter(0))
+                            last = max(last, found[split - 1][0])
+                        yield from found[:split]
+                        # Copies, so that not the whole chunk stays in memory for a few messages.
+                        heap = [(*message[:3], bytes(message[3])) for message in found[split:]]
+                        held = sum(len(message[3]) for message in heap)
+                    else:
+                        for message in found:
+                            heapq.heappush(heap, (*message[:3], bytes(message[3])))
+                            held += len(message[3])
                     while heap and (heap[0][0] < horizon or held > MAX_HELD_BYTES):
                         message = heapq.heappop(heap)
                         held -= len(message[3])

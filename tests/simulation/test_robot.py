@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from itertools import pairwise
 from math import hypot, pi, radians
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from hsloc.model import Pose2
 from hsloc.model.pose2 import wrap_angles
 from hsloc.simulation.built_in import built_in
 from hsloc.simulation.robot import DifferentialDrive, SteeredVehicle
+from hsloc.simulation.world_files import load_world
 
 STEP_S = 0.02
 
@@ -69,7 +72,7 @@ def test_steered_vehicle_is_the_reports_motion_model():
     np.testing.assert_allclose(np.diff(poses[:, 1]), v * dt * np.sin(g + poses[:-1, 2]), atol=3e-6)
 
 
-def test_steered_vehicle_needs_the_published_time_for_a_way_of_its_kind():
+def test_a_u_turn_takes_the_time_that_the_turn_rate_gives():
     """Radius v / rate: a U-turn of 180 degrees takes pi / rate seconds, whatever the speed."""
     poses = drive(SteeredVehicle(), Pose2(), [(0, 0), (-60, 0)], 0.025)
     turning = np.abs(wrap_angles(np.diff(poses[:, 2]))) > radians(19.9) * 0.025
@@ -80,6 +83,19 @@ def test_paper_world_is_driven_like_the_reports():
     world = built_in("paper")
     poses = drive(SteeredVehicle(), world.start(), world.path(), 0.025)
     assert len(poses) * 0.025 == pytest.approx(120.0, rel=0.1)
+
+
+@pytest.mark.data
+def test_the_reports_way_takes_the_published_time():
+    """[P]: 119.8 s and 359 m; scans come every 0.2 s, of which 599 fit."""
+    folder = Path(os.environ.get("HSLOC_DATA", Path(__file__).parents[3] / "shared" / "data")) / "paper"
+    if not (folder / "waypoints.csv").exists():
+        pytest.skip(f"{folder} is not there; set HSLOC_DATA")
+    world = load_world(folder / "localisation_map.csv", folder / "waypoints.csv")
+    poses = drive(SteeredVehicle(), world.start(), world.path(), 0.025)
+    seconds = (len(poses) - 1) * 0.025
+    assert seconds == pytest.approx(119.8, abs=0.1)
+    assert 3.0 * seconds == pytest.approx(359.0, abs=0.3)
 
 
 def test_a_drive_is_the_same_every_time():

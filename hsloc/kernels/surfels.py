@@ -1,0 +1,448 @@
+"""Scan against scan: short pieces of wall, and the equations that pull two scans onto each other.
+
+Each hit of a scan carries the line fitted to the hits around it (a surfel: centroid and normal). A point of another
+scan is looked up by its bearing in the scan it is compared with (projective association, as in Blais and Levine 1995),
+so that no field and no tree is needed, and what one side of a wall has seen is never paired with
+its other side. The residual is the distance from point to line (Chen and Medioni 1992; Censi 2008 for planar scans).
+
+Scans are stored one after the other (`hsloc.slam.keyscans`): hits of scan k are rows start[k] to start[k + 1] of
+`points`, `normals`, `centroids` (P, 2; base frame, metres); its beams are entries table_start[k] to
+table_start[k + 1] of `hit_of_beam` (row of the hit within the scan, or -1) and `ranges` (m; +inf: no return, free;
+NaN: invalid). `geometry` (n, 5) is the laser's x, y, theta in the base, angle_min, angle_increment.
+"""
+
+from __future__ import annotations
+
+from math import atan2, cos, pi, sin, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    F32 = NDArray[np.float32]
+    F64 = NDArray[np.float64]
+    I32 = NDArray[np.int32]
+    I64 = NDArray[np.int64]
+
+_MOST_NEIGHBOURS = 16
+"""Hits taken on each side of a hit, at most."""
+_MOST_BEAMS = 4
+"""Beams looked at on each side of the beam in which a point lies, at most."""
+_SAME_FACE = 0.7
+"""Cosine of the angle between the normals of one wall in two scans, at least."""
+_THROUGH = 0.25
+"""A beam that ends so far (m) behind a point has looked through it."""
+
+
+@njit(cache=True, nogil=True)
+def fit_surfels(
+    points: F32, beams: I32, spacing: float, radius: float, normals: F32, centroids: F32, origin: F64
+) -> None:
+    """Fit a line to the hits around each hit; writes unit `normals` towards `origin` (the laser) and `centroids`.
+
+    The neighbours are those within `radius` metres, and at least two on either side, as long as the wall goes on:
+    no gap between two beams longer than a wall seen at a grazing angle would leave (`spacing` is the angle between
+    beams in rad). A hit without a straight neighbourhood gets the normal (0, 0).
+    """
+    n = len(points)
+    for i in range(n):
+        normals[i, 0] = normals[i, 1] = np.float32(0.0)
+        centroids[i] = points[i]
+        x0 = np.float64(points[i, 0])
+        y0 = np.float64(points[i, 1])
+        count = 1
+        sx = 0.0
+        sy = 0.0
+        sxx = 0.0
+        sxy = 0.0
+        syy = 0.0
+        for direction in (-1, 1):
+            k = i
+            for step in range(_MOST_NEIGHBOURS):
+                k += direction
+                if k < 0 or k >= n or abs(beams[k] - beams[k - direction]) > 2:
+                    break
+                px = np.float64(points[k, 0])
+                py = np.float64(points[k, 1])
+                qx = np.float64(points[k - direction, 0])
+                qy = np.float64(points[k - direction, 1])
+                depth = sqrt((px - origin[0]) ** 2 + (py - origin[1]) ** 2)
+                gap = sqrt((px - qx) ** 2 + (py - qy) ** 2)
+                if gap > min(0.1 + 4.0 * spacing * depth, 0.8):
+                    break
+                dx = px - x0
+                dy = py - y0
+                if step >= 2 and dx * dx + dy * dy > radius * radius:
+                    break
+                count += 1
+                sx += dx
+                sy += dy
+                sxx += dx * dx
+                sxy += dx * dy
+                syy += dy * dy
+        if count < 4:
+            continue
+        mx = sx / count
+        my = sy / count
+        cxx = sxx / count - mx * mx
+        cxy = sxy / count - mx * my
+        cyy = syy / count - my * my
+        half = 0.5 * (cxx + cyy)
+        root = sqrt(0.25 * (cxx - cyy) ** 2 + cxy * cxy)
+        smaller = max(half - root, 0.0)
+        larger = half + root
+        if larger <= 1e-6 or smaller > 0.03 * 0.03 or smaller > 0.08 * larger:
+            continue
+        # The normal is the eigenvector of the smaller eigenvalue: turned by a right angle from the larger one's.
+        angle = 0.5 * atan2(2.0 * cxy, cxx - cyy)
+        nx = -sin(angle)
+        ny = cos(angle)
+        if nx * (origin[0] - x0) + ny * (origin[1] - y0) < 0.0:
+            nx = -nx
+            ny = -ny
+        normals[i, 0] = nx
+        normals[i, 1] = ny
+        centroids[i, 0] = x0 + mx
+        centroids[i, 1] = y0 + my
+
+
+@njit(cache=True, nogil=True)
+def bearing(y: float, x: float) -> float:
+    """atan2(y, x) to 1e-5 rad, in a quarter of its time (Abramowitz and Stegun 4.4.49): good to find a beam."""
+    ax = abs(x)
+    ay = abs(y)
+    longer = max(ax, ay)
+    if longer == 0.0:
+        return 0.0
+    z = min(ax, ay) / longer
+    q = z * z
+    angle = z * (0.9998660 + q * (-0.3302995 + q * (0.1801410 + q * (-0.0851330 + q * 0.0208351))))
+    if ay > ax:
+        angle = 0.5 * pi - angle
+    if x < 0.0:
+        angle = pi - angle
+    return -angle if y < 0.0 else angle
+
+
+@njit(cache=True, nogil=True)
+def pair_terms(
+    i: int,
+    j: int,
+    rx: float,
+    ry: float,
+    rt: float,
+    points: F32,
+    normals: F32,
+    centroids: F32,
+    start: I64,
+    hit_of_beam: I32,
+    ranges: F32,
+    table_start: I64,
+    geometry: F64,
+    stride: int,
+    gate: float,
+    scale: float,
+    information: F64,
+    gradient: F64,
+    counts: F64,
+) -> None:
+    """Equations of scan i against scan j, the pose of i in j being (rx, ry, rt).
+
+    Overwrites `information` (3, 3) = sum w J^T J and `gradient` (3,) = sum w J^T r with the residuals r (m) and
+    their derivatives by (rx, ry, rt), weights w = 1 / (1 + r^2 / scale^2)^2 (Geman-McClure), and `counts` =
+    (paired within `gate`, conflicts: points where j looked through, points in j's field of view, sum of w r^2, sum of
+    w). Every `stride`-th hit of i is used.
+    """
+    c = cos(rt)
+    s = sin(rt)
+    first = table_start[j]
+    n_beams = table_start[j + 1] - first
+    hits_j = start[j]
+    laser_x = geometry[j, 0]
+    laser_y = geometry[j, 1]
+    zero_angle = geometry[j, 2] + geometry[j, 3]
+    sense = 1.0 if geometry[j, 4] > 0.0 else -1.0
+    spacing = abs(geometry[j, 4])
+    turn = 2.0 * pi
+    gate2 = gate * gate
+    weaken = 1.0 / (scale * scale)
+    paired = conflicts = seen = 0
+    squares = weights = 0.0
+    xx = xy = xt = yy = yt = tt = gx = gy = gt = 0.0
+    for a in range(start[i], start[i + 1], stride):
+        mx = np.float64(normals[a, 0])
+        my = np.float64(normals[a, 1])
+        if mx == 0.0 and my == 0.0:
+            continue
+        px = np.float64(points[a, 0])
+        py = np.float64(points[a, 1])
+        dx = c * px - s * py
+        dy = s * px + c * py
+        x = rx + dx
+        y = ry + dy
+        lx = x - laser_x
+        ly = y - laser_y
+        angle = sense * (bearing(ly, lx) - zero_angle) + 0.5 * spacing
+        angle -= turn * np.floor(angle / turn)
+        middle = int(angle / spacing)
+        if middle >= n_beams:
+            continue
+        seen += 1
+        depth = sqrt(lx * lx + ly * ly)
+        # The hit nearest to the point, among the beams around its own.
+        reach = min(int(gate / (depth * spacing + 1e-9)) + 1, _MOST_BEAMS)
+        best = np.inf
+        chosen = -1
+        for k in range(max(middle - reach, 0), min(middle + reach + 1, n_beams)):
+            row = hit_of_beam[first + k]
+            if row >= 0:
+                ex = x - np.float64(points[hits_j + row, 0])
+                ey = y - np.float64(points[hits_j + row, 1])
+                squared = ex * ex + ey * ey
+                if squared < best:
+                    best = squared
+                    chosen = hits_j + row
+        if best > gate2:
+            # Did j look through the point? Only where all three beams around it ended well behind it.
+            nearest = np.inf
+            known = 0
+            for k in range(max(middle - 1, 0), min(middle + 2, n_beams)):
+                end = np.float64(ranges[first + k])
+                if end == end:
+                    known += 1
+                    nearest = min(nearest, end)
+            if known >= 2 and depth + _THROUGH < nearest:
+                conflicts += 1
+                continue
+            if chosen < 0 or best > gate2 + (2.0 * spacing * depth) ** 2:
+                continue
+        nx = np.float64(normals[chosen, 0])
+        ny = np.float64(normals[chosen, 1])
+        # Both sides must have seen the same face of the wall; (0, 0), no surfel, fails here too.
+        if nx * (c * mx - s * my) + ny * (s * mx + c * my) < _SAME_FACE:
+            continue
+        ex = x - np.float64(centroids[chosen, 0])
+        ey = y - np.float64(centroids[chosen, 1])
+        r = nx * ex + ny * ey
+        if abs(r) > gate:
+            continue
+        w = 1.0 / (1.0 + r * r * weaken)
+        w *= w
+        jt = ny * dx - nx * dy
+        paired += 1
+        squares += w * r * r
+        weights += w
+        wx = w * nx
+        wy = w * ny
+        wt = w * jt
+        xx += wx * nx
+        xy += wx * ny
+        xt += wx * jt
+        yy += wy * ny
+        yt += wy * jt
+        tt += wt * jt
+        gx += wx * r
+        gy += wy * r
+        gt += wt * r
+    information[0, 0] = xx
+    information[0, 1] = information[1, 0] = xy
+    information[0, 2] = information[2, 0] = xt
+    information[1, 1] = yy
+    information[1, 2] = information[2, 1] = yt
+    information[2, 2] = tt
+    gradient[0] = gx
+    gradient[1] = gy
+    gradient[2] = gt
+    counts[0] = paired
+    counts[1] = conflicts
+    counts[2] = seen
+    counts[3] = squares
+    counts[4] = weights
+
+
+@njit(cache=True, nogil=True)
+def relative(first: F64, second: F64, out: F64) -> None:
+    """`first^-1 @ second` of two poses (x, y, theta); theta is not wrapped."""
+    c = cos(first[2])
+    s = sin(first[2])
+    dx = second[0] - first[0]
+    dy = second[1] - first[1]
+    out[0] = c * dx + s * dy
+    out[1] = -s * dx + c * dy
+    out[2] = second[2] - first[2]
+
+
+@njit(cache=True, nogil=True)
+def add_relative_term(
+    pose_j: F64, rel: F64, information: F64, gradient: F64, hjj: F64, hji: F64, hii: F64, gj: F64, gi: F64, ha: F64
+) -> None:
+    """Move a term in the pose of i seen from j, `rel`, onto the two poses in the map, adding to the five blocks.
+
+    With rel = R_j^T (t_i - t_j), theta_i - theta_j: A = d rel / d pose_i, B = d rel / d pose_j.
+    `ha` (3, 3) is scratch; matrices this small are faster by hand than by BLAS.
+    """
+    c = cos(pose_j[2])
+    s = sin(pose_j[2])
+    # H A: A turns (x, y) by -theta_j.
+    for k in range(3):
+        hx = information[k, 0]
+        hy = information[k, 1]
+        ha[k, 0] = hx * c - hy * s
+        ha[k, 1] = hx * s + hy * c
+        ha[k, 2] = information[k, 2]
+    for k in range(3):
+        # A^T (H A), rows first
+        x = ha[0, k]
+        y = ha[1, k]
+        ax = c * x - s * y
+        ay = s * x + c * y
+        at = ha[2, k]
+        hii[0, k] += ax
+        hii[1, k] += ay
+        hii[2, k] += at
+        # B = -A but for its last column, (rel_y, -rel_x, -1).
+        hji[0, k] -= ax
+        hji[1, k] -= ay
+        hji[2, k] += rel[1] * x - rel[0] * y - at
+    # H_jj = B^T H B = B^T H (-A) but for the last column, which is B^T H b.
+    bx = rel[1] * information[0, 0] - rel[0] * information[0, 1] - information[0, 2]
+    by = rel[1] * information[1, 0] - rel[0] * information[1, 1] - information[1, 2]
+    bt = rel[1] * information[2, 0] - rel[0] * information[2, 1] - information[2, 2]
+    cross_x = -(c * bx - s * by)
+    cross_y = -(s * bx + c * by)
+    for k in range(2):
+        x = ha[0, k]
+        y = ha[1, k]
+        hjj[0, k] += c * x - s * y
+        hjj[1, k] += s * x + c * y
+    hjj[0, 2] += cross_x
+    hjj[1, 2] += cross_y
+    hjj[2, 0] += cross_x
+    hjj[2, 1] += cross_y
+    hjj[2, 2] += rel[1] * bx - rel[0] * by - bt
+    ax = c * gradient[0] - s * gradient[1]
+    ay = s * gradient[0] + c * gradient[1]
+    gi[0] += ax
+    gi[1] += ay
+    gi[2] += gradient[2]
+    gj[0] -= ax
+    gj[1] -= ay
+    gj[2] += rel[1] * gradient[0] - rel[0] * gradient[1] - gradient[2]
+
+
+@njit(cache=True, nogil=True)
+def assemble_pairs(
+    poses: F64,
+    pairs: I64,
+    pair_weights: F64,
+    points: F32,
+    normals: F32,
+    centroids: F32,
+    start: I64,
+    hit_of_beam: I32,
+    ranges: F32,
+    table_start: I64,
+    geometry: F64,
+    strides: I64,
+    gate: float,
+    scale: float,
+    diagonal: F64,
+    off_diagonal: F64,
+    right: F64,
+    counts: F64,
+) -> float:
+    """The equations of all pairs (m, 2) of scans, either scan against the other, at `poses` (n, 3).
+
+    Adds to `diagonal` (n, 3, 3) and `right` (n, 3); overwrites `off_diagonal` (m, 3, 3), the block of rows
+    pairs[:, 0] and columns pairs[:, 1], and `counts` (m, 5), the sum over both directions (see `pair_terms`). Returns
+    the sum of weighted squares.
+    """
+    information = np.empty((3, 3))
+    gradient = np.empty(3)
+    rel = np.empty(3)
+    tally = np.empty(5)
+    total = 0.0
+    transposed = np.empty((3, 3))
+    ha = np.empty((3, 3))
+    for m in range(len(pairs)):
+        off_diagonal[m] = 0.0
+        counts[m] = 0.0
+        weight = pair_weights[m]
+        for direction in range(2):
+            j = pairs[m, direction]
+            i = pairs[m, 1 - direction]
+            relative(poses[j], poses[i], rel)
+            pair_terms(
+                i, j, rel[0], rel[1], rel[2], points, normals, centroids, start, hit_of_beam, ranges, table_start,
+                geometry, strides[i], gate, scale, information, gradient, tally,
+            )  # fmt: skip
+            counts[m] += tally
+            total += weight * tally[3]
+            information *= weight
+            gradient *= weight
+            if direction == 0:
+                add_relative_term(
+                    poses[j],
+                    rel,
+                    information,
+                    gradient,
+                    diagonal[j],
+                    off_diagonal[m],
+                    diagonal[i],
+                    right[j],
+                    right[i],
+                    ha,
+                )
+            else:
+                transposed[:] = 0.0
+                add_relative_term(
+                    poses[j], rel, information, gradient, diagonal[j], transposed, diagonal[i], right[j], right[i], ha
+                )
+                off_diagonal[m] += transposed.T
+    return total
+
+
+@njit(cache=True, nogil=True)
+def add_edges(
+    poses: F64, edges: I64, measured: F64, information: F64, scale: F64, diagonal: F64, off_diagonal: F64, right: F64
+) -> float:
+    """The equations of edges (m, 2): pose `measured` (m, 3) of edges[:, 1] seen from edges[:, 0].
+
+    Adds to `diagonal` and `right`, overwrites `off_diagonal` (m, 3, 3) as in `assemble_pairs`. `scale` (m,)
+    weighs each edge down: w = scale^2 / (scale^2 + chi^2), Cauchy's weight; infinite: no robust weight. Returns the sum
+    of weighted chi^2.
+    """
+    rel = np.empty(3)
+    error = np.empty(3)
+    ha = np.empty((3, 3))
+    total = 0.0
+    for m in range(len(edges)):
+        off_diagonal[m] = 0.0
+        j = edges[m, 0]
+        i = edges[m, 1]
+        relative(poses[j], poses[i], rel)
+        for k in range(3):
+            error[k] = rel[k] - measured[m, k]
+        error[2] -= 2.0 * pi * np.round(error[2] / (2.0 * pi))
+        gradient = information[m] @ error
+        chi2 = error @ gradient
+        weight = 1.0
+        if scale[m] < np.inf:
+            weight = scale[m] ** 2 / (scale[m] ** 2 + chi2)
+        total += weight * chi2
+        add_relative_term(
+            poses[j],
+            rel,
+            weight * information[m],
+            weight * gradient,
+            diagonal[j],
+            off_diagonal[m],
+            diagonal[i],
+            right[j],
+            right[i],
+            ha,
+        )
+    return total

@@ -1,0 +1,94 @@
+"""The scans that carry the map, in the flat arrays that the kernels want."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.kernels.surfels import fit_surfels
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hsloc.model.events import Scan
+
+    F32 = NDArray[np.float32]
+    F64 = NDArray[np.float64]
+    I32 = NDArray[np.int32]
+    I64 = NDArray[np.int64]
+
+_SURFEL_RADIUS = 0.2
+"""Hits within this distance (m) are fitted together."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyScan:
+    """A scan prepared: its hits with surfels, and its beams for looking up (hsloc/kernels/surfels.py)."""
+
+    points: F32
+    normals: F32
+    centroids: F32
+    hit_of_beam: I32
+    ranges: F32
+    geometry: F64
+
+    @staticmethod
+    def of(scan: Scan) -> KeyScan:
+        """Prepare a scan; hits are those of `Scan.hits`."""
+        hits = scan.hits()
+        points = np.ascontiguousarray(scan.points_base(), dtype=np.float32)
+        beams = np.flatnonzero(hits).astype(np.int32)
+        hit_of_beam = np.full(len(scan.ranges), -1, dtype=np.int32)
+        hit_of_beam[beams] = np.arange(len(beams), dtype=np.int32)
+        ranges = np.where(hits | scan.no_returns(), scan.ranges, np.nan).astype(np.float32)
+        laser = scan.T_base_laser
+        geometry = np.array((laser.x, laser.y, laser.theta, scan.angle_min, scan.angle_increment))
+        normals, centroids = np.empty_like(points), np.empty_like(points)
+        fit_surfels(points, beams, abs(scan.angle_increment), _SURFEL_RADIUS, normals, centroids, geometry[:2])
+        return KeyScan(points, normals, centroids, hit_of_beam, ranges, geometry)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyScans:
+    """All keyscans of a log, one after the other."""
+
+    points: F32
+    normals: F32
+    centroids: F32
+    start: I64
+    hit_of_beam: I32
+    ranges: F32
+    table_start: I64
+    geometry: F64
+
+    @staticmethod
+    def joined(scans: list[KeyScan]) -> KeyScans:
+        """Of at least one scan."""
+        return KeyScans(
+            np.concatenate([scan.points for scan in scans]),
+            np.concatenate([scan.normals for scan in scans]),
+            np.concatenate([scan.centroids for scan in scans]),
+            _starts([len(scan.points) for scan in scans]),
+            np.concatenate([scan.hit_of_beam for scan in scans]),
+            np.concatenate([scan.ranges for scan in scans]),
+            _starts([len(scan.ranges) for scan in scans]),
+            np.array([scan.geometry for scan in scans]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.start) - 1
+
+    def hits(self, index: int) -> F32:
+        """Hits of a scan in the base's frame, shape (n, 2)."""
+        return self.points[self.start[index] : self.start[index + 1]]
+
+    def strides(self, most: int) -> I64:
+        """For each scan the step that leaves about `most` of its hits."""
+        counts = np.diff(self.start)
+        return np.maximum(np.round(counts / most), 1).astype(np.int64)
+
+
+def _starts(lengths: list[int]) -> I64:
+    return np.concatenate(([0], np.cumsum(lengths))).astype(np.int64)

@@ -1,0 +1,100 @@
+"""The graph mapper: SLAM that uses the future.
+
+While the log is read, each scan is matched against the scans just before it. At its end loops are closed between
+places, the pose graph is solved, all scans are refined against all that see the same walls, until nothing moves, and
+the map is drawn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.localisation.motion import predict_covariance
+from hsloc.model.estimate import Estimate, Status
+from hsloc.model.events import Odometry, PairedScan
+from hsloc.model.pose2 import IDENTITY
+from hsloc.slam.drawing import DrawingParameters
+from hsloc.slam.keyscans import KeyScan
+from hsloc.slam.local_matching import LocalMatcher, LocalMatchingParameters
+from hsloc.slam.loop_closer import LoopParameters
+from hsloc.slam.refinement import RefinementParameters
+from hsloc.slam.track import Track
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.random import Generator
+    from numpy.typing import NDArray
+
+    from hsloc.slam.local_matching import LocalMatch
+    from hsloc.slam.result import MappingResult
+
+    F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GraphMapperParameters:
+    """All of the graph mapper's, one default for all logs."""
+
+    local_matching: LocalMatchingParameters = field(default_factory=LocalMatchingParameters)
+    loops: LoopParameters = field(default_factory=LoopParameters)
+    refinement: RefinementParameters = field(default_factory=RefinementParameters)
+    drawing: DrawingParameters = field(default_factory=DrawingParameters)
+    use_odometry: bool = True
+    """Otherwise a constant velocity predicts, and the log's odometry is not looked at."""
+    passes: int = 3
+    """The whole log is gone over again at most so often, until nothing moves."""
+
+
+class Mapper:
+    """An `Estimator` that draws its own map; `finish` tells what the whole log knows."""
+
+    def __init__(self, parameters: GraphMapperParameters, rng: Generator) -> None:
+        self._parameters = parameters
+        self._rng = rng
+        self._matcher = LocalMatcher(parameters.local_matching, rng, parameters.use_odometry)
+        self._track = Track(parameters.local_matching.turn_length)
+        self._scans: list[KeyScan] = []
+        self._stamps: list[int] = []
+        self._local: list[LocalMatch] = []
+        self._T_map_odom = IDENTITY
+        self._T_map_key = IDENTITY
+        self._covariance = np.zeros((3, 3))
+
+    def update(self, event: Odometry | PairedScan) -> Estimate:
+        """Take an event; the estimate at its stamp, in the map as it is known so far (it drifts)."""
+        if isinstance(event, Odometry):
+            self._track.add(event.T_odom_base, is_scan=False)
+            return Estimate(event.stamp_ns, self._T_map_odom @ event.T_odom_base, Status.PREDICTED)
+        points = event.scan.points_base()
+        found = self._matcher.update(event, points)
+        covariance = predict_covariance(self._covariance, self._T_map_key, found.motion, found.covariance)
+        T_odom_base = event.T_odom_base if self._parameters.use_odometry else found.pose
+        self._track.add(T_odom_base, is_scan=True, is_key=found.is_keyscan)
+        if found.is_keyscan:
+            self._covariance, self._T_map_key = covariance, found.pose
+            self._scans.append(KeyScan.of(event.scan))
+            self._stamps.append(event.scan.stamp_ns)
+            self._local.append(found)
+        self._T_map_odom = found.pose @ event.T_odom_base.inverse()
+        return Estimate(
+            event.scan.stamp_ns,
+            found.pose,
+            found.status,
+            covariance,
+            found.fitness,
+            found.evaluations,
+            found.reason,
+        )
+
+    def finish(self, progress: Callable[[float], None] | None = None) -> MappingResult:
+        """Close loops, refine, draw; `progress` is told parts from 0 to 1. May be called once, at the end."""
+        from hsloc.slam.second_pass import finish
+
+        return finish(
+            self._scans, np.array(self._stamps, dtype=np.int64), self._local, self._track, self._parameters,
+            self._rng, progress,
+        )  # fmt: skip

@@ -1,0 +1,219 @@
+"""After the log: loops, graph, refinement and the map, from what the front end has gathered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.model.occupancy_grid import OccupancyGrid
+from hsloc.model.pose2 import Pose2, relative_poses
+from hsloc.slam.drawing import draw_grid
+from hsloc.slam.keyscans import KeyScans
+from hsloc.slam.loop_closer import Loop, LoopCloser
+from hsloc.slam.places import Places
+from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
+from hsloc.slam.refinement import Refined, refine
+from hsloc.slam.result import MappingQuality, MappingResult
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.random import Generator
+    from numpy.typing import NDArray
+
+    from hsloc.slam.keyscans import KeyScan
+    from hsloc.slam.local_matching import LocalMatch
+    from hsloc.slam.mapper import GraphMapperParameters
+    from hsloc.slam.track import Track
+
+    F64 = NDArray[np.float64]
+    I64 = NDArray[np.int64]
+
+_ODOMETRY_FLOOR = np.diag((0.01**2, 0.01**2, 0.005**2))
+"""No step of the odometry is known better than this (m^2, rad^2)."""
+_TORN = 6.0
+"""A loop whose chi is larger than this once the graph is solved was wrong."""
+_RESIDUAL_SCANS = 400
+"""Scans whose residuals are measured."""
+
+
+def finish(
+    scans: list[KeyScan],
+    stamps_ns: I64,
+    local: list[LocalMatch],
+    track: Track,
+    parameters: GraphMapperParameters,
+    rng: Generator,
+    progress: Callable[[float], None] | None = None,
+) -> MappingResult:
+    """Close loops, refine, draw."""
+    tell = progress if progress is not None else _silent
+    if not scans:
+        return _empty(track)
+    joined = KeyScans.joined(scans)
+    poses = np.array([found.pose.to_array() for found in local])
+    chain = Edges.chain(
+        np.array([found.motion.to_array() for found in local[1:]]).reshape(-1, 3),
+        np.array([found.covariance for found in local[1:]]).reshape(-1, 3, 3),
+    )
+    poses, loops, loop_edges = _close_loops(poses, chain, local, joined, parameters, rng, lambda part: tell(0.5 * part))
+    steps = _odometry_edges(local, track, parameters)
+    edges = Edges.joined([steps, loop_edges])
+    refined, passes = _refine(poses, joined, edges, parameters, lambda part: tell(0.5 + 0.4 * part))
+    grid = draw_grid(refined.poses, joined, parameters.drawing)
+    tell(1.0)
+    odometry_poses, scan_poses = track.corrected(refined.poses)
+    return MappingResult(
+        odometry_poses=odometry_poses,
+        scan_poses=scan_poses,
+        revision=_revision(odometry_poses, track) if parameters.use_odometry else (),
+        keyscan_stamps_ns=stamps_ns,
+        keyscan_poses=refined.poses,
+        grid=grid,
+        graph=PoseGraph(stamps_ns, refined.poses, edges),
+        loops=tuple(loops),
+        quality=_quality(refined, passes, loops, loop_edges, grid, joined),
+    )
+
+
+def _close_loops(
+    poses: F64,
+    chain: Edges,
+    local: list[LocalMatch],
+    scans: KeyScans,
+    parameters: GraphMapperParameters,
+    rng: Generator,
+    progress: Callable[[float], None],
+) -> tuple[F64, list[Loop], Edges]:
+    """Poses of the keyscans with all loops closed, the loops, and those accepted as edges between keyscans."""
+    motions = np.array([found.motion.to_array() for found in local])
+    covariances = np.array([found.covariance for found in local])
+    p = parameters.loops
+    places = Places.along(poses, motions, covariances, p.place_length, parameters.local_matching.turn_length)
+    closer = LoopCloser(places, scans, p, rng)
+    closer.close(progress)
+    loops = closer.loops
+    solved = places.expand(closer.poses)
+    while True:
+        edges = _between_keyscans(loops, places, p.robust)
+        solved = solve_edges(solved, Edges.joined([chain, edges]))
+        _, _, chi = edge_errors(solved, edges)
+        if not (chi > _TORN).any():
+            return solved, loops, edges
+        # The worst goes first: a wrong loop tears at the right ones too.
+        worst = [loop for loop in loops if loop.accepted][int(np.argmax(chi))]
+        torn = replace(worst, accepted=False, reason=f"torn: {chi.max():.0f} sigma off once the graph was solved")
+        loops = [torn if loop is worst else loop for loop in loops]
+
+
+def _between_keyscans(loops: list[Loop], places: Places, robust: float) -> Edges:
+    accepted = [loop for loop in loops if loop.accepted]
+    if not accepted:
+        return Edges.none()
+    reference = places.reference
+    return Edges(
+        np.array([(reference[loop.first], reference[loop.second]) for loop in accepted], dtype=np.int64),
+        np.array([loop.T_first_second.to_array() for loop in accepted]),
+        np.array([np.linalg.inv(loop.covariance) for loop in accepted]),
+        np.full(len(accepted), robust),
+    )
+
+
+def _odometry_edges(local: list[LocalMatch], track: Track, parameters: GraphMapperParameters) -> Edges:
+    """Steps from keyscan to keyscan by odometry alone, the scans being compared anew; without it, the matches'."""
+    if not parameters.use_odometry:
+        return Edges.chain(
+            np.array([found.motion.to_array() for found in local[1:]]).reshape(-1, 3),
+            np.array([found.covariance + _ODOMETRY_FLOOR for found in local[1:]]).reshape(-1, 3, 3),
+        )
+    odometry = track.key_odometry()
+    steps = relative_poses(odometry[:-1], odometry[1:])
+    noise = parameters.local_matching.odometry_noise
+    covariances = [noise.covariance(Pose2.from_array(step)) + _ODOMETRY_FLOOR for step in steps]
+    return Edges.chain(steps, np.array(covariances).reshape(-1, 3, 3))
+
+
+def _refine(
+    poses: F64, scans: KeyScans, edges: Edges, parameters: GraphMapperParameters, progress: Callable[[float], None]
+) -> tuple[Refined, int]:
+    """Passes over the whole log, each with partners chosen anew, until nothing moves."""
+    most = parameters.passes
+    refined = refine(poses, scans, edges, parameters.refinement, lambda part: progress(part / most))
+    passes = 1
+    while passes < most:
+        begin = refined.poses
+        done = passes
+        refined = refine(begin, scans, edges, parameters.refinement, lambda part: progress((done + part) / most))  # noqa: B023
+        passes += 1
+        if np.abs((refined.poses - begin)[:, :2]).max() < parameters.refinement.still:
+            break
+    return refined, passes
+
+
+def _revision(odometry_poses: F64, track: Track) -> tuple[tuple[int, Pose2], ...]:
+    return tuple(
+        (k, Pose2.from_array(pose) @ Pose2.from_array(odometry).inverse())
+        for k, (pose, odometry) in enumerate(zip(odometry_poses, track.odometry(), strict=True))
+    )
+
+
+def _quality(
+    refined: Refined, passes: int, loops: list[Loop], edges: Edges, grid: OccupancyGrid, scans: KeyScans
+) -> MappingQuality:
+    nan = float("nan")
+    distance, angle, _ = edge_errors(refined.poses, edges)
+    residuals = _residuals(refined.poses, scans, grid)
+    median, p95 = np.percentile(residuals, (50.0, 95.0)) if len(residuals) else (nan, nan)
+    return MappingQuality(
+        residual_median=float(median),
+        residual_p95=float(p95),
+        scan_rms=refined.rms,
+        conflict=refined.conflict,
+        loops=len(edges),
+        loops_refused=len(loops) - len(edges),
+        loop_median=float(np.median(distance)) if len(edges) else nan,
+        loop_max=float(distance.max()) if len(edges) else nan,
+        loop_angle_median_deg=float(np.degrees(np.median(angle))) if len(edges) else nan,
+        loop_angle_max_deg=float(np.degrees(angle.max())) if len(edges) else nan,
+        keyscans=len(scans),
+        passes=passes,
+        moved=refined.moved,
+    )
+
+
+def _residuals(poses: F64, scans: KeyScans, grid: OccupancyGrid) -> F64:
+    """Distances (m) of points to the nearest occupied cell's centre, of scans evenly chosen."""
+    from scipy.spatial import cKDTree
+
+    walls = grid.centres(grid.occupied())
+    if len(walls) == 0:
+        return np.zeros(0)
+    tree = cKDTree(walls)
+    chosen = np.unique(np.linspace(0, len(scans) - 1, _RESIDUAL_SCANS).astype(np.int64))
+    parts = [Pose2.from_array(poses[k]) @ scans.hits(int(k)).astype(np.float64) for k in chosen]
+    distances: F64 = np.asarray(tree.query(np.concatenate(parts))[0], dtype=np.float64)
+    return distances
+
+
+def _empty(track: Track) -> MappingResult:
+    """No scan had a return: odometry is all there is."""
+    nan = float("nan")
+    odometry_poses, scan_poses = track.corrected(np.zeros((0, 3)))
+    none = np.zeros(0, dtype=np.int64)
+    return MappingResult(
+        odometry_poses=odometry_poses,
+        scan_poses=scan_poses,
+        revision=(),
+        keyscan_stamps_ns=none,
+        keyscan_poses=np.zeros((0, 3)),
+        grid=OccupancyGrid(np.full((1, 1), -1, dtype=np.int8), 0.05),
+        graph=PoseGraph(none, np.zeros((0, 3)), Edges.none()),
+        loops=(),
+        quality=MappingQuality(nan, nan, nan, nan, 0, 0, nan, nan, nan, nan, 0, 0, 0.0),
+    )
+
+
+def _silent(_: float) -> None:
+    """Nobody is told."""

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.motion import fuse, predict_covariance
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2, wrap_angle
@@ -209,21 +210,23 @@ class Relocaliser:
         reason = f"{len(self._hypotheses)} hypotheses, best {best.mean:.2f}, lead {lead:.2f}, {best.scans} scans"
         covariance = best.covariance if sure else None
         fitness = best.fitness if fresh else None
-        track = self._retrace(best.pose @ motion) if sure else ()
+        track = self._retrace(best.pose @ motion, best.covariance) if sure else ()
         return Verdict(best.pose @ motion, covariance, fitness, evaluations, sure, reason, track)
 
-    def _retrace(self, pose: Pose2) -> tuple[tuple[int, Pose2], ...]:
-        """The scans seen while searching, matched backwards from where the robot is now known to be."""
+    def _retrace(self, pose: Pose2, covariance: F64) -> tuple[tuple[int, Pose2], ...]:
+        """The scans seen while searching, localised backwards from where the robot is now known to be."""
         half, half_angle = _STEP_WINDOW
         track: list[tuple[int, Pose2]] = []
         T_odom_next: Pose2 | None = None
         for count, points, T_odom_base in reversed(self._seen):
             if T_odom_next is not None:
-                pose = pose @ T_odom_next.between(T_odom_base)
+                motion = T_odom_next.between(T_odom_base)
+                covariance = predict_covariance(covariance, pose, motion, self._noise.covariance(motion))
+                pose = pose @ motion
             T_odom_next = T_odom_base
             match = self._matcher.match(points, self._field, Window(pose, half, half, half_angle), self._rng)
             if match.fitness >= self._parameters.min_fitness:
-                pose = match.pose
+                pose, covariance = fuse(pose, covariance, match.pose, match.covariance)
             track.append((count, pose @ T_odom_base.inverse()))
         return tuple(reversed(track))
 

@@ -7,8 +7,11 @@ fails, or is interrupted, leaves nothing half-written behind.
 from __future__ import annotations
 
 import os
+import platform
+import shlex
 import shutil
 from collections import Counter
+from importlib import metadata
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +20,7 @@ from hsloc import __version__
 from hsloc.config import dump
 from hsloc.errors import EvaluationError, OutputError
 from hsloc.evaluation import evaluate, write_json, write_tum
+from hsloc.evaluation.report_html import Provenance, write_report_html
 from hsloc.evaluation.report_png import draw_report
 from hsloc.log.reader import open_log
 from hsloc.log.writer import LogWriter
@@ -32,7 +36,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hsloc.replay.run import Result
+    from hsloc.replay.run import Result, RunSpec
 
 _PATH_POSES = 2000
 """A path to look at needs no more poses; viewers slow down."""
@@ -76,17 +80,54 @@ def _write(result: Result, folder: Path, alignment: str, progress: Callable[[flo
     write_json(folder / "metrics.json", values)
     write_json(folder / "timings.json", timings(result))
     (folder / "config.yaml").write_text(_config_text(result), encoding="utf-8")
-    draw_report(
-        folder / "report.png",
-        title=" ".join(path.name for path in result.spec.logs),
-        trajectory=result.trajectory,
-        odometry=result.odometry,
-        reference=result.reference,
-        grid=result.grid,
-        diagnostics=result.diagnostics,
-        metrics=values,
-    )
+    shown = {
+        "title": " ".join(result.spec.names()),
+        "trajectory": result.trajectory,
+        "odometry": result.odometry,
+        "reference": result.reference,
+        "grid": result.grid,
+        "diagnostics": result.diagnostics,
+        "metrics": values,
+    }
+    draw_report(folder / "report.png", **shown)  # type: ignore[arg-type]
+    write_report_html(folder / "report.html", **shown, provenance=_provenance(result))  # type: ignore[arg-type]
     return values
+
+
+def _provenance(result: Result) -> Provenance:
+    """What it takes to run it again: command, configuration, versions, checksum."""
+    packages = ("numpy", "scipy", "numba", "mcap", "rosbags")
+    versions = {"hsloc": __version__, "Python": platform.python_version()}
+    versions |= {name: metadata.version(name) for name in packages}
+    hashes = {" ".join(result.spec.names()): result.input_sha256}
+    return Provenance(_command(result.spec), dump(result.spec.config), versions, hashes)
+
+
+def _command(spec: RunSpec) -> str:
+    """The command line that repeats the run."""
+    words = ["hsloc", "replay", *spec.names()]
+    if spec.map_path is not None:
+        words += ["--map", spec.map_path.name]
+    if spec.initial_pose is not None:
+        pose = spec.initial_pose
+        words.append(f"--initial-pose={pose.x!r},{pose.y!r},{pose.theta!r}")
+    if spec.unknown_start:
+        words.append("--unknown-start")
+    read = spec.read
+    for flag, value in (
+        ("--scan-topic", read.scan_topic),
+        ("--odom-topic", read.odom_topic),
+        ("--truth-topic", read.truth_topic),
+        ("--base-frame", read.base_frame),
+        ("--start", read.start_s),
+        ("--end", read.end_s),
+    ):
+        if value is not None:
+            words += [flag, str(value)]
+    if read.laser_pose is not None:
+        mounting = read.laser_pose
+        words.append(f"--laser-pose={mounting.x!r},{mounting.y!r},{mounting.theta!r}")
+    return shlex.join([*words, "--config", "config.yaml", "--seed", str(spec.seed)])
 
 
 def metrics(result: Result, residuals: Residuals, alignment: str = "none") -> dict[str, object]:
@@ -100,7 +141,7 @@ def metrics(result: Result, residuals: Residuals, alignment: str = "none") -> di
     values: dict[str, object] = {
         "run": {
             "hsloc": __version__,
-            "inputs": [path.name for path in result.spec.logs],
+            "inputs": list(result.spec.names()),
             "input_sha256": result.input_sha256,
             "map": "log" if result.spec.map_path is None else result.spec.map_path.name,
             "seed": result.spec.seed,
@@ -172,9 +213,8 @@ def timings(result: Result) -> dict[str, object]:
 def _config_text(result: Result) -> str:
     """The effective configuration; what else is needed to repeat the run stands above it."""
     spec = result.spec
-    names = " ".join(path.name for path in spec.logs)
     lines = [
-        f"# hsloc {__version__}; run it again with: hsloc replay {names} --config config.yaml --seed {spec.seed}",
+        f"# hsloc {__version__}; run it again with: {_command(spec)}",
         f"# preset: {spec.preset}",
         f"# input sha256: {result.input_sha256}",
     ]

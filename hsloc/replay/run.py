@@ -37,7 +37,8 @@ class RunSpec:
     """What to run. The same spec on the same files gives the same result, bit for bit.
 
     Without `map_path` the map is the log's own. The start is `initial_pose`, else the one the log states, else unknown;
-    with `unknown_start` it is unknown whatever the log states.
+    with `unknown_start` it is unknown whatever the log states. `labels` are the names of the logs in reports, where the
+    files' own names say nothing.
     """
 
     logs: tuple[Path, ...]
@@ -48,6 +49,11 @@ class RunSpec:
     unknown_start: bool = False
     seed: int = 0
     preset: str = "default"
+    labels: tuple[str, ...] = ()
+
+    def names(self) -> tuple[str, ...]:
+        """What to call the logs in reports."""
+        return self.labels or tuple(path.name for path in self.logs)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,43 @@
+"""Real robots on real maps. The logs are not part of the repository; without them these tests skip."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from hsloc.log.summary import ReadOptions
+from hsloc.replay.results import metrics, write_recording
+from hsloc.replay.run import RunSpec, run
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.data
+
+
+@pytest.mark.parametrize("name", ["robotdata1", "robotdata3"])
+def test_wean_hall_from_an_unknown_start(data: Path, name):
+    folder = data / "wean"
+    found = run(RunSpec(logs=(folder / f"{name}.log.gz",), map_path=folder / "wean.yaml"))
+    reference = np.loadtxt(folder / f"{name}.pf.ref.txt")
+    poses = found.trajectory.interpolated(np.round(reference[:, 0] * 1e9).astype(np.int64))
+    metres = np.hypot(poses[:, 0] - reference[:, 1], poses[:, 1] - reference[:, 2])
+    assert found.localised.all()
+    assert metres.max() < 0.5
+    assert np.median(metres) < 0.25
+
+
+@pytest.mark.parametrize("log", ["mcap_zstd/mcap_zstd.mcap", "macfirst_floor_take_2/macfirst_floor_take_2_0.db3"])
+def test_turtlebot_from_an_unknown_start(data: Path, tmp_path, log):
+    folder = data / "turtlebot4"
+    spec = RunSpec(
+        logs=(folder / log,), map_path=folder / "mac_1st_floor_final.yaml", read=ReadOptions(), unknown_start=True
+    )
+    found = run(spec)
+    assert found.localised.all()
+    residuals = write_recording(found, tmp_path / "run.mcap")
+    values = metrics(found, residuals)
+    assert values["map"]["residuals"]["within_0.15_m"] >= 0.85
+    assert any("free_thresh" in warning for warning in found.warnings)

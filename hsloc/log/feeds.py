@@ -6,6 +6,7 @@ from math import isfinite
 from typing import TYPE_CHECKING, Any, Protocol
 
 from hsloc.log import definitions
+from hsloc.log.transforms import Transform3
 from hsloc.model import Odometry, Pose2, Scan, Truth
 
 if TYPE_CHECKING:
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from hsloc.log.frames import Mountings
     from hsloc.log.ordering import TopicClock
     from hsloc.log.summary import Losses
-    from hsloc.log.transforms import Transform3
     from hsloc.model import Event
 
     Stamped = tuple[TopicClock, Event]
@@ -151,14 +151,16 @@ class TransformFeed:
         odometry: TopicClock | None,
         truth: TopicClock | None,
         losses: Losses,
+        T_child_base: Pose2 | None = None,
     ) -> None:
-        """`frames` are the odometry's (None where the map is the base's parent) and the base's."""
+        """`frames` are the odometry's (None where the map is the base's parent) and its child's."""
         self.topic = topic
         self.clocks = tuple(clock for clock in (odometry, truth) if clock is not None)
         self._odom_frame, self._base_frame = frames
         self._odometry = odometry
         self._truth = truth
         self._losses = losses
+        self._T_child_base = T_child_base
         self._T_map_odom: Transform3 | None = None
 
     def events(self, message: list[LinkMessage], log_time_ns: int) -> Iterable[Stamped]:
@@ -173,6 +175,8 @@ class TransformFeed:
 
     def _base(self, link: LinkMessage, log_time_ns: int) -> Iterable[Stamped]:
         transform = link.transform.normalised()
+        if self._T_child_base is not None:
+            transform = transform @ Transform3.from_pose2(self._T_child_base)
         pose = transform.to_pose2()
         if not is_usable(pose):
             self._losses.invalid_messages[self.topic] += 1

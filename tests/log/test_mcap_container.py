@@ -174,6 +174,25 @@ def test_out_of_order_and_overlapping_chunks_are_merged_exactly(tmp_path: Path) 
         assert (len(times), losses.late_messages) == (2 * COUNT, 0)
 
 
+@pytest.mark.parametrize("few", [0, 5])
+def test_much_that_overlaps_goes_through_a_heap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, few: int) -> None:
+    monkeypatch.setattr("hsloc.log.mcap_container._FEW", few)
+    first, second = scan_payloads(COUNT, "/a"), scan_payloads(COUNT, "/b")
+    mixed = [message for pair in zip(first, reversed(second), strict=True) for message in pair]
+    times, losses = read(write_raw(tmp_path / "log.mcap", mixed))
+    assert times == sorted(times)
+    assert (len(times), losses.late_messages) == (2 * COUNT, 0)
+
+
+def test_what_is_held_back_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hsloc.log.mcap_container.MAX_HELD_BYTES", 1000)
+    first, second = scan_payloads(COUNT, "/a"), scan_payloads(COUNT, "/b")
+    mixed = [message for pair in zip(first, reversed(second), strict=True) for message in pair]
+    times, losses = read(write_raw(tmp_path / "log.mcap", mixed))
+    assert sorted(times) == sorted([time for _, time, _ in mixed])
+    assert losses.late_messages > 0
+
+
 def test_a_chunk_that_lies_about_its_times_gives_late_messages(whole: Path) -> None:
     data = bytearray(whole.read_bytes())
     struct.pack_into("<Q", data, chunks_of(bytes(data))[2][0] + 9, START + 1000 * SECOND)

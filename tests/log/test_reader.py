@@ -245,6 +245,41 @@ def test_truth_may_be_taken_from_tf(tmp_path: Path) -> None:
     assert truths == [Pose2(number, 10, 0) for number in range(3, 10)]
 
 
+def test_a_base_that_tf_does_not_move_directly_is_reached_by_its_static_transform(tmp_path: Path) -> None:
+    path = write_transforms_alone(tmp_path / "log.mcap")
+    with LogWriter(tmp_path / "more.mcap") as log:
+        log.transforms(START, [("base_link", "axle", Pose2(-0.5, 0, 0))], static=True)
+    read = open_log([path, tmp_path / "more.mcap"], ReadOptions(base_frame="axle", truth_topic="tf"))
+    events = list(read.events())
+    assert [e.T_odom_base.x for e in events if isinstance(e, Odometry)] == [n - 0.5 for n in range(10)]
+    assert [e.T_map_base for e in events if isinstance(e, Truth)] == [Pose2(n - 0.5, 10, 0) for n in range(3, 10)]
+    assert read.summary.T_base_laser.x == pytest.approx(MOUNTING.x + 0.5)
+
+
+def test_truth_may_be_map_to_base_without_odometry_between(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        for number in range(3):
+            log.odometry(START + number, Pose2())
+            log.transforms(START + number, [("map", "base_link", Pose2(number, 5, 0))])
+            log.scan(make_scan(START + number))
+    read = open_log(path, ReadOptions(truth_topic="tf"))
+    assert [e.T_map_base for e in read.events() if isinstance(e, Truth)] == [Pose2(n, 5, 0) for n in range(3)]
+
+
+def test_a_truth_of_the_same_frame_moves_with_the_base(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        log.transforms(START, [("base_link", "axle", Pose2(-0.5, 0, 0)), ("base_link", "laser", Pose2())], static=True)
+        log.odometry(START, Pose2(1, 0, 0))
+        log.odometry(START, Pose2(2, 0, 0), topic="/ground_truth", frame_id="map")
+        log.scan(make_scan(START))
+    odometry, _, truth = open_log(path, ReadOptions(base_frame="axle")).events()
+    assert isinstance(odometry, Odometry)
+    assert isinstance(truth, Truth)
+    assert (odometry.T_odom_base.x, truth.T_map_base.x) == (0.5, 1.5)
+
+
 def test_truth_may_be_poses(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     with LogWriter(path) as log:

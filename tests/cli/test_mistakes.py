@@ -1,0 +1,187 @@
+"""What users get wrong: one clear line on stderr, exit code 1 or 2, and nothing half-written left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from hsloc.cli.main import main
+
+RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
+OFFICE = str(RECORDINGS / "office.mcap")
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def fails(capsys, *argv, code=1):
+    """Run a command that must fail; its one line on stderr."""
+    try:
+        status = main(argv)
+    except SystemExit as stop:
+        status = stop.code
+    printed = capsys.readouterr()
+    assert status == code
+    assert printed.out == ""
+    lines = printed.err.strip().splitlines()
+    if code == 1:
+        assert len(lines) == 1, lines
+        assert lines[0].startswith("hsloc: error: ")
+    assert "Traceback" not in printed.err
+    return lines[-1]
+
+
+def empty(folder):
+    return not [path for path in folder.rglob("*") if path.is_file() and path.suffix not in (".yaml", ".txt", ".mcap")]
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        (["nowhere.mcap"], "nowhere.mcap: no such file"),
+        ([OFFICE, "--map", "nowhere.yaml"], "nowhere.yaml"),
+        ([OFFICE, "--scan-topic", "/lidar"], "/lidar"),
+        ([OFFICE, "--odom-topic", "/wheels"], "/wheels"),
+        ([OFFICE, "--config", "nowhere.yaml"], "nowhere.yaml: cannot be read"),
+        ([OFFICE, "--start", "5000"], "no scan between --start and --end"),
+    ],
+)
+def test_what_is_not_there_is_named(here, capsys, argv, expected):
+    line = fails(capsys, "replay", *argv, "--out", "out")
+    assert expected in line
+    assert empty(here)
+
+
+def test_not_a_log(here, capsys):
+    (here / "notes.txt").write_text("dear diary\n")
+    assert "notes.txt: is not an MCAP, a ROS bag or a CARMEN log" in fails(capsys, "replay", "notes.txt")
+    (here / "broken.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\0" * 30)
+    assert "broken.mcap" in fails(capsys, "replay", "broken.mcap")
+    (here / "empty.mcap").write_bytes(b"")
+    assert "empty.mcap" in fails(capsys, "replay", "empty.mcap")
+    assert empty(here)
+
+
+def write_log(path, scans=("/scan",), odometry=True, grid=False):
+    import numpy as np
+
+    from hsloc.log.writer import LogWriter
+    from hsloc.model import Pose2, Scan
+
+    with LogWriter(path) as writer:
+        for k in range(5):
+            stamp = 10**9 + k * 10**8
+            if odometry:
+                writer.odometry(stamp, Pose2(0.1 * k, 0.0, 0.0))
+            for topic in scans:
+                writer.scan(Scan(stamp, np.ones(10, dtype=np.float32), 0.0, 0.1, 0.1, 10.0), topic=topic)
+
+
+def test_topics_missing_or_ambiguous_are_told_with_their_remedy(here, capsys):
+    write_log(here / "two.mcap", scans=("/front", "/rear"))
+    line = fails(capsys, "replay", "two.mcap")
+    assert "/front" in line
+    assert "/rear" in line
+    assert "--scan-topic" in line
+    write_log(here / "none.mcap", scans=())
+    assert "scan" in fails(capsys, "replay", "none.mcap")
+    write_log(here / "still.mcap", odometry=False)
+    assert "odometry" in fails(capsys, "replay", "still.mcap")
+    assert empty(here)
+
+
+def test_a_log_without_a_map_asks_for_one(here, capsys):
+    write_log(here / "bare.mcap")
+    assert "--map" in fails(capsys, "replay", "bare.mcap", "--out", "out")
+    assert empty(here)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("localizer: {}\n", "unknown key 'localizer'"),
+        ("localiser: {update_min_x: 1}\n", "unknown key 'update_min_x'"),
+        ("hide: {budget: many}\n", "config.hide.budget is 'many'; it must be of type int"),
+        ("hide: {budget: -1}\n", "budget is -1"),
+        ("matcher: magic\n", "matcher is 'magic'"),
+        ("hide: [1, 2]\n", "config.hide is [1, 2]"),
+        ("{unclosed\n", "not valid YAML"),
+        ("likelihood_field: {sigma: .nan}\n", "sigma is nan"),
+    ],
+)
+def test_a_wrong_configuration_is_refused_by_name(here, capsys, text, expected):
+    (here / "wrong.yaml").write_text(text)
+    line = fails(capsys, "replay", OFFICE, "--config", "wrong.yaml")
+    assert "wrong.yaml" in line
+    assert expected in line
+    assert empty(here)
+
+
+def test_a_map_that_cannot_be_read(here, capsys):
+    (here / "map.yaml").write_text(
+        "image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\noccupied_thresh: 0.65\nfree_thresh: 0.196\nnegate: 0\n"
+    )
+    assert "map.pgm" in fails(capsys, "replay", OFFICE, "--map", "map.yaml")
+    (here / "map.pgm").write_bytes(b"P5\n4 4\n255\nabc")
+    assert "map.pgm" in fails(capsys, "replay", OFFICE, "--map", "map.yaml")
+
+
+def test_a_folder_that_is_full_of_something_else_is_left_alone(here, capsys):
+    (here / "out").mkdir()
+    (here / "out" / "thesis.tex").write_text("do not lose me")
+    assert "out: exists already" in fails(capsys, "replay", OFFICE, "--out", "out")
+    assert (here / "out" / "thesis.tex").read_text() == "do not lose me"
+
+
+def test_a_folder_under_a_file_cannot_be_written(here, capsys):
+    (here / "file.txt").write_text("")
+    assert "cannot be written" in fails(capsys, "replay", OFFICE, "--out", "file.txt/out")
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["replay"],
+        ["replay", OFFICE, "--seed", "-1"],
+        ["replay", OFFICE, "--initial-pose", "1,2"],
+        ["replay", OFFICE, "--initial-pose", "1,2,nan"],
+        ["replay", OFFICE, "--matcher", "magic"],
+        ["replay", OFFICE, "--no-such-flag"],
+        ["fly"],
+    ],
+)
+def test_wrong_use_ends_with_2(here, capsys, argv):
+    fails(capsys, *argv, code=2)
+    assert empty(here)
+
+
+def test_interrupted_runs_leave_nothing_behind(here):
+    command = [sys.executable, "-m", "hsloc.cli.main", "replay", OFFICE, "--out", "out"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+    time.sleep(1.2)
+    os.killpg(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=30)
+    if process.returncode == 0:
+        pytest.skip("the run was over before it could be interrupted")
+    assert process.returncode == 130
+    assert b"Traceback" not in stderr
+    assert stderr.decode().strip().endswith("hsloc: interrupted")
+    assert list(here.iterdir()) == []
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys; from hsloc.cli.main import build_parser; build_parser().format_help();"
+        "heavy = {'numpy', 'numba', 'scipy', 'matplotlib', 'rosbags', 'mcap', 'ruamel'} & set(sys.modules);"
+        "sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from hsloc.model.estimate import Estimate
     from hsloc.model.pose2 import Pose2
 
-_SEARCHING = str(Status.SEARCHING)
-
 
 class Recording:
     """Columns that grow with the log: the result itself, and all of the memory that does."""
@@ -35,6 +33,8 @@ class Recording:
         self._fitness = array("d")
         self._sigma = array("d")
         self._evaluations = array("q")
+        self._believed = 0
+        self._searching = False
         self._revisions: list[tuple[int, tuple[tuple[int, Pose2], ...]]] = []
 
     def add(self, event: Odometry | PairedScan | Truth, estimate: Estimate | None) -> None:
@@ -55,6 +55,7 @@ class Recording:
             self._add_scan(estimate)
 
     def _add_scan(self, estimate: Estimate) -> None:
+        self._note_belief(estimate.status)
         self._scan_stamps.append(estimate.stamp_ns)
         self._status.append(estimate.status.value)
         self._reason.append(estimate.reason)
@@ -67,6 +68,15 @@ class Recording:
         self._evaluations.append(estimate.evaluations)
         if estimate.revision:
             self._revisions.append((len(self._odometry_stamps), estimate.revision))
+
+    def _note_belief(self, status: Status) -> None:
+        """Whoever is lost now has been since the last match that was believed: in hindsight those poses are guesses."""
+        if status is Status.MATCHED or status is Status.RELOCALISED:
+            self._believed = len(self._localised)
+        elif status is Status.SEARCHING and not self._searching:
+            for k in range(self._believed, len(self._localised)):
+                self._localised[k] = 0
+        self._searching = status is Status.SEARCHING
 
     @property
     def scans(self) -> int:

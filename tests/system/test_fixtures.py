@@ -78,6 +78,9 @@ def test_a_kidnapped_robot_notices_and_is_found_again():
     assert metres[seconds < 29.9].max() < 0.06
     assert metres[(seconds > 30.0) & (seconds < 30.3)].max() > 1.0
     assert metres[seconds > 32.0].max() < 0.06
+    believed = np.isin(found.reference.stamps_ns, found.trajectory.stamps_ns[found.localised])
+    assert metres[believed].max() < 0.06
+    assert 0.97 < found.localised.mean() < 1.0
     status = found.diagnostics.status
     assert Status.REJECTED in status
     assert status.count(Status.RELOCALISED) == 1

@@ -13,6 +13,7 @@ from hsloc.errors import LogError, MapError
 from hsloc.log.reader import open_log
 from hsloc.log.summary import LogSummary, Losses, ReadOptions
 from hsloc.matching.likelihood_field import LikelihoodField
+from hsloc.matching.window import Window
 from hsloc.model.events import PairedScan, Scan
 from hsloc.replay.engine import replay
 from hsloc.replay.recording import Recording
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.log.reader import Log
+    from hsloc.matching.match import Matcher
     from hsloc.model.estimate import ScanDiagnostics
     from hsloc.model.events import Event
     from hsloc.model.occupancy_grid import OccupancyGrid
@@ -93,6 +95,8 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
     log = open_log(spec.logs, spec.read)
     grid, warnings = find_map(spec, log)
     opened = time.perf_counter()
+    if progress is not None:
+        progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
     estimator = _localiser(spec, log, grid)
     prepared = time.perf_counter()
     recording = Recording()
@@ -143,7 +147,15 @@ def _localiser(spec: RunSpec, log: Log, grid: OccupancyGrid) -> Estimator:
         stated = log.initial_pose()
         start = None if stated is None else stated[1]
     rng = np.random.default_rng(spec.seed)
+    _warm_up(config.make_matcher(), likelihood)
     return Localiser(grid, likelihood, config.make_matcher(), config.localiser, rng, start)
+
+
+def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:
+    """Have the kernels compiled (once after an installation, some ten seconds) before the clock of the replay starts."""
+    points = np.zeros((1, 2))
+    window = Window(likelihood.T_map_field, 0.1, 0.1, 0.1)
+    matcher.match(points, likelihood, window, np.random.default_rng(0))
 
 
 def _cut(spec: RunSpec) -> bool:

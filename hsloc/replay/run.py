@@ -152,7 +152,7 @@ def _localiser(spec: RunSpec, log: Log, grid: OccupancyGrid) -> Estimator:
 
 
 def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:
-    """Have the kernels compiled (once after an installation, some ten seconds) before the clock of the replay starts."""
+    """Have the kernels compiled (once after an installation, ten seconds) before the clock of the replay starts."""
     points = np.zeros((1, 2))
     window = Window(likelihood.T_map_field, 0.1, 0.1, 0.1)
     matcher.match(points, likelihood, window, np.random.default_rng(0))

@@ -1,0 +1,74 @@
+"""Serve the HTTP API and the web page: upload a log, watch the job, look at the result."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import argparse
+
+HELP = "serve the HTTP API and the web page"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Where to listen, where to keep, who may ask."""
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
+    parser.add_argument("--port", type=int, default=8000, help="port to listen on (default: 8000)")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="folder for everything (default: hsloc-data)")
+    parser.add_argument("--slots", type=int, metavar="N", help="jobs at the same time (default: 1)")
+    parser.add_argument("--allowed-host", action="append", metavar="NAME", help="answer to this name, too; * for any")
+    parser.add_argument("--retention-days", type=float, metavar="D", help="remove jobs that ended so long ago")
+    group = parser.add_argument_group("tokens")
+    group.add_argument("--first-token", action="store_true", help="make a token on the first start and print it")
+    group.add_argument("--open-to-all", action="store_true", help="listen beyond loopback without any token")
+    group.add_argument("--new-token", metavar="TENANT", help="make a token for a tenant, print it, and end")
+    group.add_argument("--scopes", default="read,write,admin", help="scopes of the new token (default: all)")
+    group.add_argument("--expires-days", type=float, metavar="D", help="the new token ends after so many days")
+    parser.epilog = (
+        "Everything else, such as limits, is set by variables HSLOC_<NAME>: HSLOC_MAX_UPLOAD_BYTES=2G, "
+        "HSLOC_JOB_MEMORY_BYTES=4G, HSLOC_MIN_FREE_BYTES=256M, HSLOC_RETENTION_S, ...; HSLOC_TOKEN is a token of your "
+        "own choice."
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serve until SIGTERM."""
+    from hsloc.errors import ConfigError
+
+    service, settings = _service()
+    try:
+        retention = None if arguments.retention_days is None else arguments.retention_days * 86400.0
+        chosen = settings.from_environment(data=arguments.data, slots=arguments.slots, retention_s=retention)
+        if arguments.allowed_host:
+            from dataclasses import replace
+
+            chosen = replace(chosen, allowed_hosts=(*chosen.allowed_hosts, *arguments.allowed_host))
+        if arguments.new_token is not None:
+            return int(service.new_token(chosen, arguments.new_token, arguments.scopes, arguments.expires_days))
+        return int(
+            service.serve(
+                chosen,
+                arguments.host,
+                arguments.port,
+                open_to_all=arguments.open_to_all,
+                first_token=arguments.first_token,
+                secret=os.environ.get("HSLOC_TOKEN"),
+            )
+        )
+    except settings.SettingsError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _service() -> tuple[Any, Any]:
+    """`service.main` and `service.settings`, found by name: the library does not import the service."""
+    from hsloc.errors import ConfigError
+
+    try:
+        return importlib.import_module("service.main"), importlib.import_module("service.settings")
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"{error.name} is not installed; install the service with: pip install 'hsloc[serve]'"
+        ) from error

@@ -1,0 +1,173 @@
+"""Who wakes the workers. The truth is the job's row with its lease; a dispatcher only says when to look.
+
+`LocalDispatcher` runs the jobs of this machine in N slots. A dispatcher over PostgreSQL and Procrastinate would satisfy
+the same protocol: `enqueue` defers a task that carries nothing but the job's id, in the transaction that inserts the
+row; its workers call the same `Attempt`; a task delivered twice finds the row taken and ends.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+import uuid
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from sqlalchemy import select
+from sqlalchemy.exc import OperationalError
+
+from service.logs import log
+from service.processes import kill_marked
+from service.supervisor import Attempt
+from service.tables import FileRow, JobRow
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from service.database import Database
+    from service.leases import Leases
+    from service.settings import Settings
+    from service.storage import Storage
+
+IDLE_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Capacity:
+    """Slots, and how many of them work."""
+
+    slots: int
+    busy: int
+
+
+class Dispatcher(Protocol):
+    """Law: after `enqueue` the job is looked at soon; after `cancel` a running job ends within its grace, or at the
+    next heartbeat where it runs elsewhere."""
+
+    def enqueue(self, job_id: str) -> None:
+        """A job was queued and committed."""
+        ...
+
+    def cancel(self, job_id: str) -> None:
+        """The job's row says that it is to end."""
+        ...
+
+    def capacity(self) -> Capacity:
+        """Slots of this machine."""
+        ...
+
+    def start(self) -> None:
+        """Begin."""
+        ...
+
+    def stop(self) -> None:
+        """Put the running jobs back into the queue, kill their processes, return when they are dead."""
+        ...
+
+
+class LocalDispatcher:
+    """N slots on this machine, a thread each; a thread lives as long as its job, because the kernel's death signal
+    for the job's process is bound to the thread that started it."""
+
+    def __init__(
+        self,
+        leases: Leases,
+        storage: Storage,
+        settings: Settings,
+        ended: Callable[[str], None] = lambda state: None,
+    ) -> None:
+        self._leases, self._storage, self._settings, self._ended = leases, storage, settings, ended
+        self._owner = uuid.uuid4().hex
+        self._stop = threading.Event()
+        self._work = threading.Condition()
+        self._running: dict[str, threading.Event] = {}
+        self._threads: list[threading.Thread] = []
+
+    @property
+    def owner(self) -> str:
+        """Name of this server in the leases."""
+        return self._owner
+
+    def start(self) -> None:
+        """Clean up after a server that died, then start the slots."""
+        if killed := kill_marked(f"{self._storage.instance}:"):
+            log("orphans.killed", count=killed)
+        for job_id in self._leases.recover(self._owner):
+            log("job.requeued", job=job_id)
+        sweep(self._leases.database, self._storage)
+        for k in range(self._settings.slots):
+            thread = threading.Thread(target=self._slot, name=f"slot-{k}", daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def stop(self) -> None:
+        """End the slots."""
+        self._stop.set()
+        with self._work:
+            self._work.notify_all()
+        for thread in self._threads:
+            thread.join()
+
+    def enqueue(self, job_id: str) -> None:
+        """Wake a slot."""
+        del job_id
+        with self._work:
+            self._work.notify()
+
+    def cancel(self, job_id: str) -> None:
+        """Tell the slot that runs the job, if it runs here."""
+        event = self._running.get(job_id)
+        if event is not None:
+            event.set()
+
+    def capacity(self) -> Capacity:
+        """Slots of this server."""
+        return Capacity(self._settings.slots, len(self._running))
+
+    def _slot(self) -> None:
+        while not self._stop.is_set():
+            try:
+                if not self._one():
+                    with self._work:
+                        self._work.wait(IDLE_S)
+            except OperationalError as error:
+                # A full disk or a locked database passes; the slot must not.
+                log("slot.database", error=str(error.orig))
+                self._storage.drop_ballast()
+                self._stop.wait(IDLE_S)
+            except Exception as error:
+                log("slot.error", error=f"{type(error).__name__}: {error}")
+                self._stop.wait(IDLE_S)
+
+    def _one(self) -> bool:
+        """Run the next job; False if there is none."""
+        claim = self._leases.claim(self._owner)
+        if claim is None:
+            self._leases.recover()
+            return False
+        cancel = threading.Event()
+        self._running[claim.job_id] = cancel
+        try:
+            attempt = Attempt(claim, self._leases, self._storage, self._settings, stop=self._stop, cancel=cancel)
+            self._ended(attempt.run())
+        finally:
+            self._running.pop(claim.job_id, None)
+        return True
+
+
+def sweep(database: Database, storage: Storage) -> None:
+    """Remove what a killed server left: folders of attempts, results that no job names, bytes that no upload names.
+
+    Only at start-up, when nothing runs.
+    """
+    with database.read() as session:
+        folders = set(session.scalars(select(JobRow.folder).where(JobRow.folder.is_not(None))))
+        files = set(session.scalars(select(FileRow.id)))
+    for kind, path in storage.leftovers():
+        keep = path.name in folders if kind == "result" else path.name in files if kind == "upload" else False
+        if not keep:
+            log("sweep", kind=kind, name=path.name)
+            with suppress(OSError):
+                shutil.rmtree(path) if path.is_dir() else os.unlink(path)

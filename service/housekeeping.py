@@ -1,0 +1,84 @@
+"""What goes with time: unfinished uploads, old jobs, old keys."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING
+
+from sqlalchemy import delete, select
+
+from service.files import needed
+from service.jobs import erase
+from service.logs import log
+from service.tables import ENDED, FileRow, IdempotencyRow, JobRow
+
+if TYPE_CHECKING:
+    from service.database import Database
+    from service.settings import Settings
+    from service.storage import Storage
+
+EVERY_S = 60.0
+KEY_S = 7 * 86400.0
+"""An Idempotency-Key is remembered for a week."""
+
+
+class Housekeeping:
+    """A thread that tidies up."""
+
+    def __init__(self, database: Database, storage: Storage, settings: Settings) -> None:
+        self._database, self._storage, self._settings = database, storage, settings
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="housekeeping", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End."""
+        self._stop.set()
+        self._thread.join(10.0)
+
+    def _run(self) -> None:
+        while not self._stop.wait(EVERY_S):
+            try:
+                self.tidy(time.time())
+            except Exception as error:
+                log("housekeeping.error", error=f"{type(error).__name__}: {error}")
+
+    def tidy(self, now: float) -> None:
+        """One round."""
+        self._storage.restore_ballast()
+        paths = self._expired_uploads(now)
+        folders: list[str] = []
+        if self._settings.retention_s is not None:
+            old_files, folders = self._old(now - self._settings.retention_s)
+            paths += old_files
+        with self._database.write() as session:
+            session.execute(delete(IdempotencyRow).where(IdempotencyRow.created < now - KEY_S))
+        for file_id in paths:
+            self._storage.upload_path(file_id).unlink(missing_ok=True)
+        for folder in folders:
+            self._storage.remove(folder)
+        if paths or folders:
+            log("tidy", uploads=len(paths), results=len(folders))
+
+    def _expired_uploads(self, now: float) -> list[str]:
+        with self._database.write() as session:
+            rows = session.scalars(select(FileRow).where(FileRow.state == "receiving", FileRow.expires < now)).all()
+            for row in rows:
+                session.delete(row)
+            return [row.id for row in rows]
+
+    def _old(self, before: float) -> tuple[list[str], list[str]]:
+        """Jobs that ended before, and uploads of that age that no active job needs."""
+        with self._database.write() as session:
+            jobs = session.scalars(select(JobRow).where(JobRow.state.in_(ENDED), JobRow.ended < before)).all()
+            for job in jobs:
+                erase(session, job)
+            query = select(FileRow).where(FileRow.state == "complete", FileRow.created < before)
+            files = [row for row in session.scalars(query) if not needed(session, row.id)]
+            for row in files:
+                session.delete(row)
+            return [row.id for row in files], [job.folder for job in jobs if job.folder is not None]

@@ -1,0 +1,1 @@
+"""The HTTP side: application, routes, guards, and uvicorn's protocol with time-outs."""

@@ -1,0 +1,178 @@
+"""The application: parts put together, routes, and one shape of error."""
+
+from __future__ import annotations
+
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.openapi.utils import get_openapi
+from fastapi.responses import FileResponse
+from fastapi.staticfiles import StaticFiles
+from sqlalchemy.exc import OperationalError
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+
+from hsloc import __version__
+from service.database import Database
+from service.dispatcher import LocalDispatcher
+from service.errors import ServiceError
+from service.files import Files
+from service.housekeeping import Housekeeping
+from service.http import (
+    events_routes,
+    files_routes,
+    jobs_routes,
+    metrics,
+    results_routes,
+    run_routes,
+    system_routes,
+    tus,
+)
+from service.http.context import Context
+from service.http.guard import PUBLIC, PUBLIC_PREFIX, Guard, problem
+from service.jobs import Jobs
+from service.leases import Leases
+from service.logs import log
+from service.principal import Tokens
+from service.receiving import Receiver
+from service.storage import Storage
+from service.webhooks import Deliverer
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from service.settings import Settings
+
+WEB = Path(__file__).parent.parent / "web"
+_CODES = {404: "not_found", 405: "method", 413: "too_large", 400: "bad_request", 416: "range"}
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """The service on its data folder, which it locks. Its workers start and stop with the application's lifespan.
+
+    Raises SettingsError if the folder cannot be used.
+    """
+    settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+    storage = Storage(settings.data, settings.min_free_bytes)
+    database = Database(settings.data / "hsloc.db")
+    leases = Leases(database, settings.lease_s, settings.max_attempts)
+    dispatcher = LocalDispatcher(leases, storage, settings, lambda state: metrics.ENDED.labels(state).inc())
+    files = Files(database, storage, settings)
+    context = Context(
+        settings=settings,
+        database=database,
+        storage=storage,
+        files=files,
+        jobs=Jobs(database, storage, settings),
+        receiver=Receiver(files, settings),
+        dispatcher=dispatcher,
+    )
+    helpers = (Deliverer(database, settings), Housekeeping(database, storage, settings))
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        dispatcher.start()
+        for helper in helpers:
+            helper.start()
+        log("start", version=__version__, slots=settings.slots, data=str(settings.data))
+        try:
+            yield
+        finally:
+            context.stopping.set()
+            dispatcher.stop()
+            for helper in helpers:
+                helper.stop()
+            database.close()
+            storage.close()
+            log("stop")
+
+    app = FastAPI(
+        title="hsloc",
+        version=__version__,
+        summary="Upload a log of a robot, get to know where it was.",
+        lifespan=lifespan,
+        docs_url=None,  # its page loads scripts from elsewhere; /openapi.json is there
+        redoc_url=None,
+        license_info={"name": "Apache-2.0"},
+    )
+    app.state.context = context
+    app.add_middleware(Guard, settings=settings, tokens=Tokens(database))
+    for module in (files_routes, tus, jobs_routes, events_routes, results_routes, run_routes, system_routes):
+        app.include_router(module.router)
+    _add_page(app)
+    _add_errors(app, storage)
+    _describe_tokens(app)
+    return app
+
+
+def _add_page(app: FastAPI) -> None:
+    app.mount("/web", StaticFiles(directory=WEB), name="web")
+
+    @app.get("/", include_in_schema=False)
+    def page() -> FileResponse:
+        return FileResponse(WEB / "index.html", headers={"cache-control": "no-cache"})
+
+    @app.get("/favicon.ico", include_in_schema=False)
+    def icon() -> FileResponse:
+        return FileResponse(WEB / "icon.svg", media_type="image/svg+xml")
+
+
+def _add_errors(app: FastAPI, storage: Storage) -> None:
+    @app.exception_handler(ServiceError)
+    async def refused(request: Request, error: ServiceError) -> Response:
+        return _answer(error.status, error.code, error.message, _closing(request, error.headers))
+
+    @app.exception_handler(RequestValidationError)
+    async def invalid(request: Request, error: RequestValidationError) -> Response:
+        details = [{"where": [str(p) for p in each["loc"]], "what": each["msg"]} for each in error.errors()][:50]
+        first = details[0] if details else {"where": [], "what": "invalid"}
+        message = f"{'.'.join(first['where'])[:200]}: {first['what'][:500]}"
+        return _answer(422, "invalid", message, _closing(request, {}), details)
+
+    @app.exception_handler(HTTPException)
+    async def other(request: Request, error: HTTPException) -> Response:
+        headers = _closing(request, dict(error.headers or {}))
+        return _answer(error.status_code, _CODES.get(error.status_code, "error"), str(error.detail), headers)
+
+    @app.exception_handler(ClientDisconnect)
+    async def gone(_request: Request, _error: ClientDisconnect) -> Response:
+        return _answer(400, "disconnected", "the connection broke", {"connection": "close"})
+
+    @app.exception_handler(OperationalError)
+    async def database(_request: Request, error: OperationalError) -> Response:
+        log("database.error", error=str(error.orig))
+        if "full" in str(error.orig):
+            storage.drop_ballast()
+            return _answer(507, "no_space", "the server's disk is full; try again", {"Retry-After": "1"})
+        return _answer(503, "database", "the database is busy", {"Retry-After": "1"})
+
+
+def _closing(request: Request, headers: dict[str, str]) -> dict[str, str]:
+    """After a refusal nobody reads what is left of a large body."""
+    if request.method in ("POST", "PUT", "PATCH"):
+        return {"connection": "close", **headers}
+    return headers
+
+
+def _answer(status: int, code: str, message: str, headers: dict[str, str], details: Any = None) -> Response:
+    return Response(problem(code, message, details), status, headers, "application/json")
+
+
+def _describe_tokens(app: FastAPI) -> None:
+    """The OpenAPI says which routes need a token: all that the guard does not let pass."""
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            schema = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
+            schema.setdefault("components", {})["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
+            for path, operations in schema["paths"].items():
+                if path not in PUBLIC and not path.startswith(PUBLIC_PREFIX):
+                    for operation in operations.values():
+                        operation["security"] = [{"token": []}]
+            app.openapi_schema = schema
+        return app.openapi_schema
+
+    app.openapi = openapi  # type: ignore[method-assign]

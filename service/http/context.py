@@ -1,0 +1,82 @@
+"""What the routes share, and how they get at it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+from fastapi import Depends, Request
+
+from service.dispatcher import Dispatcher
+from service.files import Files
+from service.http.schemas import Problem
+from service.jobs import Jobs
+from service.principal import Principal
+from service.receiving import Receiver
+from service.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from service.database import Database
+    from service.storage import Storage
+
+
+@dataclass(slots=True)
+class Context:
+    """The parts of a running service."""
+
+    settings: Settings
+    database: Database
+    storage: Storage
+    files: Files
+    jobs: Jobs
+    receiver: Receiver
+    dispatcher: Dispatcher
+    stopping: asyncio.Event = field(default_factory=asyncio.Event)
+    """Set when the server begins to shut down: event streams end."""
+    streams: Counter[str] = field(default_factory=Counter)
+    """Open event streams of each tenant."""
+
+
+def _context(request: Request) -> Context:
+    return cast("Context", request.app.state.context)
+
+
+def _principal(scope: str) -> Callable[[Request], Principal]:
+    def principal(request: Request) -> Principal:
+        who: Principal = request.state.principal  # the guard has put it there
+        who.need(scope)
+        return who
+
+    return principal
+
+
+Ctx = Annotated[Context, Depends(_context)]
+Reader = Annotated[Principal, Depends(_principal("read"))]
+Writer = Annotated[Principal, Depends(_principal("write"))]
+Admin = Annotated[Principal, Depends(_principal("admin"))]
+
+_MEANINGS = {
+    400: "the request cannot be understood",
+    401: "no token, or one that is unknown, expired or revoked",
+    403: "the token lacks the scope, or the request comes from another site",
+    404: "not there, or not yours",
+    409: "the state of the thing does not allow it",
+    413: "too large",
+    415: "wrong content type",
+    421: "this Host is not served here",
+    422: "the request does not fit its schema",
+    423: "another request is writing to this upload",
+    429: "too many; see Retry-After",
+    503: "not now; see Retry-After",
+    507: "the disk or your part of it is full",
+}
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The answers other than success, for the OpenAPI."""
+    common = (400, 401, 403, 421, 422, 429, 503)
+    return {s: {"model": Problem, "description": _MEANINGS.get(s, "refused")} for s in sorted({*common, *statuses})}

@@ -1,0 +1,217 @@
+"""What goes over the wire. Strict: `false` is not a number, an unknown key is an error."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
+
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat
+
+UUID_PATTERN = r"^[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}$"
+Ident = Annotated[str, Field(pattern=UUID_PATTERN, examples=["3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f"])]
+PoseList = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3, examples=[[1.0, 2.0, 0.0]])]
+Label = Annotated[str, Field(max_length=255)]
+
+
+class Strict(BaseModel):
+    """No conversions, no unknown keys."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+
+class Problem(BaseModel):
+    """Every answer that is not a success."""
+
+    code: str = Field(description="a word for programs", examples=["not_found"])
+    message: str = Field(description="a sentence for people", examples=["there is no job '…'"])
+    details: list[dict[str, Any]] | None = Field(default=None, description="where a request did not fit the schema")
+
+
+class FileView(BaseModel):
+    """An upload: a log, or a file of a map."""
+
+    id: Ident
+    name: str
+    state: Literal["receiving", "complete"]
+    size: int | None = Field(description="bytes; null while not known")
+    received: int = Field(description="bytes that are safe on the server's disk")
+    sha256: str | None
+    created: AwareDatetime
+    expires: AwareDatetime | None = Field(description="an unfinished upload is removed then")
+
+
+class FileList(BaseModel):
+    """Uploads, newest first."""
+
+    files: list[FileView]
+
+
+class MapFiles(Strict):
+    """The two uploads of a map as nav2 writes it."""
+
+    yaml: Ident
+    image: Ident
+
+
+class ReadRequest(Strict):
+    """How to read the log; what is left out is found out."""
+
+    scan_topic: Label | None = None
+    odom_topic: Label | None = None
+    truth_topic: Label | None = None
+    base_frame: Label | None = None
+    laser_pose: PoseList | None = None
+    start_s: FiniteFloat | None = None
+    end_s: FiniteFloat | None = None
+
+
+class JobRequest(Strict):
+    """What to run: the same as the options of `hsloc replay`."""
+
+    log: Ident = Field(description="id of the uploaded log")
+    map: MapFiles | None = Field(default=None, description="map; default: the one in the log")
+    mode: Literal["localise"] = "localise"
+    matcher: Literal["hide", "harmony_search", "icp"] | None = None
+    preset: Literal["default", "paper", "paper-literal"] = "default"
+    seed: int = Field(default=0, ge=0, le=2**63 - 1)
+    initial_pose: PoseList | None = Field(default=None, description="start: x, y (m), yaw (rad)")
+    unknown_start: bool = Field(default=False, description="search the whole map, whatever the log says")
+    alignment: Literal["none", "origin", "se2"] = "none"
+    read: ReadRequest | None = None
+    config: dict[str, Any] | None = Field(default=None, description="parameters, on top of the preset; see /v1/options")
+    webhook: Annotated[str, Field(max_length=2000, pattern=r"^https?://[^\s]+$")] | None = Field(
+        default=None, description="URL that is told when the job has ended"
+    )
+
+
+class RerunRequest(Strict):
+    """What to change in a job that is run again; the rest, and the seed, stay."""
+
+    matcher: Literal["hide", "harmony_search", "icp"] | None = None
+    preset: Literal["default", "paper", "paper-literal"] | None = None
+    seed: int | None = Field(default=None, ge=0, le=2**63 - 1)
+    initial_pose: PoseList | None = None
+    unknown_start: bool | None = None
+    config: dict[str, Any] | None = None
+
+
+State = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
+
+
+class ProgressView(BaseModel):
+    """How far a running job is."""
+
+    phase: str = Field(description="open, replay, write", examples=["replay"])
+    done: float = Field(description="seconds of the log (replay), or the part of the work from 0 to 1 (others)")
+    total: float
+    fraction: float = Field(ge=0.0, le=1.0)
+    speed: float | None = Field(description="done per second of wall time since the attempt began")
+    scans: int | None
+    age_s: float = Field(description="seconds since the job's process said so")
+
+
+class JobView(BaseModel):
+    """A job.
+
+    `reason` of a failed job: invalid_input, out_of_memory, cpu_limit, wall_limit, output_limit, disk_full,
+    fault_injection; of a crashed one: signal, exit, internal_error, protocol, attempts.
+    """
+
+    id: Ident
+    seq: int = Field(description="number of the job on this server; the cursor of the list")
+    state: State
+    reason: str | None
+    message: str | None
+    log: str = Field(description="what the client called the log")
+    request: dict[str, Any]
+    rerun_of: str | None
+    attempt: int
+    created: AwareDatetime
+    started: AwareDatetime | None
+    ended: AwareDatetime | None
+    progress: ProgressView | None
+    heartbeat_age_s: float | None = Field(description="seconds since the job's supervisor said that it lives")
+    summary: dict[str, Any] | None
+
+
+class JobList(BaseModel):
+    """Jobs, newest first; pass `next` as `before` for more."""
+
+    jobs: list[JobView]
+    next: int | None
+
+
+class AssetView(BaseModel):
+    """A file of the results."""
+
+    name: str
+    size: int
+    sha256: str
+    media_type: str
+    href: str
+
+
+class Manifest(BaseModel):
+    """All files of the results of a job."""
+
+    job: Ident
+    assets: list[AssetView]
+
+
+class DeliveryView(BaseModel):
+    """A webhook and what became of it."""
+
+    event_id: str
+    url: str
+    state: Literal["pending", "delivered", "given_up"]
+    attempts: int
+    last_status: int | None
+    last_error: str | None
+
+
+class DeliveryList(BaseModel):
+    """The webhooks of a job."""
+
+    deliveries: list[DeliveryView]
+
+
+class SecretView(BaseModel):
+    """The key of the webhooks' HMAC-SHA256."""
+
+    secret: str
+
+
+class Info(BaseModel):
+    """About this server, for whoever asks."""
+
+    version: str
+    tenant: str
+    scopes: list[str]
+    slots: int
+    busy: int
+    queued: int
+    max_upload_bytes: int
+    free_bytes: int
+
+
+class Options(BaseModel):
+    """The parameters that a job may set in `config`."""
+
+    config_schema: dict[str, Any] = Field(description="JSON Schema of `config`")
+    presets: dict[str, Any] = Field(description="the effective configuration of each preset")
+
+
+class Health(BaseModel):
+    """Alive, or ready to work."""
+
+    status: Literal["ok"]
+
+
+def moment(seconds: float | None) -> datetime | None:
+    """Seconds since 1970 as a moment in UTC."""
+    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
+
+
+def known_moment(seconds: float) -> datetime:
+    """The same for a time that is there."""
+    return datetime.fromtimestamp(seconds, UTC)

@@ -1,0 +1,129 @@
+"""Start the service: check what it listens on, make the first token, run uvicorn."""
+
+from __future__ import annotations
+
+import dataclasses
+import ipaddress
+import resource
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+import uvicorn
+
+from service.database import Database
+from service.http.app import create_app
+from service.http.protocol import protocol_class
+from service.logs import configure
+from service.principal import SCOPES, Tokens
+from service.settings import Settings, SettingsError
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
+
+SHUTDOWN_S = 10
+
+
+class Server(uvicorn.Server):
+    """Tells the event streams when it is asked to stop; else it would wait for them."""
+
+    def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
+        super().__init__(config)
+        self._hsloc = app
+
+    def handle_exit(self, sig: int, frame: Any) -> None:
+        """SIGTERM or SIGINT."""
+        self._hsloc.state.context.stopping.set()
+        super().handle_exit(sig, frame)
+
+
+def serve(
+    settings: Settings,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    *,
+    open_to_all: bool = False,
+    first_token: bool = False,
+    secret: str | None = None,
+) -> int:
+    """Serve until SIGTERM; the exit code.
+
+    Without any token the service answers loopback only, unless `open_to_all`. `first_token` makes one on the first
+    start and writes it to stdout; `secret` is a token that the operator chose. Raises SettingsError.
+    """
+    app = create_app(settings := with_tokens(settings, host, open_to_all, first_token, secret))
+    configure()
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, 65536) if hard > 0 else 65536), hard))
+    config = uvicorn.Config(
+        app,
+        host=host,
+        port=port,
+        http=protocol_class(
+            settings.header_timeout_s, settings.body_timeout_s, settings.write_timeout_s, settings.max_connections
+        ),
+        ws="none",
+        loop="asyncio",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_keep_alive=5,
+        timeout_graceful_shutdown=SHUTDOWN_S,
+        backlog=2048,
+    )
+    server = Server(config, app)
+    server.run()
+    return 0 if server.started else 1
+
+
+def with_tokens(settings: Settings, host: str, open_to_all: bool, first_token: bool, secret: str | None) -> Settings:
+    """The settings, with tokens required where they must be. Raises SettingsError where none is there."""
+    settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+    database = Database(settings.data / "hsloc.db")
+    try:
+        tokens = Tokens(database)
+        if secret is not None:
+            if len(secret) < 24:
+                raise SettingsError(f"the token has {len(secret)} characters; it must have 24 or more")
+            tokens.issue("default", label="operator's", secret=secret)
+        elif first_token and not tokens.any():
+            show_token(tokens.issue("default", label="first"))
+        required = settings.require_token or tokens.any()
+    finally:
+        database.close()
+    if not required and not open_to_all and not is_loopback(host):
+        raise SettingsError(
+            f"host is {host}, and no token exists: everybody who reaches it could do everything; "
+            "make one with --first-token or `hsloc serve --new-token TENANT`, or pass --open-to-all"
+        )
+    hosts = settings.allowed_hosts if host in settings.allowed_hosts else (*settings.allowed_hosts, host)
+    return dataclasses.replace(settings, require_token=required, allowed_hosts=hosts)
+
+
+def new_token(settings: Settings, tenant: str, scopes: str = ",".join(SCOPES), days: float | None = None) -> int:
+    """Make a token and show it; works while the service runs. Raises SettingsError."""
+    settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+    database = Database(settings.data / "hsloc.db")
+    try:
+        chosen = tuple(part.strip() for part in scopes.split(",") if part.strip())
+        expires = None if days is None else time.time() + days * 86400.0
+        show_token(Tokens(database).issue(tenant, chosen, expires=expires))
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
+    finally:
+        database.close()
+    return 0
+
+
+def show_token(token: str) -> None:
+    """Once, on stdout."""
+    sys.stdout.write(f"token (shown this once): {token}\n")
+    sys.stdout.flush()
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches it."""
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,104 @@
+"""The JSON Schema of the parameters, made from the dataclasses of the library.
+
+It is made in a process of its own (`python -m service.options`): importing the algorithms costs 100 MB and a second,
+and the server needs none of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import subprocess
+import sys
+import types
+import typing
+from typing import Any
+
+from service.errors import ServiceError
+
+_KINDS = {float: "number", int: "integer", bool: "boolean", str: "string"}
+
+
+@functools.cache
+def options() -> dict[str, Any]:
+    """`config_schema` and `presets`."""
+    command = [sys.executable, "-P", "-m", "service.options"]
+    done = subprocess.run(command, capture_output=True, check=True, timeout=120)
+    return typing.cast("dict[str, Any]", json.loads(done.stdout))
+
+
+def check(config: dict[str, Any]) -> None:
+    """Raises ServiceError 422 for an unknown key or a value of the wrong type; ranges are checked by the job."""
+    _check(config, options()["config_schema"], "config")
+
+
+def _check(value: Any, schema: dict[str, Any], where: str) -> None:
+    if "anyOf" in schema:
+        if value is None:
+            return
+        schema = next(each for each in schema["anyOf"] if each != {"type": "null"})
+    kind = schema["type"]
+    if kind == "object":
+        if not isinstance(value, dict):
+            raise _wrong(where, "must be an object")
+        for key, item in value.items():
+            if key not in schema["properties"]:
+                raise _wrong(f"{where}.{key[:60]}", f"is unknown; known are {', '.join(schema['properties'])}")
+            _check(item, schema["properties"][key], f"{where}.{key}")
+        return
+    if kind == "array":
+        if not isinstance(value, list) or len(value) > 1000:
+            raise _wrong(where, "must be a list")
+        for item in value:
+            _check(item, schema["items"], where)
+        return
+    fits = {
+        "number": isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300,
+        "integer": isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1 << 63,
+        "boolean": isinstance(value, bool),
+        "string": isinstance(value, str),
+    }
+    if not fits[kind]:
+        raise _wrong(where, f"must be of type {kind}")
+    if "enum" in schema and value not in schema["enum"]:
+        raise _wrong(where, f"must be one of {', '.join(schema['enum'])}")
+
+
+def _wrong(where: str, what: str) -> ServiceError:
+    return ServiceError(422, "invalid", f"{where} {what}")
+
+
+def _describe() -> dict[str, Any]:
+    from hsloc.config import MATCHERS, PRESETS, Config, preset, to_dict
+
+    schema = _schema(Config, Config())
+    schema["properties"]["matcher"]["enum"] = list(MATCHERS)
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    return {"config_schema": schema, "presets": {name: to_dict(preset(name)) for name in PRESETS}}
+
+
+def _schema(hint: Any, default: Any) -> dict[str, Any]:
+    """JSON Schema of a type of the configuration."""
+    if dataclasses.is_dataclass(hint):
+        hints = typing.get_type_hints(hint)
+        names = [each.name for each in dataclasses.fields(hint)]
+        properties = {name: _schema(hints[name], getattr(default, name)) for name in names}
+        return {"type": "object", "additionalProperties": False, "properties": properties}
+    if isinstance(hint, types.UnionType):
+        inner = next(kind for kind in hint.__args__ if kind is not type(None))
+        return {"anyOf": [_schema(inner, default), {"type": "null"}]}
+    if typing.get_origin(hint) is tuple:
+        inner = typing.get_args(hint)[0]
+        items = {"type": _KINDS.get(inner, "number")}
+        return {"type": "array", "items": items, "default": list(default or ())}
+    found: dict[str, Any] = {"type": _KINDS.get(typing.get_origin(hint) or hint, "string")}
+    if typing.get_origin(hint) is typing.Literal:
+        found = {"type": "string", "enum": list(typing.get_args(hint))}
+    if default is not None:
+        found["default"] = default
+    return found
+
+
+if __name__ == "__main__":
+    sys.stdout.write(json.dumps(_describe()))

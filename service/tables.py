@@ -1,0 +1,154 @@
+"""The tables. Every row of a user belongs to a tenant, and no query of the repositories leaves the tenant out."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from sqlalchemy import JSON, Index, Text, UniqueConstraint
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+SCHEMA_VERSION = 1
+
+JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
+ACTIVE: tuple[JobState, ...] = ("queued", "running", "cancelling")
+ENDED: tuple[JobState, ...] = ("succeeded", "failed", "crashed", "cancelled")
+
+
+class Base(DeclarativeBase):
+    """Base of the tables."""
+
+    type_annotation_map = {dict[str, Any]: JSON, list[str]: JSON}  # noqa: RUF012
+
+
+class TokenRow(Base):
+    """A bearer token; the secret itself is not kept."""
+
+    __tablename__ = "token"
+    id: Mapped[str] = mapped_column(primary_key=True)
+    tenant: Mapped[str]
+    label: Mapped[str] = mapped_column(default="")
+    scopes: Mapped[str]
+    sha256: Mapped[str]
+    created: Mapped[float]
+    expires: Mapped[float | None]
+    revoked: Mapped[float | None]
+
+
+class FileRow(Base):
+    """An upload: a log, or one of the two files of a map."""
+
+    __tablename__ = "file"
+    id: Mapped[str] = mapped_column(primary_key=True)
+    tenant: Mapped[str] = mapped_column(index=True)
+    name: Mapped[str]
+    """What the client called it; only ever a label."""
+    state: Mapped[str] = mapped_column(default="receiving")
+    """receiving, complete"""
+    size: Mapped[int | None]
+    """Announced, or measured when complete."""
+    received: Mapped[int] = mapped_column(default=0)
+    """Bytes known to be on the disk."""
+    sha256: Mapped[str | None]
+    created: Mapped[float]
+    expires: Mapped[float | None]
+
+
+class JobRow(Base):
+    """A job, and who runs it now."""
+
+    __tablename__ = "job"
+    seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    id: Mapped[str] = mapped_column(unique=True)
+    tenant: Mapped[str] = mapped_column(index=True)
+    file_id: Mapped[str] = mapped_column(index=True)
+    log_name: Mapped[str]
+    request: Mapped[dict[str, Any]]
+    rerun_of: Mapped[str | None]
+    state: Mapped[str] = mapped_column(default="queued")
+    reason: Mapped[str | None]
+    """Why it ended as it did, in a word: see the API's documentation."""
+    message: Mapped[str | None]
+    """The same in a sentence for a person."""
+    created: Mapped[float]
+    started: Mapped[float | None]
+    ended: Mapped[float | None]
+    attempt: Mapped[int] = mapped_column(default=0)
+    """The fence: every write of a worker names the owner and the attempt."""
+    owner: Mapped[str | None]
+    lease_until: Mapped[float | None]
+    cancel: Mapped[bool] = mapped_column(default=False)
+    phase: Mapped[str | None]
+    done: Mapped[float | None]
+    total: Mapped[float | None]
+    scans: Mapped[int | None]
+    speed: Mapped[float | None]
+    progressed: Mapped[float | None]
+    heartbeat: Mapped[float | None]
+    folder: Mapped[str | None]
+    """Name of the folder with the results: of the attempt that won."""
+    summary: Mapped[dict[str, Any] | None]
+    webhook: Mapped[str | None]
+    __table_args__ = (Index("job_by_state", "state", "seq"),)
+
+
+class AssetRow(Base):
+    """One file of a result: the manifest."""
+
+    __tablename__ = "asset"
+    job_id: Mapped[str] = mapped_column(primary_key=True)
+    name: Mapped[str] = mapped_column(primary_key=True)
+    size: Mapped[int]
+    sha256: Mapped[str]
+    media_type: Mapped[str]
+
+
+class EventRow(Base):
+    """What happened to a job; the id is the cursor of the event stream."""
+
+    __tablename__ = "event"
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    tenant: Mapped[str]
+    job_id: Mapped[str]
+    at: Mapped[float]
+    kind: Mapped[str]
+    """state, progress, log"""
+    data: Mapped[dict[str, Any]]
+    __table_args__ = (Index("event_by_job", "job_id", "id"), {"sqlite_autoincrement": True})
+
+
+class IdempotencyRow(Base):
+    """A key that a client chose for a request, so that it can be sent again."""
+
+    __tablename__ = "idempotency"
+    tenant: Mapped[str] = mapped_column(primary_key=True)
+    key: Mapped[str] = mapped_column(primary_key=True)
+    sha256: Mapped[str]
+    job_id: Mapped[str]
+    created: Mapped[float]
+
+
+class DeliveryRow(Base):
+    """A webhook to be delivered; written in the transaction that ends the job."""
+
+    __tablename__ = "delivery"
+    id: Mapped[str] = mapped_column(primary_key=True)
+    tenant: Mapped[str]
+    job_id: Mapped[str] = mapped_column(index=True)
+    url: Mapped[str]
+    body: Mapped[str] = mapped_column(Text)
+    state: Mapped[str] = mapped_column(default="pending")
+    """pending, delivered, given_up"""
+    attempts: Mapped[int] = mapped_column(default=0)
+    next_at: Mapped[float]
+    last_status: Mapped[int | None]
+    last_error: Mapped[str | None]
+    created: Mapped[float]
+
+
+class SecretRow(Base):
+    """The key that signs a tenant's webhooks."""
+
+    __tablename__ = "secret"
+    tenant: Mapped[str] = mapped_column(primary_key=True)
+    webhook: Mapped[str]
+    __table_args__ = (UniqueConstraint("tenant"),)

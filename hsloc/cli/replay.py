@@ -1,4 +1,4 @@
-"""Replay a recorded log on its map: trajectory, error metrics, a picture and a recording to look at."""
+"""Replay a recorded log, on a map or drawing one: trajectory, error metrics, a picture and a recording to look at."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.cli.arguments import add_config_arguments, add_read_arguments, config, pose, read_options, to_pose
+from hsloc.cli.folders import default_folder, link_latest, refuse_early
 from hsloc.cli.progress import ProgressLine
 
 if TYPE_CHECKING:
@@ -14,13 +15,17 @@ if TYPE_CHECKING:
 
     from hsloc.replay.run import Progress, Result
 
-HELP = "localise the robot of a recorded log on a map"
+HELP = "localise the robot of a recorded log, or map while it goes"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Logs, map, start, output; reading; algorithms."""
     parser.add_argument("log", nargs="+", type=Path, help="MCAP, ROS 1 or ROS 2 bag, CARMEN log; several are one run")
     parser.add_argument("--map", type=Path, metavar="YAML", help="map as nav2 writes it (default: /map in the log)")
+    parser.add_argument(
+        "--mode", choices=("auto", "localise", "slam"), default="auto", help="default: localise if there is a map"
+    )
+    parser.add_argument("--no-odom", action="store_true", help="draw a map without looking at the log's odometry")
     start = parser.add_mutually_exclusive_group()
     start.add_argument("--initial-pose", type=pose, metavar="X,Y,YAW", help="start, in metres and radians")
     start.add_argument("--unknown-start", action="store_true", help="search the whole map, whatever the log says")
@@ -32,7 +37,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--overwrite", action="store_true", help="replace the folder if it exists")
     parser.add_argument(
-        "--alignment", choices=("none", "origin", "se2"), default="none", help="move the estimate onto the truth first"
+        "--alignment",
+        choices=("none", "origin", "se2"),
+        help="move the estimate onto the truth first (default: none on a given map, se2 on a drawn one)",
+    )
+    parser.add_argument(
+        "--relations", type=Path, metavar="FILE", help="score by relations: `t1 t2 x y z roll pitch yaw`"
     )
     parser.add_argument("--json", action="store_true", help="print the metrics as JSON on stdout")
     parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
@@ -59,9 +69,11 @@ def run(arguments: argparse.Namespace) -> int:
         unknown_start=arguments.unknown_start,
         seed=arguments.seed,
         preset=arguments.preset,
+        mode=arguments.mode,
+        no_odometry=arguments.no_odom,
     )
-    folder = arguments.out or _default_folder(arguments.log[0])
-    _refuse_early(folder, arguments.overwrite)
+    folder = arguments.out or default_folder(arguments.log[0].name.split(".")[0] or "run")
+    refuse_early(folder, arguments.overwrite)
     with ProgressLine(arguments.quiet) as line:
 
         def show(progress: Progress) -> None:
@@ -78,10 +90,11 @@ def run(arguments: argparse.Namespace) -> int:
             folder,
             overwrite=arguments.overwrite,
             alignment=arguments.alignment,
+            relations=arguments.relations,
             progress=lambda share: line.show("writing", share),
         )
     if arguments.out is None:
-        _link_latest(folder)
+        link_latest(folder)
     _tell(result, arguments)
     if arguments.json:
         print(format_json({**metrics, "timings": timings(result), "results": str(folder)}), end="")
@@ -101,36 +114,3 @@ def _tell(result: Result, arguments: argparse.Namespace) -> None:
     if arguments.verbose:
         for reason in result.losses.reasons:
             print(f"hsloc: log: {reason}", file=sys.stderr)
-
-
-def _default_folder(log: Path) -> Path:
-    from datetime import datetime
-
-    stamp = datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
-    return Path("results") / f"{log.name.split('.')[0] or 'run'}-{stamp}"
-
-
-def _refuse_early(folder: Path, overwrite: bool) -> None:
-    """A folder that cannot be written is told before the work, not after it."""
-    import os
-
-    from hsloc.errors import OutputError
-
-    if folder.exists() and not overwrite and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError(f"{folder}: exists already; choose another --out, or pass --overwrite")
-    parent = folder.absolute().parent
-    while not parent.exists():
-        parent = parent.parent
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise OutputError(f"{folder}: cannot be written: {parent} is not a folder that may be written to")
-
-
-def _link_latest(folder: Path) -> None:
-    """`results/latest` points to the newest results; without it (no symbolic links here) nothing is lost."""
-    import contextlib
-
-    link = folder.parent / "latest"
-    with contextlib.suppress(OSError):
-        if link.is_symlink():
-            link.unlink()
-        link.symlink_to(folder.name, target_is_directory=True)

@@ -180,7 +180,7 @@ def run_search(
     few = scaled[: matcher.search_points]
     pose = np.empty(3)
     information = np.zeros((3, 3))
-    history = np.full(3 * parameters.budget + 2 * matcher.memory_size if keep_history else 0, np.nan)
+    history = np.full(most_evaluations(parameters) if keep_history else 0, np.nan)
     fitness, evaluations, restarts, stopped = search(
         field.packed,
         scaled,
@@ -204,6 +204,13 @@ def run_search(
         restarts=int(restarts),
         history=history[~np.isnan(history)] / len(few) if keep_history else None,
     )
+
+
+def most_evaluations(parameters: SearchParameters) -> int:
+    """No restart evaluates more often before its polish, whatever the budget counts."""
+    hrt = parameters.improvisations_per_pass
+    passes = -(-parameters.budget // hrt) if hrt > 0 else 0
+    return parameters.budget + parameters.memory_size * (1 + passes)
 
 
 def _more_to_agree(window: Window) -> int:

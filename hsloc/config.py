@@ -14,6 +14,7 @@ from hsloc.localisation.localiser import LocaliserParameters
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.hide import Hide
 from hsloc.matching.icp import Icp
+from hsloc.slam.mapper import GraphMapperParameters
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -51,6 +52,7 @@ class Config:
     icp: Icp = field(default_factory=Icp)
     likelihood_field: FieldParameters = field(default_factory=FieldParameters)
     localiser: LocaliserParameters = field(default_factory=LocaliserParameters)
+    graph_mapper: GraphMapperParameters = field(default_factory=GraphMapperParameters)
 
     def __post_init__(self) -> None:
         if self.matcher not in MATCHERS:

@@ -31,6 +31,13 @@ def summary_lines(metrics: Mapping[str, Any], timings: Mapping[str, Any], folder
                 ]
     elif "evaluation_error" in metrics:
         lines.append(f"no comparison with the truth: {metrics['evaluation_error']}")
+    if "relations" in metrics:
+        relations = metrics["relations"]
+        translation, angle = relations["trans_part"], relations["angle_deg"]
+        lines.append(
+            f"relations ({relations['matched']}): {translation['mean']:.4f} +- {translation['std']:.4f} m, "
+            f"{angle['mean']:.3f} +- {angle['std']:.3f} deg"
+        )
     scans, log = metrics["scans"], metrics["log"]
     others = ", ".join(
         f"{n} {name}" for name, n in scans["by_status"].items() if name not in ("matched", "relocalised")
@@ -43,12 +50,16 @@ def summary_lines(metrics: Mapping[str, Any], timings: Mapping[str, Any], folder
             f"scan to map: median {residuals['median']:.3f} m, 95 % below {residuals['p95']:.3f} m, "
             f"{100 * residuals['within_0.15_m']:.1f} % of the points within 0.15 m of a wall"
         )
-    share = metrics["localised"]["share_of_odometry"]
+    if "mapping" in metrics["map"]:
+        quality = metrics["map"]["mapping"]
+        lines.append(f"map drawn from {quality['keyscans']} scans, {quality['loops']} loops closed")
+    share = metrics["localised"]["share_of_poses"]
     if share < 1.0:
         lines.append(f"localised: {100 * share:.1f} % of the poses; the others are guesses")
     speed = timings["times_real_time"]
     if speed:
-        lines.append(f"replay: {timings['seconds']['replay']:.2f} s, {speed:.0f}x real time")
+        seconds = timings["seconds"]["replay"] + timings["seconds"].get("finish", 0.0)
+        lines.append(f"replay: {seconds:.2f} s, {speed:.0f}x real time")
     lines.append(f"results: {folder}")
     return lines
 

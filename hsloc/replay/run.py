@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.config import Config
-from hsloc.errors import LogError, MapError
+from hsloc.errors import ConfigError, LogError, MapError
 from hsloc.log.reader import open_log
 from hsloc.log.summary import LogSummary, Losses, ReadOptions
 from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.matching.window import Window
-from hsloc.model.events import PairedScan, Scan
+from hsloc.model.events import Odometry, Scan
+from hsloc.model.trajectory import Trajectory
 from hsloc.replay.engine import replay
 from hsloc.replay.recording import Recording
+from hsloc.slam.mapper import Mapper
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -30,17 +32,21 @@ if TYPE_CHECKING:
     from hsloc.model.events import Event
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.model.pose2 import Pose2
-    from hsloc.model.trajectory import Trajectory
     from hsloc.replay.engine import Estimator
+    from hsloc.slam.result import MappingResult
+
+
+MODES = ("auto", "localise", "slam")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunSpec:
     """What to run. The same spec on the same files gives the same result, bit for bit.
 
-    Without `map_path` the map is the log's own. The start is `initial_pose`, else the one the log states, else unknown;
-    with `unknown_start` it is unknown whatever the log states. `labels` are the names of the logs in reports, where the
-    files' own names say nothing.
+    `mode` is "localise", "slam" or "auto": localise if there is a map, `map_path` or the log's own, else draw one.
+    With `no_odometry` the log's odometry is not looked at (slam alone). The start is `initial_pose`, else the one the
+    log states, else unknown; with `unknown_start` it is unknown whatever the log states. `labels` are the names of the
+    logs in reports, where the files' own names say nothing.
     """
 
     logs: tuple[Path, ...]
@@ -52,6 +58,16 @@ class RunSpec:
     seed: int = 0
     preset: str = "default"
     labels: tuple[str, ...] = ()
+    mode: str = "auto"
+    no_odometry: bool = False
+
+    def __post_init__(self) -> None:
+        if self.mode not in MODES:
+            raise ConfigError(f"mode is {self.mode!r}; it must be one of {', '.join(MODES)}")
+        if self.no_odometry and (self.mode == "localise" or self.map_path is not None):
+            raise ConfigError(
+                "a robot on a given map is followed with odometry; leave out --no-odom or use --mode slam"
+            )
 
     def names(self) -> tuple[str, ...]:
         """What to call the logs in reports."""
@@ -70,7 +86,12 @@ class Progress:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Result:
-    """What a run found, and what is needed to repeat it. `seconds` are wall times, the only thing not repeatable."""
+    """What a run found, and what is needed to repeat it. `seconds` are wall times, the only thing not repeatable.
+
+    `trajectory` has one pose for each odometry message; where there are none, one for each scan. `localised` says
+    which of them are believed. `grid` is the map that was used, or, with `mapping`, the one that was drawn; then
+    `true_grid` is the one that the log carries, if any.
+    """
 
     spec: RunSpec
     summary: LogSummary
@@ -84,30 +105,42 @@ class Result:
     losses: Losses
     warnings: tuple[str, ...]
     seconds: dict[str, float]
+    mapping: MappingResult | None = None
+    true_grid: OccupancyGrid | None = None
+
+    @property
+    def follows_scans(self) -> bool:
+        """Whether the trajectory has a pose for each scan, for want of odometry."""
+        return len(self.odometry) == 0
 
 
 def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Result:
-    """Replay a log through the localiser.
+    """Replay a log through the localiser or the mapper.
 
     Raises an `HslocError` for a log, map or configuration that cannot be used.
     """
     begin = time.perf_counter()
-    log = open_log(spec.logs, spec.read)
+    log = open_log(spec.logs, replace(spec.read, require_odometry=not spec.no_odometry))
     grid, warnings = find_map(spec, log)
+    localise = spec.mode == "localise" or (spec.mode == "auto" and grid is not None and not spec.no_odometry)
     opened = time.perf_counter()
     if progress is not None:
         progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
-    estimator = _localiser(spec, log, grid)
+    estimator = _localiser(spec, log, grid) if localise else _mapper(spec)
     prepared = time.perf_counter()
     recording = Recording()
-    for event, estimate in replay(_reported(log, log.events(), recording, progress), estimator):
+    for event, estimate in replay(_reported(log, _events(spec, log), recording, progress), estimator):
         recording.add(event, estimate)
     replayed = time.perf_counter()
     if recording.scans == 0:
-        raise LogError(
-            f"{spec.logs[0]}: no scan between --start and --end" if _cut(spec) else f"{spec.logs[0]}: no scan"
-        )
-    trajectory, localised = recording.trajectory()
+        where = "between --start and --end" if _cut(spec) else f"on {log.summary.scan_topic} that could be read"
+        raise LogError(f"{spec.logs[0]}: no scan {where}")
+    seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
+    mapping = None
+    if isinstance(estimator, Mapper):
+        mapping = estimator.finish(_share(progress, log.summary.duration_s, recording.scans))
+        seconds["finish"] = time.perf_counter() - replayed
+    trajectory, localised = recording.trajectory() if mapping is None else _mapped(recording, mapping)
     return Result(
         spec=spec,
         summary=log.summary,
@@ -116,30 +149,66 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
         localised=localised,
         odometry=recording.odometry(),
         reference=recording.reference(),
-        grid=grid,
+        grid=mapping.grid if mapping is not None else _must(grid),
         diagnostics=recording.diagnostics(),
         losses=log.losses,
         warnings=(*log.summary.warnings, *warnings),
-        seconds={"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared},
+        seconds=seconds,
+        mapping=mapping,
+        true_grid=grid if mapping is not None else None,
     )
 
 
-def find_map(spec: RunSpec, log: Log) -> tuple[OccupancyGrid, tuple[str, ...]]:
-    """The map to localise in, and what there is to warn of."""
+def _mapped(recording: Recording, mapping: MappingResult) -> tuple[Trajectory, NDArray[np.bool_]]:
+    """The trajectory as it is known at the end: at the odometry messages, or at the scans if there are none."""
+    stamps = recording.odometry().stamps_ns
+    poses = mapping.odometry_poses
+    if len(stamps) == 0:
+        stamps, poses = recording.diagnostics().stamps_ns, mapping.scan_poses
+    return Trajectory(stamps, poses), np.ones(len(stamps), dtype=np.bool_)
+
+
+def _events(spec: RunSpec, log: Log) -> Iterator[Event]:
+    """The events of the log; without its odometry if that is not to be looked at."""
+    for event in log.events():
+        if not (spec.no_odometry and isinstance(event, Odometry)):
+            yield event
+
+
+def _share(progress: Callable[[Progress], None] | None, total: float, scans: int) -> Callable[[float], None] | None:
+    if progress is None:
+        return None
+    return lambda share: progress(Progress("refine", share * total, total, scans))
+
+
+def find_map(spec: RunSpec, log: Log) -> tuple[OccupancyGrid | None, tuple[str, ...]]:
+    """The map that is given or that the log carries, and what there is to warn of."""
     if spec.map_path is not None:
         from hsloc.maps import read_map
 
         loaded = read_map(spec.map_path)
         return loaded.grid, loaded.warnings
     grid = log.map()
-    if grid is None:
+    if grid is None and spec.mode == "localise":
         raise MapError(f"{spec.logs[0]}: the log has no /map; give one with --map map.yaml")
     return grid, ()
 
 
-def _localiser(spec: RunSpec, log: Log, grid: OccupancyGrid) -> Estimator:
+def _must(grid: OccupancyGrid | None) -> OccupancyGrid:
+    if grid is None:
+        raise MapError("no map to localise in")
+    return grid
+
+
+def _mapper(spec: RunSpec) -> Mapper:
+    parameters = replace(spec.config.graph_mapper, use_odometry=not spec.no_odometry)
+    return Mapper(parameters, np.random.default_rng(spec.seed))
+
+
+def _localiser(spec: RunSpec, log: Log, given: OccupancyGrid | None) -> Estimator:
     from hsloc.localisation.localiser import Localiser
 
+    grid = _must(given)
     config = spec.config
     likelihood = LikelihoodField.from_grid(grid, config.likelihood_field.sigma, config.likelihood_field.margin)
     start = spec.initial_pose
@@ -173,5 +242,5 @@ def _reported(
     origin = log.summary.origin_ns
     for event in events:
         yield event
-        if isinstance(event, (Scan, PairedScan)):
+        if isinstance(event, Scan):
             progress(Progress("replay", max((event.stamp_ns - origin) / 1e9, 0.0), total, recording.scans))

@@ -1,0 +1,136 @@
+"""metrics.json and timings.json: what a run measured."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc import __version__
+from hsloc.errors import EvaluationError
+from hsloc.evaluation import evaluate, evaluate_relations, read_relations
+from hsloc.evaluation.map_quality import compare_maps, crispness
+from hsloc.evaluation.metrics import compare
+from hsloc.model.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from hsloc.replay.residuals import Residuals
+    from hsloc.replay.run import Result
+
+
+def metrics(
+    result: Result, residuals: Residuals, alignment: str | None = None, relations: Path | None = None
+) -> dict[str, object]:
+    """The content of metrics.json: the same for the same run, wall times left out.
+
+    `alignment` of the trajectory with the truth: by default none on a given map, and se2 on one that was drawn, whose
+    frame is its own. `relations` is a file for the metric [K].
+    """
+    diagnostics = result.diagnostics
+    status = Counter(diagnostics.status)
+    pairs = zip(diagnostics.status, diagnostics.reason, strict=True)
+    reasons = Counter(f"{state}: {_kind(reason)}" if reason else state for state, reason in pairs)
+    fitness = diagnostics.fitness[np.isfinite(diagnostics.fitness)]
+    spec = result.spec
+    values: dict[str, object] = {
+        "run": {
+            "hsloc": __version__,
+            "mode": "localise" if result.mapping is None else "slam",
+            "inputs": list(spec.names()),
+            "input_sha256": result.input_sha256,
+            "map": _map_name(result),
+            "seed": spec.seed,
+            "preset": spec.preset,
+            "matcher": spec.config.matcher,
+        },
+        "log": {
+            "duration_s": duration(result),
+            "odometry_messages": len(result.odometry),
+            "path_length_m": result.trajectory.length(),
+        },
+        "scans": {
+            "total": len(diagnostics),
+            "used": status["matched"] + status["relocalised"],
+            "by_status": dict(sorted(status.items())),
+            "by_reason": dict(sorted(reasons.items())),
+        },
+        "evaluations": {
+            "total": int(diagnostics.evaluations.sum()),
+            "median_per_match": _median(diagnostics.evaluations[diagnostics.evaluations > 0]),
+        },
+        "fitness": {"median": _median(fitness), "p05": float(np.percentile(fitness, 5)) if len(fitness) else None},
+        "map": _map_quality(result, residuals),
+        "localised": {"share_of_poses": float(result.localised.mean()) if len(result.localised) else 0.0},
+        "losses": {"data_lost": result.losses.data_lost, "notes": result.losses.lines()},
+        "warnings": list(result.warnings),
+    }
+    if result.reference is not None and len(result.reference) > 1:
+        chosen = alignment or ("none" if result.mapping is None else "se2")
+        values |= _against(result.trajectory, result.reference, chosen)
+        if not result.localised.all() and result.localised.any():
+            believed = Trajectory(
+                result.trajectory.stamps_ns[result.localised], result.trajectory.poses[result.localised]
+            )
+            values["localised_only"] = _against(believed, result.reference, chosen)
+    if relations is not None:
+        values["relations"] = evaluate_relations(result.trajectory, read_relations(relations)).to_dict()
+    return values
+
+
+def _map_name(result: Result) -> str:
+    if result.mapping is not None:
+        return "drawn"
+    return "log" if result.spec.map_path is None else result.spec.map_path.name
+
+
+def _map_quality(result: Result, residuals: Residuals) -> dict[str, object]:
+    """How well scans and map agree; for a drawn map also how crisp and how consistent it is, and against a true one."""
+    values: dict[str, object] = {"residuals": residuals.to_dict()}
+    if result.mapping is None:
+        return values
+    values["crispness"] = crispness(result.grid).to_dict()
+    values["mapping"] = result.mapping.quality.to_dict()
+    if result.true_grid is not None and result.reference is not None:
+        try:
+            moved = compare(result.trajectory, result.reference, alignment="se2").T_reference_estimate
+            values["comparison"] = compare_maps(result.grid, result.true_grid, T_truth_map=moved).to_dict()
+        except EvaluationError as error:
+            values["comparison_error"] = str(error)
+    return values
+
+
+def timings(result: Result) -> dict[str, object]:
+    """Wall times: what differs from one run to the next."""
+    work = result.seconds["replay"] + result.seconds.get("finish", 0.0)
+    return {
+        "seconds": result.seconds,
+        "times_real_time": duration(result) / work if work > 0.0 else None,
+        "evaluations_per_second": int(result.diagnostics.evaluations.sum()) / work if work > 0.0 else None,
+    }
+
+
+def duration(result: Result) -> float:
+    """Seconds of the log from the first to the last pose."""
+    stamps = result.trajectory.stamps_ns
+    return float(stamps.max() - stamps.min()) / 1e9 if len(stamps) else 0.0
+
+
+def _against(trajectory: Trajectory, reference: Trajectory, alignment: str) -> dict[str, object]:
+    try:
+        return evaluate(trajectory, reference, alignment=alignment).to_dict()
+    except EvaluationError as error:
+        return {"evaluation_error": str(error)}
+
+
+def _kind(reason: str) -> str:
+    """A reason without its figures, so that reasons can be counted."""
+    return " ".join(word for word in reason.split() if not any(c.isdigit() for c in word)).rstrip(",")
+
+
+def _median(values: NDArray[np.float64] | NDArray[np.int64]) -> float | None:
+    return float(np.median(values)) if len(values) else None

@@ -1,0 +1,92 @@
+"""run.mcap: a result as a recording that Lichtblick and Foxglove show without set-up."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hsloc import __version__
+from hsloc.log.reader import open_log
+from hsloc.log.writer import LogWriter
+from hsloc.model.events import Odometry, PairedScan
+from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.model.trajectory import Trajectory
+from hsloc.replay.engine import pair
+from hsloc.replay.provenance import config_text
+from hsloc.replay.residuals import Residuals
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from hsloc.replay.run import Result
+
+_PATH_POSES = 2000
+"""A path to look at needs no more poses; viewers slow down."""
+
+
+def write_recording(result: Result, path: Path, progress: Callable[[float], None] | None = None) -> Residuals:
+    """Write map, scans, transforms, poses and the path; returns how well the scans fit the map.
+
+    The scans come from the log, read once more, so that memory does not grow with it. The map is that of the result.
+    """
+    log = open_log(result.spec.logs, result.spec.read)
+    residuals = Residuals(result.grid)
+    places = _Places(result)
+    mountings: set[str] = set()
+    start = int(result.trajectory.stamps_ns[0])
+    with LogWriter(path) as writer:
+        writer.metadata("hsloc", {"version": __version__, "seed": str(result.spec.seed)})
+        writer.attachment("config.yaml", config_text(result).encode(), "application/yaml")
+        writer.occupancy_grid(result.grid, start)
+        for event in pair(log.events()):
+            if isinstance(event, PairedScan):
+                scan = event.scan
+                if scan.frame_id not in mountings:
+                    mountings.add(scan.frame_id)
+                    writer.transforms(start, [("base_link", scan.frame_id, scan.T_base_laser)], static=True)
+                T_map_base, believed = places.of_scan(event)
+                if result.follows_scans:
+                    _write_pose(writer, scan.stamp_ns, IDENTITY, T_map_base, T_map_base)
+                writer.scan(scan)
+                if believed:
+                    residuals.add(scan, T_map_base)
+            elif isinstance(event, Odometry) and not result.follows_scans:
+                T_map_odom, T_map_base = places.of_odometry()
+                _write_pose(writer, event.stamp_ns, T_map_odom, event.T_odom_base, T_map_base)
+            if progress is not None and places.row % 500 == 0:
+                progress(places.row / len(result.trajectory))
+        every = max(len(result.trajectory) // _PATH_POSES, 1)
+        writer.path(start, Trajectory(result.trajectory.stamps_ns[::every], result.trajectory.poses[::every]))
+    return residuals
+
+
+class _Places:
+    """Where the base was at each event, going through the log a second time."""
+
+    def __init__(self, result: Result) -> None:
+        self._result = result
+        self.row = -1
+
+    def of_odometry(self) -> tuple[Pose2, Pose2]:
+        """(T_map_odom, T_map_base) at the next odometry message."""
+        self.row += 1
+        T_map_base = Pose2(*self._result.trajectory.poses[self.row])
+        return T_map_base @ Pose2(*self._result.odometry.poses[self.row]).inverse(), T_map_base
+
+    def of_scan(self, event: PairedScan) -> tuple[Pose2, bool]:
+        """T_map_base at the next scan, and whether it is believed.
+
+        Composed with the odometry since the last message: within one message of it the correction hardly changes.
+        """
+        result = self._result
+        if result.follows_scans:
+            self.row += 1
+            return Pose2(*result.trajectory.poses[self.row]), True
+        row = max(self.row, 0)
+        T_map_odom = Pose2(*result.trajectory.poses[row]) @ Pose2(*result.odometry.poses[row]).inverse()
+        return T_map_odom @ event.T_odom_base, bool(result.localised[row])
+
+
+def _write_pose(writer: LogWriter, stamp_ns: int, T_map_odom: Pose2, T_odom_base: Pose2, T_map_base: Pose2) -> None:
+    writer.transforms(stamp_ns, [("map", "odom", T_map_odom), ("odom", "base_link", T_odom_base)])
+    writer.pose(stamp_ns, T_map_base)

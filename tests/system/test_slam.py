@@ -1,0 +1,68 @@
+"""Whole runs without a map: the map is drawn, loops are closed, the trajectory is right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hsloc.evaluation import evaluate, evaluate_relations, read_relations
+from hsloc.evaluation.alignment import umeyama
+from hsloc.maps import load_map
+from hsloc.replay.results import write_results
+from hsloc.replay.run import RunSpec, run
+
+RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
+
+
+def ape(found):
+    return evaluate(found.trajectory, found.reference, alignment="se2").ape.trans_part
+
+
+@pytest.mark.parametrize("name", ["office", "corridor_loop"])
+def test_a_map_is_drawn_and_the_way_is_right(tmp_path, name):
+    found = run(RunSpec(logs=(RECORDINGS / f"{name}.mcap",), mode="slam"))
+    assert ape(found).rmse < 0.03
+    values = write_results(found, tmp_path / "out")
+    assert values["run"]["mode"] == "slam"
+    assert values["map"]["comparison"]["precision"] > 0.95
+    assert values["map"]["residuals"]["within_0.15_m"] > 0.95
+    assert np.array_equal(load_map(tmp_path / "out" / "map.yaml").cells == 100, found.grid.occupied())
+    assert (tmp_path / "out" / "graph.g2o").stat().st_size > 1000
+
+
+def test_a_drawn_map_is_a_map_to_localise_in(tmp_path):
+    drawn = run(RunSpec(logs=(RECORDINGS / "office.mcap",), mode="slam"))
+    write_results(drawn, tmp_path / "out")
+    spec = RunSpec(logs=(RECORDINGS / "office.mcap",), map_path=tmp_path / "out" / "map.yaml", unknown_start=True)
+    found = run(spec)
+    assert ape(found).rmse < 0.03
+    assert found.localised.all()
+
+
+def test_without_odometry_the_scans_alone_must_do():
+    found = run(RunSpec(logs=(RECORDINGS / "office.mcap",), mode="slam", no_odometry=True))
+    assert len(found.odometry) == 0
+    assert len(found.trajectory) == len(found.diagnostics)
+    assert ape(found).rmse < 0.03
+
+
+@pytest.mark.data
+def test_intel_is_mapped_as_well_as_by_the_best(data: Path):
+    folder = data / "intel"
+    found = run(RunSpec(logs=(folder / "intel.clf.gz",)))
+    result = evaluate_relations(found.trajectory, read_relations(folder / "intel.relations"))
+    assert result.matched == 2984
+    assert result.statistics.trans_part.mean <= 0.033
+    assert result.statistics.angle_deg.mean <= 0.8
+
+
+@pytest.mark.data
+def test_aces_closes_its_loop(data: Path):
+    folder = data / "aces"
+    found = run(RunSpec(logs=(folder / "aces.clf.gz",)))
+    reference = np.loadtxt(folder / "aces.rbpf.txt")
+    poses = found.trajectory.interpolated(np.round(reference[:, 0] * 1e9).astype(np.int64))
+    moved = umeyama(reference[:, 1:3], poses[:, :2]) @ poses[:, :2]
+    assert np.hypot(*(moved - reference[:, 1:3]).T).mean() <= 0.20

@@ -1,10 +1,10 @@
 """Closing loops: is this place one that was seen before, long ago on the way?
 
-Places are visited in their order. Those seen before that could be near, by a drift that is assumed too
-large rather than too small, are searched by HIDE over the whole window in which they could lie. A match is believed if
-it is fit, if no other pose in the window comes near to it (branch and bound, hsloc/kernels/bounds.py: in a corridor
-whose every bay looks the same there is one), and if neither place looks through the walls of the other. It becomes an edge of
-the pose graph with a covariance and a robust weight, and the graph is solved before the next place is looked at.
+Places are visited in their order. Those seen before that could be near, by a drift that is assumed too large rather than
+too small, are searched by HIDE over the whole window in which they could lie. A match is believed if it is fit, if no
+other pose in the window comes near to it (branch and bound, hsloc/kernels/bounds.py: in a corridor whose every bay
+looks the same there is one), and if neither place looks through the walls of the other. It becomes an edge of the pose
+graph with a covariance and a robust weight, and the graph is solved before the next place is looked at.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class LoopParameters:
     """Another pose may reach at most this part of the fitness."""
     max_conflict: float = 0.1
     """At most this part of the points may lie where the other place looked through."""
-    min_paired: float = 0.35
+    min_paired: float = 0.15
     """At least this part of the points seen by the other place must lie on its walls."""
     sigma_edge: float = 0.05
     """Standard deviation of a loop beside that of its match (m)."""
@@ -90,7 +90,7 @@ class Loop:
     covariance: F64
     fitness: float
     rival: float
-    """Fitness of the best other pose in the window, as a part; NaN: not known."""
+    """Fitness of the best other pose in the window, as a part; NaN: not looked for, the match was refused before."""
     conflict: float
     paired: float
     window: tuple[float, float]
@@ -191,17 +191,18 @@ class LoopCloser:
         likelihood, pooled = self._field(old)
         points = self._places.cloud(place, 1, self._scans, p.scan_range, 2.0 * p.resolution)
         match = p.hide.match(points, likelihood, Window(centre, half, half, half_angle), self._rng)
-        rival = self._rival(points, likelihood, pooled, match.pose, centre, half, half_angle)
         paired, conflict = self._compare(old, place, match.pose)
-        reason = ""
+        rival, reason = float("nan"), ""
         if match.fitness < p.min_fitness:
             reason = f"fitness {match.fitness:.2f} below {p.min_fitness:.2f}"
-        elif not rival <= p.max_rival:
-            reason = f"ambiguous: another pose reaches {100.0 * rival:.0f} % of the fitness"
         elif conflict > p.max_conflict:
             reason = f"{100.0 * conflict:.0f} % of the points lie where the other place saw free space"
         elif paired < p.min_paired:
             reason = f"only {100.0 * paired:.0f} % of the points lie on walls of the other place"
+        else:
+            rival = self._rival(points, likelihood, pooled, match.pose, centre, half, half_angle)
+            if not rival <= p.max_rival:
+                reason = f"ambiguous: another pose reaches {100.0 * rival:.0f} % of the fitness"
         covariance = match.covariance + np.diag((p.sigma_edge**2, p.sigma_edge**2, p.sigma_edge_angle**2))
         return Loop(
             old,
@@ -260,7 +261,7 @@ class LoopCloser:
     def _compare(self, old: int, place: int, pose: Pose2) -> tuple[float, float]:
         """Of the points that either place sees of the other: the part on walls, the part where it looked through."""
         places, s = self._places, self._scans
-        first, second = places.members(old, 0), places.members(place, 0)
+        first, second = places.members(old, 1), places.members(place, 1)
         T_old = compose_poses(
             np.zeros(3),
             relative_poses(
@@ -275,8 +276,8 @@ class LoopCloser:
             ),
         )
         information, gradient, counts, total = np.empty((3, 3)), np.empty(3), np.zeros(5), np.zeros(5)
-        for a in range(0, len(first), max(len(first) // 5, 1)):
-            for b in range(0, len(second), max(len(second) // 5, 1)):
+        for a in range(0, len(first), max(len(first) // 7, 1)):
+            for b in range(0, len(second), max(len(second) // 7, 1)):
                 for i, j, x, y in (
                     (second[b], first[a], T_new[b], T_old[a]),
                     (first[a], second[b], T_old[a], T_new[b]),

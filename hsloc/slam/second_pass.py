@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.model.occupancy_grid import OccupancyGrid
-from hsloc.model.pose2 import Pose2, relative_poses
+from hsloc.model.pose2 import Pose2, relative_poses, wrap_angles
 from hsloc.slam.drawing import draw_grid
 from hsloc.slam.keyscans import KeyScans
 from hsloc.slam.loop_closer import Loop, LoopCloser
 from hsloc.slam.places import Places
 from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
-from hsloc.slam.refinement import Refined, refine
+from hsloc.slam.refinement import Refined, refine, stirred
 from hsloc.slam.result import MappingQuality, MappingResult
 
 if TYPE_CHECKING:
@@ -139,15 +139,19 @@ def _refine(
     poses: F64, scans: KeyScans, edges: Edges, parameters: GraphMapperParameters, progress: Callable[[float], None]
 ) -> tuple[Refined, int]:
     """Passes over the whole log, each with partners chosen anew, until nothing moves."""
-    most = parameters.passes
-    refined = refine(poses, scans, edges, parameters.refinement, lambda part: progress(part / most))
+    most, p = parameters.passes, parameters.refinement
+    # Later passes begin near their end: no wide gates, and fewer rounds.
+    later = replace(p, gates=p.gates[-1:], rounds=max(p.rounds // 2, 1))
+    refined = refine(poses, scans, edges, p, lambda part: progress(part / most))
     passes = 1
     while passes < most:
         begin = refined.poses
         done = passes
-        refined = refine(begin, scans, edges, parameters.refinement, lambda part: progress((done + part) / most))  # noqa: B023
+        refined = refine(begin, scans, edges, later, lambda part: progress((done + part) / most))  # noqa: B023
         passes += 1
-        if np.abs((refined.poses - begin)[:, :2]).max() < parameters.refinement.still:
+        change = refined.poses - begin
+        change[:, 2] = wrap_angles(change[:, 2])
+        if stirred(change) < p.still:
             break
     return refined, passes
 

@@ -1,0 +1,140 @@
+"""The report's SLAM ([P] V): a map of points, each scan matched against the points so far.
+
+The first scan is the map. Each later scan is localised against it inside the box of the prediction; where its fitness
+is at least 0.5, the points farther than a threshold from the map are added. A scan with too few points leaves the
+prediction. There is no way back: a bad pose spoils the map, as [P] says itself; the graph mapper is the answer to that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.errors import ConfigError
+from hsloc.localisation.motion import OdometryNoise, predict_covariance
+from hsloc.matching.window import Window
+from hsloc.model.estimate import Estimate, Status
+from hsloc.model.events import Odometry, PairedScan
+from hsloc.model.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
+from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.slam.local_map import LocalMap
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+    from numpy.typing import NDArray
+
+    from hsloc.matching.match import Matcher
+
+    F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointMapperParameters:
+    """The report's, at its own scale: a site of some 190 x 170 m."""
+
+    sigma: float = 1.0
+    """Decay of a point's score with its distance to the map (m)."""
+    threshold: float = 1.5
+    """A point farther than this from the map is new (m)."""
+    min_fitness: float = 0.5
+    """A scan that fits worse adds nothing."""
+    min_points: int = 3
+    """A scan with fewer points is not matched ([P]: more than 2)."""
+    window_sigmas: float = 3.0
+    """Half-width of the window in standard deviations of the prediction."""
+    window_min: float = 0.3
+    """But at least so many metres (m)."""
+    window_min_angle: float = 0.035
+    """And so much of an angle (rad)."""
+    resolution: float = 0.25
+    """Between the nodes of the field (m)."""
+    reach: float = 6.0
+    """Beyond, a point scores nothing (m); [P] has no such limit, exp(-6) is 0.002."""
+    odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
+
+    def __post_init__(self) -> None:
+        for name in ("sigma", "threshold", "window_sigmas", "window_min", "window_min_angle", "resolution"):
+            if not getattr(self, name) > 0.0:
+                raise ConfigError(f"point_mapper: {name} is {getattr(self, name)}; it must be positive")
+        if not self.reach >= self.threshold:
+            raise ConfigError(f"point_mapper: reach is {self.reach}; it must be at least the threshold")
+        if self.min_points < 1:
+            raise ConfigError(f"point_mapper: min_points is {self.min_points}; it must be at least 1")
+
+
+_START = np.diag((1e-6, 1e-6, 1e-8))
+"""The pose of the first scan is taken as known."""
+
+
+class PointMapper:
+    """An `Estimator`. State: the map of points, and the pose with its covariance at the last scan."""
+
+    def __init__(
+        self, matcher: Matcher, parameters: PointMapperParameters, rng: Generator, initial_pose: Pose2 = IDENTITY
+    ) -> None:
+        self._matcher = matcher
+        self._parameters = parameters
+        self._rng = rng
+        self._map = LocalMap(parameters.resolution, parameters.sigma, parameters.reach)
+        self._points: list[F64] = []
+        self._T_map_base = initial_pose
+        self._T_odom_base: Pose2 | None = None
+        self._covariance = _START
+
+    @property
+    def points(self) -> F64:
+        """The map, shape (n, 2), metres, in the order in which the points were added."""
+        return np.concatenate(self._points) if self._points else np.zeros((0, 2))
+
+    def update(self, event: Odometry | PairedScan) -> Estimate:
+        """Take an event; the estimate at its stamp."""
+        motion = IDENTITY if self._T_odom_base is None else self._T_odom_base.between(event.T_odom_base)
+        predicted = self._T_map_base @ motion
+        if self._T_odom_base is None:
+            self._T_odom_base = event.T_odom_base
+        if isinstance(event, Odometry):
+            return Estimate(event.stamp_ns, predicted, Status.PREDICTED)
+        noise = self._parameters.odometry_noise.covariance(motion)
+        covariance = predict_covariance(self._covariance, self._T_map_base, motion, noise)
+        estimate = self._localise(event, predicted, covariance)
+        self._T_map_base, self._T_odom_base = estimate.T_map_base, event.T_odom_base
+        self._covariance = covariance if estimate.covariance is None else estimate.covariance
+        return estimate
+
+    def grid(self, resolution: float = 0.1) -> OccupancyGrid:
+        """The points as occupied cells; all else is unknown, for points tell nothing of what is free."""
+        points = self.points
+        if len(points) == 0:
+            return OccupancyGrid(np.full((1, 1), UNKNOWN, dtype=np.int8), resolution)
+        corner = np.floor(points.min(axis=0) / resolution) - 1.0
+        cells = np.floor(points / resolution - corner).astype(np.int64)
+        width, height = cells.max(axis=0) + 2
+        values = np.full((int(height), int(width)), UNKNOWN, dtype=np.int8)
+        values[cells[:, 1], cells[:, 0]] = OCCUPIED
+        return OccupancyGrid(values, resolution, Pose2(float(corner[0]) * resolution, float(corner[1]) * resolution))
+
+    def _localise(self, paired: PairedScan, predicted: Pose2, covariance: F64) -> Estimate:
+        p = self._parameters
+        stamp = paired.scan.stamp_ns
+        points = paired.scan.points_base()
+        if len(points) < p.min_points:
+            return Estimate(stamp, predicted, Status.NO_RETURNS, covariance, reason=f"{len(points)} returns")
+        if not self._points:
+            self._add(predicted @ points)
+            return Estimate(stamp, predicted, Status.MATCHED, covariance, 1.0, reason="the first scan is the map")
+        window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
+        match = self._matcher.match(points, self._map.field, window, self._rng)
+        reason = ""
+        if match.fitness >= p.min_fitness:
+            far = self._map.field.distances(points, match.pose) > p.threshold
+            self._add(match.pose @ points[far])
+        else:
+            reason = f"fitness {match.fitness:.2f} below {p.min_fitness:.2f}: nothing added to the map"
+        return Estimate(stamp, match.pose, Status.MATCHED, match.covariance, match.fitness, match.evaluations, reason)
+
+    def _add(self, points: F64) -> None:
+        if len(points):
+            self._points.append(points)
+            self._map.draw(points, known=2.0)

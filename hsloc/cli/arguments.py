@@ -42,7 +42,10 @@ def to_pose(values: tuple[float, float, float] | None) -> Pose2 | None:
 def add_read_arguments(parser: argparse.ArgumentParser) -> None:
     """How to read a log."""
     group = parser.add_argument_group("reading the log")
-    group.add_argument("--scan-topic", metavar="TOPIC", help="topic of the laser scans (default: the only one)")
+    group.add_argument(
+        "--scan-topic", metavar="TOPIC", action="append",
+        help="topic of the laser scans (default: the only one); several, or with commas, are merged",
+    )  # fmt: skip
     group.add_argument("--odom-topic", metavar="TOPIC", help="topic of the odometry (default: the only one)")
     group.add_argument("--truth-topic", metavar="TOPIC", help="topic of reference poses, or tf for map -> base in /tf")
     group.add_argument("--base-frame", metavar="FRAME", help="frame of the base (default: the odometry's child frame)")
@@ -58,7 +61,7 @@ def read_options(arguments: argparse.Namespace) -> ReadOptions:
     from hsloc.log.summary import ReadOptions
 
     return ReadOptions(
-        scan_topic=arguments.scan_topic,
+        scan_topic=None if arguments.scan_topic is None else ",".join(arguments.scan_topic),
         odom_topic=arguments.odom_topic,
         truth_topic=arguments.truth_topic,
         base_frame=arguments.base_frame,

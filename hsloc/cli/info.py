@@ -90,6 +90,18 @@ def _values(log: Log, losses: Losses, counts: dict[str, int]) -> dict[str, Any]:
         "frames": {"odom": summary.odom_frame, "base": summary.base_frame, "laser": summary.laser_frame},
         "laser_pose": {"x": pose.x, "y": pose.y, "yaw": pose.theta, "upside_down": summary.laser_flipped},
         "extrinsics": summary.extrinsics,
+        "lasers": [
+            {
+                "topic": laser.topic,
+                "frame": laser.frame,
+                "x": laser.T_base_laser.x,
+                "y": laser.T_base_laser.y,
+                "yaw": laser.T_base_laser.theta,
+                "upside_down": laser.flipped,
+                "extrinsics": laser.extrinsics,
+            }
+            for laser in summary.lasers
+        ],
         "order": summary.order,
         "map": None
         if grid is None
@@ -117,7 +129,11 @@ def _lines(summary: LogSummary, losses: Losses, report: dict[str, Any]) -> list[
     lines += [f"  {name + ':':<12}{topic or 'none'}" for name, topic in chosen]
     frames = " -> ".join(name for name in (summary.odom_frame, summary.base_frame, summary.laser_frame) if name)
     lines += [f"  {'frames:':<12}{frames or 'none'}"]
-    if summary.scan_topic is not None:
+    if len(summary.lasers) > 1:
+        for laser in summary.lasers:
+            flipped = ", upside-down" if laser.flipped else ""
+            lines += [f"  {'laser:':<12}{laser.topic}: {pose_text(laser.T_base_laser)}{flipped} ({laser.extrinsics})"]
+    elif summary.scan_topic is not None:
         flipped = ", upside-down" if summary.laser_flipped else ""
         lines += [f"  {'laser:':<12}{pose_text(summary.T_base_laser)}{flipped} ({summary.extrinsics})"]
     if report["map"] is not None:

@@ -43,6 +43,9 @@ class ScanMessage(NamedTuple):
     range_max: float
     ranges: NDArray[np.float32]
     intensities: NDArray[np.float32] | None
+    scan_time: float = 0.0
+    T_frame_laser: Transform3 | None = None
+    """The laser's pose in `frame_id`, which Foxglove's message has and ROS's has not."""
 
 
 class OdometryMessage(NamedTuple):
@@ -141,7 +144,7 @@ def laser_scan(data: Payload) -> ScanMessage:
     _check_encapsulation(data)
     stamp, frame, at = _header(data, 4)
     at = _aligned(at, 4)
-    angle_min, _, increment, time_increment, _, range_min, range_max, count = _SCAN.unpack_from(data, at)
+    angle_min, _, increment, time_increment, scan_time, range_min, range_max, count = _SCAN.unpack_from(data, at)
     at += _SCAN.size
     if at + 4 * count > len(data):
         raise ValueError("more ranges than the message holds")
@@ -149,7 +152,9 @@ def laser_scan(data: Payload) -> ScanMessage:
     at += 4 * count
     (count,) = _SIZE.unpack_from(data, at)
     intensities = _floats(data, at + 4, count) if count else None
-    return ScanMessage(stamp, frame, angle_min, increment, time_increment, range_min, range_max, ranges, intensities)
+    return ScanMessage(
+        stamp, frame, angle_min, increment, time_increment, range_min, range_max, ranges, intensities, scan_time
+    )
 
 
 @lru_cache(maxsize=64)
@@ -253,6 +258,7 @@ def object_laser_scan(message: Any) -> ScanMessage:
         float(message.range_max),
         np.array(message.ranges, dtype=np.float32),
         intensities if len(intensities) else None,
+        float(message.scan_time),
     )
 
 

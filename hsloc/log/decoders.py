@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import LogFormatError
-from hsloc.log import decode, definitions, schema
+from hsloc.log import decode, definitions, foxglove, schema
 from hsloc.log.definitions import long_name
 
 if TYPE_CHECKING:
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     Decoder = Callable[[Payload], Any]
 
-_ALIASES = {"tf/msg/tfMessage": definitions.TF_MESSAGE}
-"""ROS 1's old name of a type that is otherwise the same."""
+_ALIASES = {"tf/msg/tfMessage": definitions.TF_MESSAGE} | foxglove.TYPES
+"""ROS 1's old name of a type that is otherwise the same, and Foxglove's types."""
 
 
 class Undecodable(Exception):
@@ -32,6 +32,8 @@ def canonical_type(typename: str) -> str:
 
 def is_decodable(channel: Channel) -> bool:
     """Whether hsloc has a decoder for the channel's type and encoding."""
+    if channel.typename.startswith(foxglove.PREFIX):
+        return foxglove.is_foxglove(channel)
     return channel.message_encoding in ("cdr", "ros1") and canonical_type(channel.typename) in decode.BY_HAND
 
 
@@ -40,6 +42,8 @@ def decoder_for(channel: Channel) -> Decoder:
 
     Raises LogFormatError where the channel's definition cannot be used.
     """
+    if foxglove.is_foxglove(channel):
+        return _by_foxglove(channel)
     typename = canonical_type(channel.typename)
     if channel.message_encoding == "cdr" and _is_known(channel, typename):
         return _by_hand(channel, typename)
@@ -69,6 +73,18 @@ def _by_hand(channel: Channel, typename: str) -> Decoder:
         if not slow:
             slow.append(_by_rosbags(channel, typename))
         return slow[0](data)
+
+    return decoder
+
+
+def _by_foxglove(channel: Channel) -> Decoder:
+    read = foxglove.decoder(channel)
+
+    def decoder(data: Payload) -> Any:
+        try:
+            return read(data)
+        except Exception as error:  # JSON and protobuf raise many things, down to RecursionError.
+            raise Undecodable(_short(error)) from error
 
     return decoder
 

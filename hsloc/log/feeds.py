@@ -50,19 +50,21 @@ class ScanFeed:
 
     typename = definitions.LASER_SCAN
 
-    def __init__(self, clock: TopicClock, mountings: Mountings, losses: Losses) -> None:
+    def __init__(self, clock: TopicClock, mountings: Mountings, losses: Losses, deskew: bool = False) -> None:
+        """With `deskew`, a scan that does not say how long a beam takes gets an even part of its duration."""
         self.topic = clock.topic
         self.clocks = (clock,)
         self._clock = clock
         self._mountings = mountings
         self._losses = losses
+        self._deskew = deskew
 
     def events(self, message: ScanMessage, log_time_ns: int) -> Iterable[Stamped]:
         """One scan."""
         stamp = self._clock.stamp(message.stamp_ns, log_time_ns)
         if stamp is None:
             return ()
-        _, frame, angle_min, increment, time_increment, range_min, range_max, ranges, intensities = message
+        _, frame, angle_min, increment, time_increment, range_min, range_max, ranges, intensities, *_ = message
         if (
             not (isfinite(angle_min) and isfinite(increment) and range_max > 0.0)
             or abs(angle_min) > 1e3
@@ -70,11 +72,13 @@ class ScanFeed:
         ):
             self._losses.invalid_messages[self.topic] += 1
             return ()
-        mounting = self._mountings.of(frame)
+        mounting = self._mountings.of(frame, message.T_frame_laser)
         if mounting.flipped:
             angle_min, increment = -angle_min, -increment
         if not isfinite(time_increment):
             time_increment = 0.0
+        if self._deskew and time_increment == 0.0 and isfinite(message.scan_time):
+            time_increment = message.scan_time / max(len(ranges), 1)
         scan = Scan(
             stamp,
             ranges,
@@ -119,14 +123,19 @@ class OdometryFeed:
 
 
 class PoseFeed:
-    """geometry_msgs/PoseStamped and PoseWithCovarianceStamped to Truth."""
+    """geometry_msgs/PoseStamped and PoseWithCovarianceStamped to Truth, or to Odometry."""
 
-    def __init__(self, clock: TopicClock, losses: Losses, typename: str) -> None:
+    def __init__(
+        self, clock: TopicClock, losses: Losses, typename: str, is_truth: bool, T_child_base: Pose2 | None = None
+    ) -> None:
+        """As `OdometryFeed`."""
         self.typename = typename
         self.topic = clock.topic
         self.clocks = (clock,)
         self._clock = clock
         self._losses = losses
+        self._is_truth = is_truth
+        self._T_child_base = T_child_base
 
     def events(self, message: PoseMessage, log_time_ns: int) -> Iterable[Stamped]:
         """One pose."""
@@ -136,7 +145,8 @@ class PoseFeed:
         if not is_usable(message.pose):
             self._losses.invalid_messages[self.topic] += 1
             return ()
-        return ((self._clock, Truth(stamp, message.pose)),)
+        pose = message.pose if self._T_child_base is None else message.pose @ self._T_child_base
+        return ((self._clock, Truth(stamp, pose) if self._is_truth else Odometry(stamp, pose)),)
 
 
 class TransformFeed:

@@ -9,7 +9,7 @@ from hsloc.errors import LogFormatError
 from hsloc.log import definitions
 from hsloc.log.decoders import Undecodable, canonical_type, decoder_for, is_decodable
 from hsloc.log.summary import Losses
-from hsloc.log.topics import TF, TF_STATIC, has_name
+from hsloc.log.topics import TF, TF_STATIC, carries
 from hsloc.log.transforms import FrameTree, Mounting, Transform3, laser_mounting
 from hsloc.model import IDENTITY, Pose2
 
@@ -35,7 +35,7 @@ def read_links(
     for container in containers:
         decoders: dict[int, Decoder] = {}
         for channel in container.channels.values():
-            if not has_name(channel, topic) or canonical_type(channel.typename) != definitions.TF_MESSAGE:
+            if not carries(channel, topic) or canonical_type(channel.typename) != definitions.TF_MESSAGE:
                 continue
             try:
                 if is_decodable(channel):
@@ -67,11 +67,15 @@ class Mountings:
             self._static.add(link.parent, link.child, link.transform)
         self._all: FrameTree | None = None
         self._known: dict[str, tuple[Mounting, str]] = {}
+        self._spatial: dict[str, Transform3] = {}
         self.base_frame = base_frame if base_frame is not None else self._guessed_base()
 
-    def of(self, laser_frame: str) -> Mounting:
-        """The mounting of a laser's frame."""
-        return self.found(laser_frame)[0]
+    def of(self, laser_frame: str, T_frame_laser: Transform3 | None = None) -> Mounting:
+        """The mounting of a laser's frame, or of a laser that stands elsewhere in the frame."""
+        if T_frame_laser is None or self._override is not None:
+            return self.found(laser_frame)[0]
+        self.found(laser_frame)
+        return laser_mounting(self._spatial.get(laser_frame, Transform3()) @ T_frame_laser)
 
     def found(self, laser_frame: str) -> tuple[Mounting, str]:
         """The mounting, and where it comes from: `option`, `/tf_static`, `/tf` or `identity`."""
@@ -98,6 +102,7 @@ class Mountings:
                 transform, source = tree.lookup(base, laser), TF
                 self._warn_if_moving(tree, base, laser)
             if transform is not None:
+                self._spatial[laser] = transform
                 mounting = laser_mounting(transform)
                 if mounting.tilt > TILT_WARNING:
                     self.warnings.append(
@@ -132,4 +137,5 @@ class Mountings:
             )
 
     def _guessed_base(self) -> str | None:
-        return next((frame for frame in BASE_FRAMES if frame in self._static), None)
+        static = next((frame for frame in BASE_FRAMES if frame in self._static), None)
+        return static or next((frame for frame in BASE_FRAMES if frame in self._whole_tree()), None)

@@ -70,18 +70,15 @@ class RosSource:
             tf_odometry = _clock(TF, KIND_ODOMETRY, None, losses)
         elif choice.odom is not None:
             clock = _clock(choice.odom, KIND_ODOMETRY, survey.odom, losses)
-            feeds.append(OdometryFeed(clock, losses, is_truth=False, T_child_base=survey.T_child_base))
-        if choice.scan is not None:
-            clock = _clock(choice.scan, KIND_SCAN, survey.scan, losses)
-            feeds.append(ScanFeed(clock, survey.mountings, losses))
+            feeds.append(_pose_feed(clock, losses, survey.odom_type, False, survey.T_child_base))
+        for topic, first in survey.scans.items():
+            clock = _clock(topic, KIND_SCAN, first, losses)
+            feeds.append(ScanFeed(clock, survey.mountings, losses, survey.options.deskew))
         if choice.truth == TF:
             tf_truth = _clock(TF, KIND_TRUTH, None, losses)
         elif choice.truth is not None:
             clock = _clock(choice.truth, KIND_TRUTH, survey.truth, losses)
-            if survey.truth_type == definitions.ODOMETRY:
-                feeds.append(OdometryFeed(clock, losses, is_truth=True, T_child_base=survey.T_truth_base))
-            else:
-                feeds.append(PoseFeed(clock, losses, survey.truth_type))
+            feeds.append(_pose_feed(clock, losses, survey.truth_type, True, survey.T_truth_base))
         if tf_odometry is not None or tf_truth is not None:
             frames = survey.tf_frames or (None, survey.mountings.base_frame or BASE_FRAMES[0])
             feeds.append(TransformFeed(TF, frames, tf_odometry, tf_truth, losses, survey.T_child_base))
@@ -137,6 +134,14 @@ def _routed(
 ) -> Iterator[tuple[int, tuple[Feed, Decoder], memoryview | bytes]]:
     for log_time, _, channel, data in container.messages(routes.keys(), losses):
         yield log_time, routes[channel], data
+
+
+def _pose_feed(
+    clock: TopicClock, losses: Losses, typename: str, is_truth: bool, T_child_base: Pose2 | None
+) -> OdometryFeed | PoseFeed:
+    if typename == definitions.ODOMETRY:
+        return OdometryFeed(clock, losses, is_truth, T_child_base)
+    return PoseFeed(clock, losses, typename, is_truth, T_child_base)
 
 
 def _clock(topic: str, kind: int, first: First | None, losses: Losses) -> TopicClock:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from hsloc.log import definitions
+from hsloc.log import definitions, foxglove
 from hsloc.log.decoders import Undecodable, canonical_type, decoder_for, is_decodable
 from hsloc.log.feeds import MAP_FRAME
 from hsloc.log.frames import BASE_FRAMES, Mountings, read_links
-from hsloc.log.summary import LogSummary, Losses, ReadOptions, TopicSummary
-from hsloc.log.topics import TF, TRUTH_TYPES, choose_topics, has_name, is_truth_name, of_type
+from hsloc.log.summary import LaserSummary, LogSummary, Losses, ReadOptions, TopicSummary
+from hsloc.log.topics import TF, TRUTH_TYPES, carries, choose_topics, is_truth_name, of_type
+from hsloc.model import IDENTITY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -74,10 +75,11 @@ class Survey:
             where += f" and {len(containers) - 1} more"
         self.choice = choose_topics(where, self.active, options, self.tf_frames is not None)
         self._warnings += self.choice.problems
-        self.scan = self._first(self.choice.scan, definitions.LASER_SCAN)
-        self.odom = self._first(self.choice.odom, definitions.ODOMETRY)
-        self.truth_type = definitions.ODOMETRY
-        self.truth = self._first_truth()
+        self.scans = {topic: self._first(topic, definitions.LASER_SCAN) for topic in self.choice.scans}
+        self.odom_type = self._pose_type(self.choice.odom)
+        self.odom = self._first(self.choice.odom, self.odom_type)
+        self.truth_type = self._pose_type(self.choice.truth)
+        self.truth = self._first(self.choice.truth, self.truth_type)
         self.mountings = Mountings(containers, self._base_frame(), options.laser_pose)
         self.T_child_base = self._child_to_base()
         # A truth that speaks of the same frame as the odometry moves with it.
@@ -89,7 +91,7 @@ class Survey:
         """(number of the container, channel) of a topic, those that can be decoded."""
         for number, container in enumerate(self.containers):
             for channel in container.channels.values():
-                if has_name(channel, topic) and is_decodable(channel):
+                if carries(channel, topic) and is_decodable(channel):
                     kind = canonical_type(channel.typename)
                     if typename is None or kind == typename:
                         yield number, channel
@@ -126,19 +128,18 @@ class Survey:
                 break
         return first
 
-    def _first_truth(self) -> First | None:
-        topic = self.choice.truth
+    def _pose_type(self, topic: str | None) -> str:
+        """In which of the types of a pose a topic tells it."""
         if topic is None or topic == TF:
-            return None
+            return definitions.ODOMETRY
         kinds = {canonical_type(channel.typename) for _, channel in self.channels(topic)}
-        self.truth_type = next((kind for kind in TRUTH_TYPES if kind in kinds), definitions.ODOMETRY)
-        return self._first(topic, self.truth_type)
+        return next((kind for kind in TRUTH_TYPES if kind in kinds), definitions.ODOMETRY)
 
     @property
     def odometry_child(self) -> str | None:
         """The frame whose pose the odometry tells."""
         if self.odom is not None:
-            return str(self.odom.message.child_frame_id) or None
+            return str(getattr(self.odom.message, "child_frame_id", "")) or None
         return self.tf_frames[1] if self.choice.odom == TF and self.tf_frames else None
 
     def _base_frame(self) -> str | None:
@@ -163,11 +164,10 @@ class Survey:
 
     def _summarise(self) -> LogSummary:
         statistics = self._topics()
-        scan_frame = self.scan.message.frame_id if self.scan is not None else None
-        mounting, extrinsics = self.mountings.found(scan_frame or "")
-        if self.scan is None:
-            self.mountings.warnings.clear()
-            extrinsics = "identity"
+        lasers = [self._laser(topic, first) for topic, first in self.scans.items() if first is not None]
+        if len(lasers) > 1 and self.options.laser_pose is not None:
+            self._warnings.append(f"--laser-pose is taken for all {len(lasers)} lasers")
+        laser = lasers[0] if lasers else LaserSummary("", "", IDENTITY, False, "identity")
         converted = any(c.metadata.get(CONVERTED, {}).get("order") == "log" for c in self.containers)
         self._warn_of_clocks()
         starts = [topic.first_ns for topic in statistics if topic.first_ns is not None]
@@ -181,27 +181,36 @@ class Survey:
             end_ns=max(ends, default=0),
             origin_ns=self._origin(in_log_time=converted),
             topics=tuple(statistics),
-            scan_topic=self.choice.scan,
+            scan_topic=",".join(self.choice.scans) or None,
             odom_topic=self.choice.odom,
             truth_topic=self.choice.truth,
             reference_candidates=self._candidates(),
             odom_frame=self._odom_frame(),
             base_frame=self.mountings.base_frame,
-            laser_frame=scan_frame,
-            T_base_laser=mounting.T_base_laser,
-            laser_flipped=mounting.flipped,
-            extrinsics=extrinsics,
+            laser_frame=laser.frame if lasers else None,
+            T_base_laser=laser.T_base_laser,
+            laser_flipped=laser.flipped,
+            extrinsics=laser.extrinsics,
+            lasers=tuple(lasers),
             order="log" if converted else "stamp",
             metadata={name: dict(v) for c in self.containers for name, v in c.metadata.items()},
             warnings=tuple(dict.fromkeys(self._warnings + self.mountings.warnings)),
         )
+
+    def _laser(self, topic: str, first: First) -> LaserSummary:
+        frame = first.message.frame_id
+        extrinsics = self.mountings.found(frame)[1]
+        mounting = self.mountings.of(frame, first.message.T_frame_laser)
+        return LaserSummary(topic, frame, mounting.T_base_laser, mounting.flipped, extrinsics)
 
     def _topics(self) -> list[TopicSummary]:
         """Statistics by topic and type, over all files."""
         merged: dict[tuple[str, str, str], list[Any]] = {}
         for container in self.containers:
             for channel in container.channels.values():
-                key = (channel.topic, canonical_type(channel.typename), channel.message_encoding)
+                name = channel.typename
+                kind = name if name.startswith(foxglove.PREFIX) else canonical_type(name)
+                key = (channel.topic, kind, channel.message_encoding)
                 statistics = container.statistics.get(channel.id)
                 merged.setdefault(key, []).extend([statistics] if statistics else [])
         found = []
@@ -217,7 +226,9 @@ class Survey:
     def _candidates(self) -> tuple[str, ...]:
         poses = [topic for typename in TRUTH_TYPES[1:] for topic in of_type(self.active, typename)]
         truths = [topic for topic in of_type(self.active, definitions.ODOMETRY) if is_truth_name(topic)]
-        return tuple(dict.fromkeys(truths + sorted(poses) + (["tf"] if self._has_map_to_odom else [])))
+        return tuple(
+            dict.fromkeys(truths + sorted({*poses} - {self.choice.odom}) + (["tf"] if self._has_map_to_odom else []))
+        )
 
     def _odom_frame(self) -> str | None:
         if self.odom is not None:
@@ -226,12 +237,10 @@ class Survey:
 
     def _origin(self, in_log_time: bool) -> int:
         """The first effective stamp."""
-        stamps = []
-        for first, topic in ((self.scan, self.choice.scan), (self.odom, self.choice.odom)):
-            if first is not None:
-                stamps.append(first.start_log_ns if in_log_time else first.origin_ns)
-            elif topic == TF:
-                stamps += self._first_transform(in_log_time)
+        firsts = [first for first in (*self.scans.values(), self.odom) if first is not None]
+        stamps = [first.start_log_ns if in_log_time else first.origin_ns for first in firsts]
+        if self.choice.odom == TF:
+            stamps += self._first_transform(in_log_time)
         if not stamps and self.truth is not None:
             stamps.append(self.truth.start_log_ns if in_log_time else self.truth.origin_ns)
         return min(stamps, default=0)
@@ -244,17 +253,17 @@ class Survey:
         return []
 
     def _warn_of_clocks(self) -> None:
-        delays = [
-            (first.stamp_ns - first.log_time_ns, topic)
-            for first, topic in ((self.scan, self.choice.scan), (self.odom, self.choice.odom))
-            if first is not None and first.stamp_ns
-        ]
-        if len(delays) == 2 and abs(delays[0][0] - delays[1][0]) > _CLOCKS_APART_NS:
-            seconds = (delays[0][0] - delays[1][0]) / 1e9
-            self._warnings.append(
-                f"the stamps of {delays[0][1]} and {delays[1][1]} are {seconds:.1f} s apart, measured by the log's "
-                "clock: they may be of different clocks"
-            )
+        if self.odom is None or not self.odom.stamp_ns:
+            return
+        for topic, first in self.scans.items():
+            if first is None or not first.stamp_ns:
+                continue
+            apart = (first.stamp_ns - first.log_time_ns) - (self.odom.stamp_ns - self.odom.log_time_ns)
+            if abs(apart) > _CLOCKS_APART_NS:
+                self._warnings.append(
+                    f"the stamps of {topic} and {self.choice.odom} are {apart / 1e9:.1f} s apart, measured by the "
+                    "log's clock: they may be of different clocks"
+                )
 
 
 def _odometry_frames(links: set[tuple[str, str]], base: str | None) -> tuple[str, str] | None:

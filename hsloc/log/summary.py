@@ -20,10 +20,12 @@ NANOSECONDS = 1_000_000_000
 class ReadOptions:
     """How to read a log. None means: find out.
 
-    `truth_topic` may be `"tf"`: the truth is then map -> odom -> base of /tf. `base_frame` names the frame of the
-    robot's base, `laser_pose` overrides the mounting T_base_laser that the log states. `start_s` and `end_s` cut
-    a half-open window, in seconds from the first event of the chosen topics. Without `require_scan` or
-    `require_odometry` a missing or ambiguous topic is a warning, not an error.
+    `scan_topic` may name several topics, separated by commas: their scans are merged into one run. `truth_topic` may
+    be `"tf"`: the truth is then map -> odom -> base of /tf. `base_frame` names the frame of the robot's base,
+    `laser_pose` overrides the mounting T_base_laser that the log states. `start_s` and `end_s` cut a half-open window,
+    in seconds from the first event of the chosen topics. Without `require_scan` or
+    `require_odometry` a missing or ambiguous topic is a warning, not an error. `deskew` asks for scans whose points
+    are moved to where the robot was when each beam was measured.
     """
 
     scan_topic: str | None = None
@@ -35,6 +37,7 @@ class ReadOptions:
     end_s: float | None = None
     require_scan: bool = True
     require_odometry: bool = True
+    deskew: bool = False
 
 
 @dataclass(slots=True)
@@ -77,13 +80,25 @@ class TopicSummary:
 
 
 @dataclass(frozen=True, slots=True)
+class LaserSummary:
+    """A laser: its scan topic, its frame, how it is mounted, and where that is stated (as in `LogSummary`)."""
+
+    topic: str
+    frame: str
+    T_base_laser: Pose2
+    flipped: bool
+    extrinsics: str
+
+
+@dataclass(frozen=True, slots=True)
 class LogSummary:
     """What a log holds and what hsloc takes from it.
 
     `start_ns` and `end_ns` are log times of the first and last message of any topic (0 and 0 in an empty log);
     `origin_ns` is the stamp of the first event, from which `ReadOptions.start_s` counts. `extrinsics` says where
     T_base_laser comes from: `/tf_static`, `/tf`, `option`, `file format` or `identity`. `order` is `stamp` (events
-    in the order of their header stamps) or `log` (in the order of the log, where that is the true one).
+    in the order of their header stamps) or `log` (in the order of the log, where that is the true one). Where several
+    lasers are merged, `scan_topic` names them all, `lasers` tells of each, and the other fields tell of the first.
     """
 
     paths: tuple[Path, ...]
@@ -103,6 +118,7 @@ class LogSummary:
     T_base_laser: Pose2 = IDENTITY
     laser_flipped: bool = False
     extrinsics: str = "identity"
+    lasers: tuple[LaserSummary, ...] = ()
     order: str = "stamp"
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()

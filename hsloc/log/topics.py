@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from hsloc.errors import TopicError
-from hsloc.log import definitions
+from hsloc.log import definitions, foxglove
 from hsloc.log.decoders import canonical_type, is_decodable
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ TF_NAMES = ("tf", "/tf")
 """How a user names transforms in place of a topic."""
 TRUTH_TYPES = (definitions.ODOMETRY, definitions.POSE_STAMPED, definitions.POSE_WITH_COVARIANCE_STAMPED)
 _TRUTH_NAME = re.compile(r"ground_?truth|(^|/)truth($|/)|(^|/)gt($|/)")
+_ODOMETRY_NAME = re.compile(r"(^|/)odom(etry)?($|/)")
 _LISTED = 12
 
 
@@ -28,7 +29,7 @@ _LISTED = 12
 class Choice:
     """Topics to read; `TF` stands for transforms in place of a topic. `problems` are what stood in the way."""
 
-    scan: str | None = None
+    scans: tuple[str, ...] = ()
     odom: str | None = None
     truth: str | None = None
     problems: list[str] = field(default_factory=list)
@@ -37,6 +38,14 @@ class Choice:
 def has_name(channel: Channel, name: str) -> bool:
     """Whether a channel's topic is the name, with or without the leading slash that ROS 1 leaves out."""
     return channel.topic.lstrip("/") == name.lstrip("/")
+
+
+def carries(channel: Channel, topic: str) -> bool:
+    """Whether a channel belongs to a topic: Foxglove's transforms are found by their type, under any name."""
+    if has_name(channel, topic):
+        return True
+    is_transform = foxglove.TYPES.get(channel.typename) == definitions.TF_MESSAGE
+    return topic == TF and is_transform and not has_name(channel, TF_STATIC)
 
 
 def of_type(channels: Sequence[Channel], typename: str) -> list[str]:
@@ -52,22 +61,22 @@ def choose_topics(where: str, channels: Sequence[Channel], options: ReadOptions,
     """
     choice = Choice()
     choice.truth = _truth(where, channels, options)
-    choice.scan = _pick(
-        where, channels, "scan", definitions.LASER_SCAN, options.scan_topic, options.require_scan, choice.problems
-    )
+    choice.scans = _scans(where, channels, options, choice.problems)
     if options.odom_topic in TF_NAMES:
         choice.odom = TF
     else:
         others = [c for c in channels if c.topic != choice.truth and not is_truth_name(c.topic)]
         named = options.odom_topic is not None
-        if not named and tf_has_odometry and not of_type(others, definitions.ODOMETRY):
+        candidates = _odometry_candidates(channels if named else others, named)
+        if not named and tf_has_odometry and not candidates:
             choice.odom = TF
         else:
             choice.odom = _pick(
                 where,
-                channels if named else others,
+                channels,
                 "odom",
                 definitions.ODOMETRY,
+                candidates,
                 options.odom_topic,
                 options.require_odometry,
                 choice.problems,
@@ -84,16 +93,38 @@ def is_truth_name(topic: str) -> bool:
     return _TRUTH_NAME.search(topic) is not None
 
 
+def _scans(where: str, channels: Sequence[Channel], options: ReadOptions, problems: list[str]) -> tuple[str, ...]:
+    """The scan topics: the only one, or those that are named, separated by commas."""
+    candidates = of_type(channels, definitions.LASER_SCAN)
+    names: list[str | None] = [None]
+    if options.scan_topic is not None:
+        names = [*dict.fromkeys(name.strip() for name in options.scan_topic.split(","))]
+    chosen = [
+        _pick(where, channels, "scan", definitions.LASER_SCAN, candidates, name, options.require_scan, problems)
+        for name in names
+    ]
+    return tuple(dict.fromkeys(topic for topic in chosen if topic is not None))
+
+
+def _odometry_candidates(channels: Sequence[Channel], named: bool) -> list[str]:
+    """Topics of odometry; poses count if they are named, or if their name speaks and nothing else is there."""
+    found = of_type(channels, definitions.ODOMETRY)
+    poses = [topic for typename in TRUTH_TYPES[1:] for topic in of_type(channels, typename)]
+    if named:
+        return found + sorted(poses)
+    return found or sorted(topic for topic in poses if _ODOMETRY_NAME.search(topic))
+
+
 def _pick(
     where: str,
     channels: Sequence[Channel],
     kind: str,
     typename: str,
+    candidates: list[str],
     named: str | None,
     required: bool,
     problems: list[str],
 ) -> str | None:
-    candidates = of_type(channels, typename)
     flag = f"--{kind}-topic"
     if named is not None:
         found = [topic for topic in candidates if topic.lstrip("/") == named.lstrip("/")]
@@ -106,6 +137,7 @@ def _pick(
     if candidates:
         listing = ", ".join(candidates[:_LISTED])
         problem = f"{where}: {len(candidates)} {what} topics ({listing}); choose with {flag} {candidates[0]}"
+        problem += f", or take all with {flag} {','.join(candidates[:_LISTED])}" if kind == "scan" else ""
     else:
         problem = f"{where}: no {what} topic ({typename}); the log holds {listed(channels)}"
     if required:

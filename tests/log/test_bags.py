@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 import shutil
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import log_formats
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from log_builders import describe, write_run
-from rosbags.highlevel import AnyReader
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hsloc.errors import HslocError, LogFormatError
-from hsloc.log import definitions
 from hsloc.log.reader import open_log
 from hsloc.log.summary import Losses, ReadOptions
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-ROS1 = get_typestore(Stores.ROS1_NOETIC)
-ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", definitions.TF_MESSAGE))
-ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 
 
 @pytest.fixture(scope="module")
@@ -33,44 +24,14 @@ def mcap(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_run(tmp_path_factory.mktemp("bags") / "run.mcap")
 
 
-def to_ros1(message: Any) -> Any:
-    """ROS 1's headers have a sequence number."""
-    if hasattr(message, "header"):
-        header = message.header
-        message.header = ROS1.types["std_msgs/msg/Header"](seq=0, stamp=header.stamp, frame_id="/" + header.frame_id)
-    for part in getattr(message, "transforms", ()):
-        to_ros1(part)
-    return message
-
-
 @pytest.fixture(scope="module")
 def bag1(mcap: Path) -> Path:
-    path = mcap.with_name("run.bag")
-    compressed = Writer1(path)
-    compressed.set_compression(Writer1.CompressionFormat.LZ4)
-    with AnyReader([mcap]) as reader, compressed as writer:
-        connections: dict[str, Any] = {}
-        for connection, log_time, raw in reader.messages():
-            name = connection.msgtype
-            if connection.topic not in connections:
-                connections[connection.topic] = writer.add_connection(connection.topic, name, typestore=ROS1)
-            message = to_ros1(reader.deserialize(raw, name))
-            writer.write(connections[connection.topic], log_time, ROS1.serialize_ros1(message, name))
-    return path
+    return log_formats.bag1(mcap, mcap.with_name("run.bag"))
 
 
 @pytest.fixture(scope="module")
 def bag2(mcap: Path) -> Path:
-    path = mcap.with_name("bag2")
-    with AnyReader([mcap]) as reader, Writer2(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        connections: dict[str, Any] = {}
-        for connection, log_time, raw in reader.messages():
-            if connection.topic not in connections:
-                connections[connection.topic] = writer.add_connection(
-                    connection.topic, connection.msgtype, typestore=ROS2
-                )
-            writer.write(connections[connection.topic], log_time, raw)
-    return path
+    return log_formats.bag2(mcap, mcap.with_name("bag2"))
 
 
 @pytest.mark.parametrize("which", ["bag1", "bag2", "bare"])

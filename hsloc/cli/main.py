@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import signal
 import sys
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ from hsloc.errors import HslocError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-COMMANDS = ("record", "replay", "info", "eval", "convert", "reproduce", "config", "serve")
+COMMANDS = ("record", "replay", "info", "eval", "convert", "reproduce", "bench", "config", "serve")
 
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_DATA_LOST = 0, 1, 2, 3
 """Exit codes: done; failed; wrong use; done, but part of the input was lost."""
@@ -42,8 +43,8 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code. Errors of `HslocError` are one line on stderr."""
-    arguments = build_parser().parse_args(argv)
     try:
+        arguments = build_parser().parse_args(argv)
         return int(arguments.run(arguments))
     except HslocError as error:
         print(f"hsloc: error: {error}", file=sys.stderr)
@@ -56,5 +57,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_FAILED
 
 
+def program() -> None:
+    """The program `hsloc`. Once the work is done, or given up, a Ctrl-C comes too late to matter."""
+    status = main()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.exit(status)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

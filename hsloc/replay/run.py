@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -69,6 +71,9 @@ class RunSpec:
                 "a robot on a given map is followed with odometry; leave out --no-odom or use --mode slam"
             )
 
+        if self.no_odometry and self.read.deskew:
+            raise ConfigError("scans are deskewed with odometry; leave out --no-odom or --deskew")
+
     def names(self) -> tuple[str, ...]:
         """What to call the logs in reports."""
         return self.labels or tuple(path.name for path in self.logs)
@@ -129,7 +134,9 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
     estimator = _localiser(spec, log, grid) if localise else _mapper(spec)
     prepared = time.perf_counter()
     recording = Recording()
-    for event, estimate in replay(_reported(log, _events(spec, log), recording, progress), estimator):
+    for event, estimate in replay(
+        _reported(log, _events(spec, log), recording, progress), estimator, deskew=spec.read.deskew
+    ):
         recording.add(event, estimate)
     replayed = time.perf_counter()
     if recording.scans == 0:
@@ -224,7 +231,21 @@ def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:
     """Have the kernels compiled (once after an installation, ten seconds) before the clock of the replay starts."""
     points = np.zeros((1, 2))
     window = Window(likelihood.T_map_field, 0.1, 0.1, 0.1)
-    matcher.match(points, likelihood, window, np.random.default_rng(0))
+    with _uninterrupted():
+        matcher.match(points, likelihood, window, np.random.default_rng(0))
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Hold back Ctrl-C until the end: a compiler that is thrown out of its work may take the process with it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _cut(spec: RunSpec) -> bool:

@@ -72,6 +72,8 @@ class LocalMatchingParameters:
     restart_after: int = 3
     """A new local map begins after so many refused matches in a row."""
     hide: Hide = field(default_factory=lambda: Hide(restarts=6, agreement=2, budget=200, memory_size=20))
+    hide_wide: Hide = field(default_factory=lambda: Hide(restarts=16, agreement=3, budget=400))
+    """The search of the wide window."""
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
     no_odometry_window: float = 0.3
     """Without odometry: half-width of the window around the constant-velocity prediction (m)."""
@@ -158,10 +160,11 @@ class LocalMatcher:
             return motion, p.odometry_noise.covariance(motion) + _FLOOR
         stamp, pose = self._last if self._last is not None else (paired.scan.stamp_ns, self._T_map_key)
         seconds = min(max((paired.scan.stamp_ns - stamp) * 1e-9, 0.0), 1.0)
-        step = self._velocity * seconds
+        # A clock that jumps makes wild velocities: no step is predicted longer than the window is wide.
+        most = np.array((p.no_odometry_window, p.no_odometry_window, p.no_odometry_window_angle))
+        step = np.clip(self._velocity * seconds, -most, most)
         motion = self._T_map_key.between(pose @ Pose2(float(step[0]), float(step[1]), float(step[2])))
-        spread = np.array((p.no_odometry_window, p.no_odometry_window, p.no_odometry_window_angle)) / p.window_sigmas
-        return motion, np.diag(spread**2)
+        return motion, np.diag((most / p.window_sigmas) ** 2)
 
     def _matched(self, points: F64, motion: Pose2, covariance: F64) -> LocalMatch:
         p = self._parameters
@@ -195,7 +198,7 @@ class LocalMatcher:
                 max(window.half_y, p.wide_window),
                 max(window.half_theta, p.wide_window_angle),
             )
-            match = p.hide.match(points, local, wide, self._rng)
+            match = p.hide_wide.match(points, local, wide, self._rng)
             evaluations += match.evaluations
             usual = p.min_fitness if self._usual is None else self._usual
             if match.fitness >= max(best.fitness + 0.1, _CONVINCING * usual):
@@ -222,7 +225,7 @@ class LocalMatcher:
         self._last = (stamp, found.pose)
         motion = found.motion
         moved = hypot(motion.x, motion.y) >= p.keyscan_min_d or abs(motion.theta) >= p.keyscan_min_a
-        keep = found.is_keyscan and moved
+        keep = found.is_keyscan and (moved or self._refused >= p.restart_after)
         return LocalMatch(
             found.pose,
             motion,

@@ -1,8 +1,8 @@
 """Closing loops: is this place one that was seen before, long ago on the way?
 
-Places are visited in their order. Those seen before that could be near, by a drift that is assumed too large rather than
-too small, are searched by HIDE over the whole window in which they could lie. A match is believed if it is fit, if no
-other pose in the window comes near to it (branch and bound, hsloc/kernels/bounds.py: in a corridor whose every bay
+Places are visited in their order. Those seen before that could be near, by a drift that is assumed too large rather
+than too small, are searched by HIDE over the whole window in which they could lie. A match is believed if it is fit,
+if no other pose in the window comes near to it (branch and bound, hsloc/kernels/bounds.py: in a corridor whose every bay
 looks the same there is one), and if neither place looks through the walls of the other. It becomes an edge of the pose
 graph with a covariance and a robust weight, and the graph is solved before the next place is looked at.
 """
@@ -148,7 +148,7 @@ class LoopCloser:
     def solve(self) -> None:
         """Solve the graph of the places: the front end's steps, and the loops with robust weights."""
         places = self._places
-        steps = Edges.chain(places.steps, places.covariances)
+        steps = Edges.chain(places.steps, places.covariances, places.doubted)
         self.poses = solve_edges(self.poses, Edges.joined([steps, self.edges()]))
 
     def _candidates(self, place: int) -> list[tuple[int, float]]:
@@ -157,7 +157,9 @@ class LoopCloser:
         way = self._ways(place)
         old = np.arange(place)
         distance = np.hypot(*(self.poses[:place, :2] - self.poses[place, :2]).T)
-        could = (way >= p.min_way) & (distance <= p.reach + p.sigmas * p.drift * way)
+        # Places next to each other are drawn from the same scans: those would match themselves.
+        apart = place - old > 3
+        could = apart & (way >= p.min_way) & (distance <= p.reach + p.sigmas * p.drift * way)
         order = np.lexsort((old[could], distance[could]))
         chosen: list[tuple[int, float]] = []
         for candidate in old[could][order]:

@@ -62,13 +62,16 @@ class Mapper:
         self._local: list[LocalMatch] = []
         self._T_map_odom = IDENTITY
         self._T_map_key = IDENTITY
+        self._T_last_scan = IDENTITY
         self._covariance = np.zeros((3, 3))
 
     def update(self, event: Odometry | PairedScan) -> Estimate:
         """Take an event; the estimate at its stamp, in the map as it is known so far (it drifts)."""
         if isinstance(event, Odometry):
-            self._track.add(event.T_odom_base, is_scan=False)
-            return Estimate(event.stamp_ns, self._T_map_odom @ event.T_odom_base, Status.PREDICTED)
+            # Without odometry the message tells nothing: it stands where the last scan stood.
+            T_odom_base = event.T_odom_base if self._parameters.use_odometry else self._T_last_scan
+            self._track.add(T_odom_base, is_scan=False)
+            return Estimate(event.stamp_ns, self._T_map_odom @ T_odom_base, Status.PREDICTED)
         points = event.scan.points_base()
         found = self._matcher.update(event, points)
         covariance = predict_covariance(self._covariance, self._T_map_key, found.motion, found.covariance)
@@ -79,7 +82,8 @@ class Mapper:
             self._scans.append(KeyScan.of(event.scan))
             self._stamps.append(event.scan.stamp_ns)
             self._local.append(found)
-        self._T_map_odom = found.pose @ event.T_odom_base.inverse()
+        self._T_map_odom = found.pose @ T_odom_base.inverse()
+        self._T_last_scan = found.pose
         return Estimate(
             event.scan.stamp_ns,
             found.pose,

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
 
 
+REFUSED_WAY = 5.0
+"""A refused match may hide a slip: loops are looked for as if so many metres more had been driven."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
     """Place k holds keyscans start[k] to start[k + 1]; its frame is that of its middle one, `reference[k]`.
@@ -33,15 +37,25 @@ class Places:
     poses: F64
     steps: F64
     covariances: F64
+    doubted: NDArray[np.bool_]
+    """Steps (m - 1,) on which a match was refused: odometry alone, which may have slipped."""
     way: F64
-    """Metres driven until each reference, shape (m,)."""
+    """Metres driven until each reference, shape (m,), a refused match counting as `REFUSED_WAY` more."""
 
     def __len__(self) -> int:
         return len(self.reference)
 
     @staticmethod
-    def along(poses: F64, motions: F64, covariances: F64, length: float, turn_length: float) -> Places:
+    def along(
+        poses: F64,
+        motions: F64,
+        covariances: F64,
+        length: float,
+        turn_length: float,
+        refused: NDArray[np.bool_] | None = None,
+    ) -> Places:
         """Cut the way of keyscans into places of `length` metres; `motions` and `covariances` lead to each keyscan."""
+        refused = np.zeros(len(poses), dtype=bool) if refused is None else refused
         way = np.cumsum(np.hypot(motions[:, 0], motions[:, 1]) + turn_length * np.abs(motions[:, 2]))
         index = np.floor(way / length).astype(np.int64)
         start = np.concatenate((np.flatnonzero(np.diff(index, prepend=-1)), [len(poses)])).astype(np.int64)
@@ -55,7 +69,9 @@ class Places:
                 covariance = predict_covariance(covariance, pose, motion, covariances[scan])
                 pose = pose @ motion
             chained[k] = covariance
-        return Places(start, reference, poses, steps, chained, way[reference])
+        count = np.cumsum(refused)
+        doubted = np.diff(count[reference]) > 0
+        return Places(start, reference, poses, steps, chained, doubted, (way + REFUSED_WAY * count)[reference])
 
     def members(self, place: int, around: int) -> range:
         """Keyscans of a place and of `around` places before and after."""

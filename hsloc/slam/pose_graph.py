@@ -42,11 +42,15 @@ class Edges:
         return Edges(np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
 
     @staticmethod
-    def chain(measured: F64, covariances: F64) -> Edges:
-        """Trusted edges from each node to the next: `measured` (n - 1, 3) with covariances (n - 1, 3, 3)."""
+    def chain(measured: F64, covariances: F64, doubted: NDArray[np.bool_] | None = None) -> Edges:
+        """Edges from each node to the next: `measured` (n - 1, 3) with covariances (n - 1, 3, 3).
+
+        They are trusted, but for those `doubted` (n - 1,), which may tear (Cauchy's weight with scale 1).
+        """
         first = np.arange(len(measured))
         information: F64 = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
-        return Edges(np.column_stack((first, first + 1)), measured, information, np.full(len(first), np.inf))
+        scale = np.full(len(first), np.inf) if doubted is None else np.where(doubted, 1.0, np.inf)
+        return Edges(np.column_stack((first, first + 1)), measured, information, scale)
 
     @staticmethod
     def joined(parts: list[Edges]) -> Edges:

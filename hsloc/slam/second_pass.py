@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.model.estimate import Status
 from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import Pose2, relative_poses, wrap_angles
 from hsloc.slam.drawing import draw_grid
@@ -57,6 +58,7 @@ def finish(
     chain = Edges.chain(
         np.array([found.motion.to_array() for found in local[1:]]).reshape(-1, 3),
         np.array([found.covariance for found in local[1:]]).reshape(-1, 3, 3),
+        _refused(local)[1:],
     )
     poses, loops, loop_edges = _close_loops(poses, chain, local, joined, parameters, rng, lambda part: tell(0.5 * part))
     steps = _odometry_edges(local, track, parameters)
@@ -91,7 +93,8 @@ def _close_loops(
     motions = np.array([found.motion.to_array() for found in local])
     covariances = np.array([found.covariance for found in local])
     p = parameters.loops
-    places = Places.along(poses, motions, covariances, p.place_length, parameters.local_matching.turn_length)
+    turn_length = parameters.local_matching.turn_length
+    places = Places.along(poses, motions, covariances, p.place_length, turn_length, _refused(local))
     closer = LoopCloser(places, scans, p, rng)
     closer.close(progress)
     loops = closer.loops
@@ -127,12 +130,18 @@ def _odometry_edges(local: list[LocalMatch], track: Track, parameters: GraphMapp
         return Edges.chain(
             np.array([found.motion.to_array() for found in local[1:]]).reshape(-1, 3),
             np.array([found.covariance + _ODOMETRY_FLOOR for found in local[1:]]).reshape(-1, 3, 3),
+            _refused(local)[1:],
         )
     odometry = track.key_odometry()
     steps = relative_poses(odometry[:-1], odometry[1:])
     noise = parameters.local_matching.odometry_noise
     covariances = [noise.covariance(Pose2.from_array(step)) + _ODOMETRY_FLOOR for step in steps]
-    return Edges.chain(steps, np.array(covariances).reshape(-1, 3, 3))
+    return Edges.chain(steps, np.array(covariances).reshape(-1, 3, 3), _refused(local)[1:])
+
+
+def _refused(local: list[LocalMatch]) -> NDArray[np.bool_]:
+    """Keyscans whose match was refused: odometry alone led to them."""
+    return np.array([found.status is Status.REJECTED for found in local], dtype=bool)
 
 
 def _refine(

@@ -174,7 +174,7 @@ def test_interrupted_runs_leave_nothing_behind(here):
     _, stderr = process.communicate(timeout=30)
     if process.returncode == 0:
         pytest.skip("the run was over before it could be interrupted")
-    assert process.returncode == 130
+    assert process.returncode in (130, -signal.SIGINT)  # a shell says 130 to both
     assert b"Traceback" not in stderr
     assert stderr.decode().strip().endswith("hsloc: interrupted")
     assert list(here.iterdir()) == []

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.evaluation.markdown import DASH, table
 from hsloc.reproduction import published
 from hsloc.reproduction.convergence import COUNTS
 from hsloc.reproduction.localisation import INITIAL
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     from hsloc.reproduction.run import MaterialResults, Reproduction
     from hsloc.reproduction.scan_match import ScanMatch
     from hsloc.reproduction.windows import Windows
-
-_DASH = "-"
 
 
 def markdown(reproduction: Reproduction, notes: Sequence[str] = ()) -> str:
@@ -49,24 +48,6 @@ def markdown(reproduction: Reproduction, notes: Sequence[str] = ()) -> str:
         lines += [f"- {'yes' if verdict.met else 'NO '}  {verdict.text}" for verdict in reproduction.verdicts]
         lines.append("")
     return "\n".join(lines)
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A Markdown table whose columns are aligned also as plain text; numbers stand on the right."""
-    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
-    right = [i > 0 and all(row[i][:1].isdigit() or row[i] == _DASH for row in rows) for i in range(len(head))]
-
-    def line(cells: Sequence[str]) -> str:
-        padded = (
-            cell.rjust(width) if is_right else cell.ljust(width)
-            for cell, width, is_right in zip(cells, widths, right, strict=True)
-        )
-        return f"| {' | '.join(padded)} |"
-
-    rule = "|".join(
-        "-" * (width + 1) + (":" if is_right else "-") for width, is_right in zip(widths, right, strict=True)
-    )
-    return [line(head), f"|{rule}|", *(line(row) for row in rows), ""]
 
 
 def _of_material(results: MaterialResults) -> list[str]:
@@ -100,7 +81,7 @@ def _e1(rows: Sequence[ScanMatch], title: str) -> list[str]:
         cells.append(
             (
                 row.variant.label,
-                published.E1.get(matcher, _DASH),
+                published.E1.get(matcher, DASH),
                 f"{100 * row.success:.1f} %",
                 f"{1e3 * np.median(tally.metres):.2f}",
                 f"{1e3 * tally.metres.max():.2f}",
@@ -108,7 +89,7 @@ def _e1(rows: Sequence[ScanMatch], title: str) -> list[str]:
                 f"{angle.max():.3f}",
                 f"{np.median(tally.evaluations):.0f}",
                 f"{np.median(tally.ms):.2f}",
-                _DASH if seconds is None else f"{1e3 * seconds:.0f}",
+                DASH if seconds is None else f"{1e3 * seconds:.0f}",
             )
         )
     head = (
@@ -134,9 +115,9 @@ def _e2(convergence: Convergence, title: str) -> list[str]:
         (
             f"{curve.matcher}, {curve.preset}",
             f"{counts}",
-            published.E2[curve.matcher] if counts == "improvisations" else _DASH,
+            published.E2[curve.matcher] if counts == "improvisations" else DASH,
             *(f"{curve.mean[k - 1]:.3f}" for k in (50, 100, 200, 500, 1000)),
-            _DASH if curve.first() is None else str(curve.first()),
+            DASH if curve.first() is None else str(curve.first()),
         )
         for counts in COUNTS
         for curve in convergence.curves

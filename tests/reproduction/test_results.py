@@ -10,7 +10,6 @@ from PIL import Image
 from hsloc.errors import OutputError
 from hsloc.reproduction import results as results_module
 from hsloc.reproduction.results import write_results
-from hsloc.reproduction.tables import table
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -75,14 +74,3 @@ def test_nothing_half_written_stays(small: Reproduction, tmp_path: Path, monkeyp
     with pytest.raises(KeyboardInterrupt):
         write_results(small, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_table_is_markdown_in_columns() -> None:
-    lines = table(("name", "n"), [("long name", "1"), ("b", "20")])
-    assert lines == [
-        "| name      |  n |",
-        "|-----------|---:|",
-        "| long name |  1 |",
-        "| b         | 20 |",
-        "",
-    ]

@@ -1,0 +1,157 @@
+"""All parts of the benchmark in one call."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hsloc.benchmark.cases import read_cases, run_method
+from hsloc.benchmark.kernel import time_kernel, time_matches
+from hsloc.benchmark.machine import load, machine
+from hsloc.benchmark.memory import measure_memory
+from hsloc.benchmark.methods import our_methods, peers
+from hsloc.benchmark.replaying import fixture, time_replay
+from hsloc.benchmark.scene import office_scene
+from hsloc.benchmark.sub_cell import measure_sub_cell
+from hsloc.benchmark.targets import Target, targets
+from hsloc.simulation.presets import OFFICE
+from hsloc.simulation.recorder import record
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from hsloc.benchmark.cases import CaseResult
+    from hsloc.benchmark.kernel import KernelTiming, MatchTiming
+    from hsloc.benchmark.memory import Memory
+    from hsloc.benchmark.replaying import ReplayTiming
+    from hsloc.benchmark.sub_cell import SubCell
+
+    Progress = Callable[[str, float], None]
+
+PARTS = ("kernel", "match", "replay", "memory", "sub-cell", "cases")
+
+
+@dataclass(frozen=True, slots=True)
+class Sizes:
+    """How much is measured."""
+
+    kernel_repeats: int = 30
+    match_repeats: int = 200
+    replay_repeats: int = 7
+    replay_seconds: float | None = None
+    """Of the log; None: the whole fixture."""
+    memory_seconds: float | None = None
+    """Of the short log; None: a lap of the office, 113 s."""
+    sub_cell_matches: int = 100
+    cases: int = 10**9
+
+
+QUICK = Sizes(
+    kernel_repeats=5,
+    match_repeats=20,
+    replay_repeats=2,
+    replay_seconds=8.0,
+    memory_seconds=3.0,
+    sub_cell_matches=10,
+    cases=10,
+)
+"""A look at whether all works; the figures mean little."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bench:
+    """What was measured; None or empty where it was not asked for."""
+
+    machine: dict[str, object]
+    load_after: tuple[float, ...] | None
+    quick: bool
+    kernel: KernelTiming | None = None
+    matches: tuple[MatchTiming, ...] = ()
+    replay: ReplayTiming | None = None
+    memory: Memory | None = None
+    sub_cell: tuple[SubCell, ...] = ()
+    cases_name: str = ""
+    cases: tuple[CaseResult, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def targets(self) -> tuple[Target, ...]:
+        """What the project promises, and whether it was kept."""
+        return targets(self)
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return {
+            "machine": self.machine | {"load_average_after": self.load_after},
+            "quick": self.quick,
+            **({"kernel": self.kernel.to_dict()} if self.kernel else {}),
+            **({"match": [match.to_dict() for match in self.matches]} if self.matches else {}),
+            **({"replay": self.replay.to_dict()} if self.replay else {}),
+            **({"memory": self.memory.to_dict()} if self.memory else {}),
+            **({"sub_cell": [row.to_dict() for row in self.sub_cell]} if self.sub_cell else {}),
+            **(
+                {"cases": {"name": self.cases_name, "results": [row.to_dict() for row in self.cases]}}
+                if self.cases
+                else {}
+            ),
+            "targets": [target.to_dict() for target in self.targets],
+            "notes": list(self.notes),
+        }
+
+
+def run_bench(
+    parts: Sequence[str] = PARTS,
+    cases: Path | None = None,
+    *,
+    quick: bool = False,
+    progress: Progress = lambda phase, share: None,
+) -> Bench:
+    """Run `parts` (of `PARTS`), one after the other on one core; "cases" only where `cases` names a file.
+
+    Raises ConfigError for a file of cases that cannot be used.
+    """
+    sizes = QUICK if quick else Sizes()
+    bench = Bench(machine=machine(), load_after=None, quick=quick)
+    # First of all: a wrong file is told before minutes of work.
+    given = None if cases is None or "cases" not in parts else read_cases(cases).first(sizes.cases)
+    if "kernel" in parts or "match" in parts:
+        progress("kernel", 0.0)
+        scene = office_scene()
+        if "kernel" in parts:
+            bench = replace(bench, kernel=time_kernel(scene, sizes.kernel_repeats))
+        if "match" in parts:
+            bench = replace(bench, matches=time_matches(scene, sizes.match_repeats))
+    with tempfile.TemporaryDirectory(prefix="hsloc-bench-") as folder:
+        if "replay" in parts:
+            progress("replay", 0.0)
+            bench = replace(bench, replay=time_replay(_log(Path(folder), sizes), sizes.replay_repeats))
+        if "memory" in parts:
+            progress("memory", 0.0)
+            bench = replace(bench, memory=measure_memory(Path(folder), sizes.memory_seconds))
+    if "sub-cell" in parts:
+        progress("sub-cell", 0.0)
+        bench = replace(bench, sub_cell=measure_sub_cell(sizes.sub_cell_matches))
+    if given is not None:
+        methods, notes = peers(given.grid)
+        methods = our_methods(given.grid) + methods
+        rows: list[CaseResult] = []
+        for index, method in enumerate(methods):
+
+            def tell(share: float, index: int = index) -> None:
+                progress("cases", (index + share) / len(methods))
+
+            rows += run_method(method, given, tell)
+        bench = replace(bench, cases_name=given.name, cases=tuple(rows), notes=tuple(notes))
+    return replace(bench, load_after=load())
+
+
+def _log(folder: Path, sizes: Sizes) -> Path:
+    """The fixture where there is one, else the same recorded anew; or a short one."""
+    found = fixture()
+    if found is not None and sizes.replay_seconds is None:
+        return found
+    path = folder / "office.mcap"
+    record(replace(OFFICE, seed=1, duration_s=sizes.replay_seconds), path)
+    return path

@@ -1,0 +1,194 @@
+"""The benchmark as Markdown."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hsloc.benchmark.cases import LEVELS, SUCCESS
+from hsloc.evaluation.markdown import DASH, table
+
+if TYPE_CHECKING:
+    from hsloc.benchmark.cases import CaseResult
+    from hsloc.benchmark.memory import Memory
+    from hsloc.benchmark.replaying import ReplayTiming
+    from hsloc.benchmark.run import Bench
+
+
+def markdown(bench: Bench) -> str:
+    """The whole report."""
+    m = bench.machine
+    lines = ["# hsloc bench", ""]
+    versions = ", ".join(f"{name} {m[name]}" for name in ("hsloc", "python", "numpy", "numba", "scipy"))
+    lines += [f"{m['cpu']}, {m['cores']} cores; {versions}.", ""]
+    lines += [
+        (
+            f"Load average before {_load(m['load_average'])}, after {_load(bench.load_after)}. Wall times of one core "
+            "after warm-up. Where the machine is shared, times grow by a third and more: best of the repeats is given "
+            "beside the median, and between methods of one run the ratio counts, not the time."
+        ),
+        "",
+    ]
+    if bench.quick:
+        lines += ["Quick: few repeats on small inputs. These figures show that it works, not how fast it is.", ""]
+    lines += [*_kernel(bench), *_matches(bench)]
+    if bench.replay is not None:
+        lines += _replay(bench.replay)
+    if bench.memory is not None:
+        lines += _memory(bench.memory)
+    lines += [*_sub_cell(bench), *_cases(bench)]
+    for note in bench.notes:
+        lines += [f"Note: {note}.", ""]
+    if bench.targets:
+        lines += ["## Promised and measured", ""]
+        rows = [
+            (
+                target.text,
+                f"{'>=' if target.at_least else '<='} {target.limit:g} {target.unit}",
+                f"{target.measured:.3g} {target.unit}",
+                "yes" if target.met else "NO",
+            )
+            for target in bench.targets
+        ]
+        lines += table(("what", "promised", "measured", "kept"), rows)
+    return "\n".join(lines)
+
+
+def _load(values: object) -> str:
+    return " ".join(f"{value:.2f}" for value in values) if isinstance(values, tuple) else "unknown"
+
+
+def _kernel(bench: Bench) -> list[str]:
+    if bench.kernel is None:
+        return []
+    kernel = bench.kernel
+    factor = 1e9 / (kernel.points * kernel.poses)
+    rows = [
+        (name, f"{timing.best * factor:.2f}", f"{timing.median * factor:.2f}")
+        for name, timing in (("poses of one window", kernel.near), ("poses anywhere on the map", kernel.far))
+    ]
+    return [
+        "## Look-up in the interpolated field",
+        "",
+        f"{kernel.points} points, {kernel.poses} poses a call, no pose given up early; {kernel.near.repeats} repeats.",
+        "",
+        *table(("", "best, ns per point and evaluation", "median"), rows),
+    ]
+
+
+def _matches(bench: Bench) -> list[str]:
+    if not bench.matches:
+        return []
+    rows = [
+        (
+            match.name,
+            f"{match.beams}",
+            f"{match.evaluations}",
+            f"{match.timing.best * 1e3:.3f}",
+            f"{match.timing.median * 1e3:.3f}",
+        )
+        for match in bench.matches
+    ]
+    head = ("", "beams", "evaluations (median)", "best ms", "median ms")
+    return [
+        "## One match",
+        "",
+        f"Window +-(0.3 m, 0.3 m, 10 deg), {bench.matches[0].timing.repeats} seeds.",
+        "",
+        *table(head, rows),
+    ]
+
+
+def _replay(replay: ReplayTiming) -> list[str]:
+    total = sum(replay.parts.values())
+    parts = ", ".join(f"{name} {seconds:.3f} s ({seconds / total:.0%})" for name, seconds in replay.parts.items())
+    return [
+        f"## Replay of {replay.log}",
+        "",
+        (
+            f"{replay.log_seconds:.1f} s of log, {replay.matched} of {replay.scans} scans matched; "
+            f"{replay.replay.repeats} repeats after one to warm up. Best {replay.replay.best:.3f} s, "
+            f"{replay.times_real_time:.0f}x real time; median {replay.replay.median:.3f} s, "
+            f"{replay.log_seconds / replay.replay.median:.0f}x; with opening the log and making the field (best) "
+            f"{replay.whole.best:.3f} s, {replay.log_seconds / replay.whole.best:.0f}x."
+        ),
+        "",
+        f"One run taken to pieces: {parts}.",
+        "",
+    ]
+
+
+def _memory(memory: Memory) -> list[str]:
+    mib = 1.0 / 2**20
+    rows = [
+        (f"{seconds:.0f} s", f"{peak * mib:.1f}", f"{kept * mib:.1f}")
+        for seconds, peak, kept in (
+            (memory.seconds, memory.peak, memory.trajectory),
+            (memory.long_seconds, memory.long_peak, memory.long_trajectory),
+        )
+    ]
+    return [
+        "## Peak memory of a replay",
+        "",
+        *table(("log", "peak MiB", "of which trajectories MiB"), rows),
+        f"Growth {memory.growth:.1%}, without the trajectories {memory.growth_but_trajectory:.1%}.",
+        "",
+    ]
+
+
+def _sub_cell(bench: Bench) -> list[str]:
+    if not bench.sub_cell:
+        return []
+    rows = [
+        (
+            row.room,
+            f"{1e3 * row.mean_m:.4f}",
+            f"{1e3 * row.max_m:.4f}",
+            f"{1e3 * row.bias_m[0]:+.4f} {1e3 * row.bias_m[1]:+.4f}",
+            f"{row.mean_deg:.5f}",
+        )
+        for row in bench.sub_cell
+    ]
+    return [
+        "## Sub-cell accuracy",
+        "",
+        f"{bench.sub_cell[0].matches} matches without noise in an L-shaped room on a map of 5 cm cells.",
+        "",
+        *table(("", "mean mm", "max mm", "mean signed x y mm", "mean deg"), rows),
+        (
+            "The map is all that a match knows. A wall on a border occupies the cells on both sides: within a wall two "
+            "cells thick every place fits alike. A room whose walls all lie a third of a cell (16.7 mm) beside the "
+            "centres is drawn that much beside itself, and is found there: 16.7 mm in x and in y are the map's."
+        ),
+        "",
+    ]
+
+
+def _cases(bench: Bench) -> list[str]:
+    if not bench.cases:
+        return []
+    by_method: dict[str, dict[str, CaseResult]] = {}
+    for row in bench.cases:
+        by_method.setdefault(row.method, {})[row.level] = row
+    rows = []
+    for method, levels in by_method.items():
+        cells = [method]
+        for level in LEVELS:
+            row = levels[level]
+            spent = DASH if row.median_evaluations is None else f"{row.median_evaluations:.0f}"
+            cells += [f"{100 * row.success:.1f} %", f"{row.median_ms:.2f} / {row.p95_ms:.2f}", spent]
+        rows.append(cells)
+    head = ["method"]
+    for level in LEVELS:
+        head += [level, "ms", "evaluations"]
+    return [
+        f"## Matching cases: {bench.cases_name}",
+        "",
+        (
+            f"{bench.cases[0].cases} cases a level, each matched once; ms: median / 95th percentile. Success: within "
+            f"{SUCCESS[0]:.2f} m and {SUCCESS[1]:g} deg. The window of a level (track +-0.1 m, 5 deg; small +-0.5 m, "
+            "20 deg; large +-2 m, 45 deg) is given to all but small_gicp, which starts from its centre; the "
+            "preparation of the map is not counted."
+        ),
+        "",
+        *table(head, rows),
+    ]

@@ -1,0 +1,69 @@
+"""What the project promises."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from hsloc.benchmark.run import Bench
+
+CASES = {"track": (1.0, None), "small": (1.0, 1.0), "large": (0.99, 4.0)}
+"""Least success of HIDE, and most milliseconds (median)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A figure, its limit, and whether it is kept; `at_least` says on which side."""
+
+    text: str
+    measured: float
+    limit: float
+    unit: str
+    at_least: bool = False
+
+    @property
+    def met(self) -> bool:
+        """Whether it is kept."""
+        return self.measured >= self.limit if self.at_least else self.measured <= self.limit
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return {
+            "text": self.text,
+            "measured": self.measured,
+            "limit": self.limit,
+            "unit": self.unit,
+            "at_least": self.at_least,
+            "met": self.met,
+        }
+
+
+def targets(bench: Bench) -> tuple[Target, ...]:
+    """Those of the parts that were run. Of repeats of one work the best counts, of different matches the median."""
+    return tuple(_targets(bench))
+
+
+def _targets(bench: Bench) -> Iterator[Target]:
+    if bench.kernel is not None:
+        factor = 1e9 / (bench.kernel.points * bench.kernel.poses)
+        yield Target("look-up, per point and evaluation", bench.kernel.near.best * factor, 4.0, "ns")
+    if bench.matches:
+        first = bench.matches[0]
+        yield Target(f"{first.name}, {first.beams} beams, median", first.timing.median * 1e3, 0.6, "ms")
+    if bench.replay is not None:
+        yield Target(f"replay of {bench.replay.log}", bench.replay.times_real_time, 300.0, "x real time", True)
+    if bench.memory is not None:
+        growth = 100.0 * bench.memory.growth_but_trajectory
+        yield Target("more memory for a log 10 times as long, but for the trajectory", growth, 10.0, "%")
+    if bench.sub_cell:
+        first_room = bench.sub_cell[0]
+        yield Target(f"mean error of a match, {first_room.room}", 1e3 * first_room.mean_m, 5.0, "mm")
+    for row in bench.cases:
+        if row.method == "HIDE":
+            success, milliseconds = CASES[row.level]
+            yield Target(f"HIDE on {bench.cases_name} {row.level}", 100.0 * row.success, 100.0 * success, "%", True)
+            if milliseconds is not None:
+                yield Target(f"HIDE on {bench.cases_name} {row.level}, median", row.median_ms, milliseconds, "ms")

@@ -1,0 +1,52 @@
+"""Measure on this machine what the project promises: speed, memory, accuracy within a cell, and peers beside it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from hsloc.cli.progress import ProgressLine
+
+HELP = "measure speed, memory and matching beside peers"
+
+_PARTS = ("kernel", "match", "replay", "memory", "sub-cell", "cases")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Parts, cases, output."""
+    parser.add_argument(
+        "parts", nargs="*", type=_part, metavar="PART", help=f"of {', '.join(_PARTS)} (default: all)"
+    )  # fmt: skip
+    parser.add_argument(
+        "--cases", type=Path, metavar="FILE.npz", help="matching cases: real scans, a map, starts that are off"
+    )
+    parser.add_argument("--quick", action="store_true", help="small inputs, few repeats: does it work at all")
+    parser.add_argument("--json", action="store_true", help="print the results as JSON on stdout")
+    parser.add_argument("-q", "--quiet", action="store_true", help="show no progress")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure and print. A promise that is not kept is printed, and no failure: the machine may be busy."""
+    from hsloc.benchmark.run import run_bench
+    from hsloc.benchmark.tables import markdown
+    from hsloc.errors import ConfigError
+    from hsloc.evaluation.metrics import format_json
+
+    parts = arguments.parts or list(_PARTS)
+    if "cases" in arguments.parts and arguments.cases is None:
+        raise ConfigError("the part cases needs a file; name an .npz with --cases")
+    with ProgressLine(arguments.quiet) as line:
+        bench = run_bench(parts, arguments.cases, quick=arguments.quick, progress=line.show)
+    if arguments.json:
+        print(format_json(bench.to_dict()), end="")
+        return 0
+    print(markdown(bench))
+    if arguments.cases is None:
+        print("No --cases FILE.npz: the matching table was left out.")
+    return 0
+
+
+def _part(text: str) -> str:
+    if text not in _PARTS:
+        raise argparse.ArgumentTypeError(f"{text!r} is none of {', '.join(_PARTS)}")
+    return text

@@ -52,6 +52,9 @@ def add_read_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--laser-pose", type=pose, metavar="X,Y,YAW", help="mounting of the laser, over what the log says"
     )
+    group.add_argument(
+        "--deskew", action="store_true", help="move each beam to where the robot was when it was measured"
+    )
     group.add_argument("--start", type=float, metavar="S", help="begin so many seconds into the log")
     group.add_argument("--end", type=float, metavar="S", help="end so many seconds into the log")
 
@@ -68,6 +71,7 @@ def read_options(arguments: argparse.Namespace) -> ReadOptions:
         laser_pose=to_pose(arguments.laser_pose),
         start_s=arguments.start,
         end_s=arguments.end,
+        deskew=arguments.deskew,
     )
 
 

@@ -42,6 +42,8 @@ class Scan:
     `stamp_ns + i * time_increment`. `ranges` (metres, shape (n,), float32 as in the log) keep their special
     values: +inf is no return within range, NaN and -inf are invalid. `T_base_laser` is the mounting; an
     upside-down laser is already turned (negated angles), so that the plane's geometry is all that is left.
+    `T_base_beam` (n, 3), if the scan is deskewed, is where the base was when each beam was measured, seen from where
+    it was at `stamp_ns`.
     """
 
     stamp_ns: int
@@ -54,6 +56,7 @@ class Scan:
     T_base_laser: Pose2 = IDENTITY
     frame_id: str = "laser"
     intensities: NDArray[np.float32] | None = field(default=None, repr=False)
+    T_base_beam: NDArray[np.float64] | None = field(default=None, repr=False)
 
     def angles(self) -> NDArray[np.float64]:
         """Direction of each beam in the laser's frame, radians, shape (n,)."""
@@ -74,7 +77,12 @@ class Scan:
         hits = self.hits()
         ranges = self.ranges[hits].astype(np.float64)
         angles = self.angles()[hits]
-        return self.T_base_laser @ np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))
+        points = self.T_base_laser @ np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))
+        if self.T_base_beam is None:
+            return points
+        x, y, theta = self.T_base_beam[hits].T
+        c, s = np.cos(theta), np.sin(theta)
+        return np.column_stack((x + c * points[:, 0] - s * points[:, 1], y + s * points[:, 0] + c * points[:, 1]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from hsloc.model.events import Odometry, PairedScan, Scan, Truth
 from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.replay.deskew import deskewed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -34,18 +35,23 @@ class Estimator(Protocol):
 
 
 def replay(
-    events: Iterable[Event], estimator: Estimator
+    events: Iterable[Event], estimator: Estimator, *, deskew: bool = False
 ) -> Iterator[tuple[Odometry | PairedScan | Truth, Estimate | None]]:
     """Each event with what the estimator says to it (None for the truth, which it does not see)."""
-    for event in pair(events):
+    for event in pair(events, deskew=deskew):
         yield event, None if isinstance(event, Truth) else estimator.update(event)
 
 
-def pair(events: Iterable[Event]) -> Iterator[Odometry | PairedScan | Truth]:
-    """Pair the scans with odometry; other events pass through in their order.
+def pair(events: Iterable[Event], *, deskew: bool = False) -> Iterator[Odometry | PairedScan | Truth]:
+    """Pair the scans with odometry, and deskew them if asked for; other events pass through in their order.
 
     A log without any odometry gives scans paired with the identity.
     """
+    paired = _pair(events)
+    return deskewed(paired) if deskew else paired
+
+
+def _pair(events: Iterable[Event]) -> Iterator[Odometry | PairedScan | Truth]:
     recent: deque[Odometry] = deque(maxlen=_RECENT)
     waiting: deque[Scan] = deque()
     for event in events:

@@ -45,6 +45,8 @@ def command(spec: RunSpec) -> str:
     words += [f"{flag}={value}" for flag, value in flags if value is not None]
     if spec.unknown_start:
         words.append("--unknown-start")
+    if read.deskew:
+        words.append("--deskew")
     if spec.no_odometry:
         words.append("--no-odom")
     return shlex.join([*words, "--config=config.yaml", f"--seed={spec.seed}"])

@@ -38,7 +38,7 @@ def write_recording(result: Result, path: Path, progress: Callable[[float], None
         writer.metadata("hsloc", {"version": __version__, "seed": str(result.spec.seed)})
         writer.attachment("config.yaml", config_text(result).encode(), "application/yaml")
         writer.occupancy_grid(result.grid, start)
-        for event in pair(log.events()):
+        for event in pair(log.events(), deskew=result.spec.read.deskew):
             if isinstance(event, PairedScan):
                 scan = event.scan
                 if scan.frame_id not in mountings:

@@ -88,17 +88,19 @@ def _extent(poses: F64, scans: KeyScans, p: DrawingParameters) -> tuple[F64, F64
 
 def _beams(pose: F64, scans: KeyScans, k: int, p: DrawingParameters) -> tuple[F64, F64, NDArray[np.uint8]]:
     """Origins, ends (n, 2) in the map (m) and whether each beam ends in a hit."""
-    ranges = scans.ranges[scans.table_start[k] : scans.table_start[k + 1]].astype(np.float64)
     x, y, theta, angle_min, increment = scans.geometry[k]
-    known = ~np.isnan(ranges)
-    angles = (angle_min + increment * np.arange(len(ranges)))[known]
-    ranges = ranges[known]
-    hit = ranges < p.max_range
-    length = np.where(np.isinf(ranges), p.no_return_range, np.minimum(ranges, p.max_range))
     laser = Pose2.from_array(pose) @ Pose2(float(x), float(y), float(theta))
-    ends = laser @ np.column_stack((length * np.cos(angles), length * np.sin(angles)))
+    # Hits as they were taken in: a scan taken in motion is already straightened there.
+    hits = Pose2.from_array(pose) @ scans.hits(k).astype(np.float64) - (laser.x, laser.y)
+    depth = np.hypot(hits[:, 0], hits[:, 1])
+    hits *= np.minimum(1.0, p.max_range / np.maximum(depth, 1e-9))[:, None]
+    ranges = scans.ranges[scans.table_start[k] : scans.table_start[k + 1]]
+    angles = laser.theta + angle_min + increment * np.flatnonzero(np.isposinf(ranges))
+    cleared = p.no_return_range * np.column_stack((np.cos(angles), np.sin(angles)))
+    ends = np.concatenate((hits, cleared)) + (laser.x, laser.y)
+    is_hit = np.concatenate((depth < p.max_range, np.zeros(len(cleared), dtype=bool)))
     origins = np.broadcast_to(np.array((laser.x, laser.y)), ends.shape)
-    return origins, ends, hit.astype(np.uint8)
+    return origins, ends, is_hit.astype(np.uint8)
 
 
 def _logit(probability: float) -> float:

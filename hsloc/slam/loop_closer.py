@@ -2,9 +2,9 @@
 
 Places are visited in their order. Those seen before that could be near, by a drift that is assumed too large rather
 than too small, are searched by HIDE over the whole window in which they could lie. A match is believed if it is fit,
-if no other pose in the window comes near to it (branch and bound, hsloc/kernels/bounds.py: in a corridor whose every bay
-looks the same there is one), and if neither place looks through the walls of the other. It becomes an edge of the pose
-graph with a covariance and a robust weight, and the graph is solved before the next place is looked at.
+if neither place looks through the walls of the other, and if no other pose in the window comes near to it (branch and
+bound, hsloc/kernels/bounds.py: in a corridor whose every bay looks the same there is one). It becomes an edge of the
+pose graph with a covariance and a robust weight, and the graph is solved before the next place is looked at.
 """
 
 from __future__ import annotations

@@ -97,7 +97,7 @@ def _beams(pose: F64, scans: KeyScans, k: int, p: DrawingParameters) -> tuple[F6
     ranges = scans.ranges[scans.table_start[k] : scans.table_start[k + 1]]
     angles = laser.theta + angle_min + increment * np.flatnonzero(np.isposinf(ranges))
     cleared = p.no_return_range * np.column_stack((np.cos(angles), np.sin(angles)))
-    ends = np.concatenate((hits, cleared)) + (laser.x, laser.y)
+    ends = np.concatenate((hits, cleared)) + np.array((laser.x, laser.y))
     is_hit = np.concatenate((depth < p.max_range, np.zeros(len(cleared), dtype=bool)))
     origins = np.broadcast_to(np.array((laser.x, laser.y)), ends.shape)
     return origins, ends, is_hit.astype(np.uint8)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from hsloc.errors import HslocError
+from hsloc.replay.run import RunSpec, run
 from hsloc.simulation.presets import OFFICE
 from hsloc.simulation.recorder import record
 
@@ -86,6 +87,9 @@ def measure_memory(folder: Path, seconds: float | None = None) -> Memory:
     else:
         short = replace(OFFICE, seed=1, duration_s=seconds)
         long = replace(OFFICE, seed=1, duration_s=TIMES * seconds)
+    warm_up = folder / "warm-up.mcap"
+    record(replace(short, duration_s=1.0), warm_up)
+    run(RunSpec(logs=(warm_up,)))  # a process that has to compile the kernels needs 100 MB for that alone
     one, ten = (_replayed(scenario, folder / f"{name}.mcap") for name, scenario in (("short", short), ("long", long)))
     return Memory(
         one["seconds"], int(one["peak"]), int(one["trajectory"]),

@@ -52,6 +52,8 @@ def markdown(reproduction: Reproduction, notes: Sequence[str] = ()) -> str:
 
 def _of_material(results: MaterialResults) -> list[str]:
     lines = []
+    if results.material.name != "report":
+        lines += [f"The published figures beside those on {results.material.title} belong to the report's data.", ""]
     if results.scan_match:
         lines += _e1(results.scan_match, results.material.title)
     if results.convergence is not None:

@@ -93,7 +93,7 @@ def test_the_improvisations_of_hide_are_told_from_its_evolution(short_material: 
 
 def test_localisation_beats_what_is_published(small: Reproduction, short_material: Material) -> None:
     drives = small.materials[0].drives
-    assert len(drives) == 3 * 6
+    assert len(drives) == 2 * 6
     for drive in drives:
         assert drive.matched > 0.95 * drive.scans > 20
         if (drive.matcher, drive.preset) == ("HIDE", "default"):

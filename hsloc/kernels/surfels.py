@@ -31,6 +31,8 @@ _MOST_NEIGHBOURS = 16
 """Hits taken on each side of a hit, at most."""
 _MOST_BEAMS = 4
 """Beams looked at on each side of the beam in which a point lies, at most."""
+_DIRECTIONS = 16
+"""Sorts of walls when hits are chosen."""
 _SAME_FACE = 0.7
 """Cosine of the angle between the normals of one wall in two scans, at least."""
 _THROUGH = 0.25
@@ -128,6 +130,42 @@ def bearing(y: float, x: float) -> float:
 
 
 @njit(cache=True, nogil=True)
+def choose_hits(normals: F32, most: int, chosen: I32) -> int:
+    """Choose about `most` hits that have a surfel, evenly by the directions of their walls; returns how many.
+
+    In a corridor nearly all hits lie on its two sides, and only a handful, on door frames and at its end, tell
+    how far along it one is: of a crowded direction every so-many-th hit is taken, of a rare one all (normal-space
+    sampling, Rusinkiewicz and Levoy 2001). Writes the rows into `chosen`, in ascending order.
+    """
+    n = len(normals)
+    counts = np.zeros(_DIRECTIONS, dtype=np.int64)
+    direction = np.full(n, -1, dtype=np.int64)
+    for i in range(n):
+        nx = np.float64(normals[i, 0])
+        ny = np.float64(normals[i, 1])
+        if nx != 0.0 or ny != 0.0:
+            direction[i] = int((bearing(ny, nx) / (2.0 * pi) + 1.0) * _DIRECTIONS) % _DIRECTIONS
+            counts[direction[i]] += 1
+    # The quota: the largest that no more than `most` hits in all are within.
+    quota = 1
+    while quota < n and np.minimum(counts, quota + 1).sum() <= most:
+        quota += 1
+    taken = 0
+    passed = np.zeros(_DIRECTIONS, dtype=np.int64)
+    for i in range(n):
+        k = direction[i]
+        if k < 0:
+            continue
+        keep = min(counts[k], quota)
+        # The j-th of a direction is kept where j * keep / counts steps over a whole number.
+        if (passed[k] + 1) * keep // counts[k] > passed[k] * keep // counts[k]:
+            chosen[taken] = i
+            taken += 1
+        passed[k] += 1
+    return taken
+
+
+@njit(cache=True, nogil=True)
 def pair_terms(
     i: int,
     j: int,
@@ -142,7 +180,8 @@ def pair_terms(
     ranges: F32,
     table_start: I64,
     geometry: F64,
-    stride: int,
+    chosen_hits: I32,
+    chosen_start: I64,
     gate: float,
     scale: float,
     information: F64,
@@ -154,7 +193,7 @@ def pair_terms(
     Overwrites `information` (3, 3) = sum w J^T J and `gradient` (3,) = sum w J^T r with the residuals r (m) and
     their derivatives by (rx, ry, rt), weights w = 1 / (1 + r^2 / scale^2)^2 (Geman-McClure), and `counts` =
     (paired within `gate`, conflicts: points where j looked through, points in j's field of view, sum of w r^2, sum of
-    w). Every `stride`-th hit of i is used.
+    w). Of scan i the rows `chosen_hits[chosen_start[i] : chosen_start[i + 1]]` are used.
     """
     c = cos(rt)
     s = sin(rt)
@@ -172,7 +211,8 @@ def pair_terms(
     paired = conflicts = seen = 0
     squares = weights = 0.0
     xx = xy = xt = yy = yt = tt = gx = gy = gt = 0.0
-    for a in range(start[i], start[i + 1], stride):
+    for q in range(chosen_start[i], chosen_start[i + 1]):
+        a = start[i] + chosen_hits[q]
         mx = np.float64(normals[a, 0])
         my = np.float64(normals[a, 1])
         if mx == 0.0 and my == 0.0:
@@ -346,7 +386,8 @@ def assemble_pairs(
     ranges: F32,
     table_start: I64,
     geometry: F64,
-    strides: I64,
+    chosen_hits: I32,
+    chosen_start: I64,
     gate: float,
     scale: float,
     diagonal: F64,
@@ -377,7 +418,7 @@ def assemble_pairs(
             relative(poses[j], poses[i], rel)
             pair_terms(
                 i, j, rel[0], rel[1], rel[2], points, normals, centroids, start, hit_of_beam, ranges, table_start,
-                geometry, strides[i], gate, scale, information, gradient, tally,
+                geometry, chosen_hits, chosen_start, gate, scale, information, gradient, tally,
             )  # fmt: skip
             counts[m] += tally
             total += weight * tally[3]

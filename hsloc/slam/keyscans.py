@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.surfels import fit_surfels
+from hsloc.kernels.surfels import choose_hits, fit_surfels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -84,10 +84,17 @@ class KeyScans:
         """Hits of a scan in the base's frame, shape (n, 2)."""
         return self.points[self.start[index] : self.start[index + 1]]
 
-    def strides(self, most: int) -> I64:
-        """For each scan the step that leaves about `most` of its hits."""
-        counts = np.diff(self.start)
-        return np.maximum(np.round(counts / most), 1).astype(np.int64)
+    def chosen(self, most: int) -> tuple[I32, I64]:
+        """About `most` hits of each scan, evenly by the directions of their walls (`kernels.surfels.choose_hits`).
+
+        Returns the rows within each scan, one scan after the other, and where each begins, shape (n + 1,).
+        """
+        row = np.empty(int(np.diff(self.start).max(initial=0)), dtype=np.int32)
+        parts = []
+        for k in range(len(self)):
+            count = choose_hits(self.normals[self.start[k] : self.start[k + 1]], most, row)
+            parts.append(row[:count].copy())
+        return np.concatenate(parts), _starts([len(part) for part in parts])
 
 
 def _starts(lengths: list[int]) -> I64:

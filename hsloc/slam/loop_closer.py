@@ -100,6 +100,8 @@ class Loop:
 
 _CACHED = 48
 """Fields of places kept."""
+_COMPARED = 90
+"""Points of a scan that are looked up in another."""
 _VISITS = 3_000_000
 """Bounds computed for a window before it counts as ambiguous."""
 _DISTINCT = (0.8, radians(12.0))
@@ -116,6 +118,7 @@ class LoopCloser:
         self._rng = rng
         self.poses = places.poses[places.reference].copy()
         self.loops: list[Loop] = []
+        self._chosen = scans.chosen(_COMPARED)
         self._fields: dict[int, tuple[LikelihoodField, NDArray[np.float32]]] = {}
 
     @property
@@ -287,7 +290,7 @@ class LoopCloser:
                     rel = relative_poses(y[None], x[None])[0]
                     pair_terms(
                         i, j, rel[0], rel[1], rel[2], s.points, s.normals, s.centroids, s.start, s.hit_of_beam,
-                        s.ranges, s.table_start, s.geometry, 2, 0.3, 0.1, information, gradient, counts,
+                        s.ranges, s.table_start, s.geometry, *self._chosen, 0.3, 0.1, information, gradient, counts,
                     )  # fmt: skip
                     total += counts
         seen = max(total[2], 1.0)

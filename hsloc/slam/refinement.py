@@ -102,7 +102,7 @@ def refine(
     system = BlockSystem(
         len(poses), np.concatenate((pairs[:, 0], edges.pairs[:, 0])), np.concatenate((pairs[:, 1], edges.pairs[:, 1]))
     )
-    strides = scans.strides(p.points_per_scan)
+    chosen, chosen_start = scans.chosen(p.points_per_scan)
     weights = np.full(len(pairs), 1.0 / (p.sigma**2 * p.correlated))
     counts = np.zeros((len(pairs), 5))
     pair_blocks, edge_blocks = np.empty((len(pairs), 3, 3)), np.empty((len(edges), 3, 3))
@@ -113,8 +113,8 @@ def refine(
         add_edges(poses, edges.pairs, edges.measured, edges.information, edges.scale, diagonal, edge_blocks, right)
         assemble_pairs(
             poses, pairs, weights, scans.points, scans.normals, scans.centroids, scans.start, scans.hit_of_beam,
-            scans.ranges, scans.table_start, scans.geometry, strides, gate, p.scale_of_gate * gate, diagonal,
-            pair_blocks, right, counts,
+            scans.ranges, scans.table_start, scans.geometry, chosen, chosen_start, gate, p.scale_of_gate * gate,
+            diagonal, pair_blocks, right, counts,
         )  # fmt: skip
         step = solve_anchored(system, diagonal, np.concatenate((pair_blocks, edge_blocks)), right)
         poses = moved_by(poses, step)

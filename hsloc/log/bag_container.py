@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     class _Reader(Protocol):
         connections: list[Any]
+        message_count: int
 
         def __enter__(self) -> _Reader: ...
         def __exit__(self, *error: object) -> object: ...
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class BagContainer:
-    """A `.bag`, a `.db3`, or a folder with `metadata.yaml` and `.db3` files.
+    """A `.bag`, a `.db3`, or a folder with `metadata.yaml` and compressed SQLite files.
 
     The decoders get the definitions that the bag carries, as with MCAP; rosbags is asked for raw messages alone.
     Raises LogFormatError, whatever rosbags, its databases and its decompressors raise.
@@ -96,6 +97,10 @@ class BagContainer:
         # What is damaged further on is counted when it is read for its own sake.
         if damage.reasons and not self.statistics:
             raise LogFormatError(damage.reasons[0])
+        counted, promised = sum(item.count for item in self.statistics.values()), reader.message_count
+        if not damage.reasons and counted < promised:
+            self.losses_at_opening.truncated_files += 1
+            self.losses_at_opening.note(f"{self.path}: holds {counted} messages of {promised} that it speaks of")
 
     @contextmanager
     def _guarded(self, losses: Losses | None = None) -> Iterator[None]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping
     from pathlib import Path
 
     from hsloc.log.summary import Losses, TopicStatistics
@@ -54,7 +54,7 @@ class Container(Protocol):
     @property
     def losses_at_opening(self) -> Losses: ...  # noqa: D102
     @property
-    def warnings(self) -> Sequence[str]: ...  # noqa: D102
+    def warnings(self) -> list[str]: ...  # noqa: D102
 
     def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
         """Messages of the wanted channels."""

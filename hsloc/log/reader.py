@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 _BAG_MAGIC = b"#ROSBAG V"
 _SQLITE_MAGIC = b"SQLite format 3\0"
 _GZIP_MAGIC = b"\x1f\x8b"
+_COMPRESSED = re.compile(rb"^\s*compression_mode:\s*[\"']?(file|message)", re.IGNORECASE | re.MULTILINE)
+_METADATA_BYTES = 1 << 20
 _NO_LOG = "is not an MCAP, a ROS bag or a CARMEN log"
 
 
@@ -136,19 +138,26 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 
 def _expand(path: Path) -> list[Path]:
-    """The files of a recording: the path itself, or the parts in a folder (SQLite bags stay a folder)."""
+    """The files of a recording: the path itself, or the parts in a folder.
+
+    Only a compressed SQLite bag stays a folder. Of all others metadata.yaml tells nothing that the files do not, and
+    where it is wrong (a type's hash, say) rosbags would give no messages and no error.
+    """
     try:
         if not path.exists():
             raise LogError(f"{path}: no such file or folder")
+        if path.name == "metadata.yaml":  # What a bag's folder is known by.
+            path = path.parent
         if not path.is_dir():
             return [path]
         inside = sorted(path.iterdir(), key=_natural)
+        metadata = path / "metadata.yaml"
+        if metadata.is_file() and _COMPRESSED.search(metadata.read_bytes()[:_METADATA_BYTES]):
+            return [path]
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
     for suffix in (".mcap", ".db3", ".bag"):
         found = [part for part in inside if part.suffix == suffix and not part.name.startswith(".")]
-        if suffix == ".db3" and (path / "metadata.yaml").exists():
-            return [path]
         if found:
             return found
     raise LogFormatError(f"{path}: is a folder without .mcap, .db3 or .bag files; name a log file")

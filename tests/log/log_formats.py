@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -125,9 +125,12 @@ def bag1(source: Path, target: Path) -> Path:
     return target
 
 
-def bag2(source: Path, target: Path) -> Path:
-    """As a folder with a ROS 2 bag in SQLite."""
-    with AnyReader([source]) as reader, Writer2(target, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+def bag2(source: Path, target: Path, compression: str = "", storage: StoragePlugin = StoragePlugin.SQLITE3) -> Path:
+    """As a folder with a ROS 2 bag in SQLite, compressed as `FILE` or `MESSAGE` if asked for."""
+    bag = Writer2(target, version=8, storage_plugin=storage)
+    if compression:
+        bag.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    with AnyReader([source]) as reader, bag as writer:
         connections: dict[str, Any] = {}
         for connection, log_time, raw in reader.messages():
             if connection.topic not in connections:

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from log_builders import describe, write_run
+from rosbags.rosbag2 import StoragePlugin
 
 from hsloc.errors import HslocError, LogFormatError
 from hsloc.log.reader import open_log
@@ -58,6 +59,16 @@ def test_the_folder_of_a_bag_without_metadata_is_read_file_by_file(tmp_path: Pat
     (tmp_path / "bag" / "metadata.yaml").unlink()
     expected = [describe(event) for event in open_log(mcap).events()]
     assert [describe(event) for event in open_log(tmp_path / "bag").events()] == expected
+
+
+@pytest.mark.parametrize("storage", StoragePlugin)
+@pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
+def test_a_compressed_bag_is_read_by_its_metadata(
+    tmp_path: Path, mcap: Path, mode: str, storage: StoragePlugin
+) -> None:
+    log = open_log(log_formats.bag2(mcap, tmp_path / "bag", mode, storage))
+    assert [describe(event) for event in log.events()] == [describe(event) for event in open_log(mcap).events()]
+    assert log.losses == Losses()
 
 
 def test_bag_and_mcap_together(bag1: Path, mcap: Path) -> None:

@@ -108,7 +108,9 @@ class Localiser:
         self._usual: float | None = None
         self._rejected = 0
         self._start_given = initial_pose is not None
-        self._relocaliser = Relocaliser(grid, likelihood, matcher, parameters, rng)
+        self._relocaliser = Relocaliser(
+            grid, likelihood, matcher, parameters.relocaliser, parameters.odometry_noise, rng
+        )
         self._searching = initial_pose is None
 
     @property

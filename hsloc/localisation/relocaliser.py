@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
-from math import hypot, pi, radians
+from math import floor, hypot, pi, radians
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from hsloc.localisation.localiser import LocaliserParameters
+    from hsloc.localisation.motion import OdometryNoise
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
     from hsloc.model.events import Scan
@@ -57,6 +57,8 @@ class RelocaliserParameters:
     """Or after so much turning (rad)."""
     seed_scans: int = 3
     """The whole map is searched with so many scans: what one misses another finds."""
+    min_points: int = 20
+    """A scan with fewer hits says too little."""
     min_scans: int = 4
     """Scans before anything is believed."""
     min_fitness: float = 0.35
@@ -111,14 +113,14 @@ class Relocaliser:
         grid: OccupancyGrid,
         likelihood: LikelihoodField,
         matcher: Matcher,
-        parameters: LocaliserParameters,
+        parameters: RelocaliserParameters,
+        noise: OdometryNoise,
         rng: Generator,
     ) -> None:
         self._field = likelihood
         self._matcher = matcher
-        self._parameters = parameters.relocaliser
-        self._min_points = parameters.min_points
-        self._noise = parameters.odometry_noise
+        self._parameters = parameters
+        self._noise = noise
         self._rng = rng
         self._tiles = _tiles(grid, self._parameters.tile)
         self._hypotheses: list[_Hypothesis] = []
@@ -139,7 +141,7 @@ class Relocaliser:
         if self._hypotheses and not moved:
             return self._verdict(motion, 0, False)
         points = scan.points_base()
-        if len(points) < max(self._min_points, 20):
+        if len(points) < p.min_points:
             return self._verdict(motion, 0, False)
         self._T_odom_last = T_odom_base
         self._seen.append((odometry_count, points, T_odom_base))
@@ -155,19 +157,25 @@ class Relocaliser:
     def _seed(self, points: F64, scans: int) -> int:
         """Search every tile; a pose that is found late is taken for as fit in the scans before."""
         p = self._parameters
-        quick = self._quick_matcher()
-        half_angle = pi / p.sectors
-        evaluations = 0
-        for x, y in self._tiles:
-            for sector in range(p.sectors):
-                centre = Pose2(x, y, wrap_angle(2.0 * pi * sector / p.sectors))
-                window = Window(centre, 0.6 * p.tile, 0.6 * p.tile, 1.1 * half_angle)
-                match = quick.match(points, self._field, window, self._rng)
-                evaluations += match.evaluations
-                self._hypotheses.append(
-                    _Hypothesis(match.pose, match.covariance, match.fitness, match.fitness * scans, scans)
-                )
+        half = 0.6 * p.tile, 0.6 * p.tile, 1.1 * pi / p.sectors
+        headings = [wrap_angle(2.0 * pi * sector / p.sectors) for sector in range(p.sectors)]
+        windows = [Window(Pose2(x, y, heading), *half) for x, y in self._tiles for heading in headings]
+        poses, fitness, evaluations = self._search(points, windows)
+        unsure = np.diag(np.square(half))
+        self._hypotheses += [
+            _Hypothesis(pose, unsure, float(fit), float(fit) * scans, scans)
+            for pose, fit in zip(poses, fitness, strict=True)
+        ]
         return evaluations
+
+    def _search(self, points: F64, windows: list[Window]) -> tuple[list[Pose2], F64, int]:
+        """The fittest pose in each window, how fit, and the evaluations spent."""
+        quick = self._quick_matcher()
+        if isinstance(quick, HarmonySearch):
+            return quick.match_boxes(points, self._field, windows, self._rng)
+        found = [quick.match(points, self._field, window, self._rng) for window in windows]
+        fitness = np.array([match.fitness for match in found])
+        return [match.pose for match in found], fitness, sum(match.evaluations for match in found)
 
     def _advance(self, points: F64, motion: Pose2) -> int:
         """Move the hypotheses with the odometry and match them again."""
@@ -189,14 +197,15 @@ class Relocaliser:
         return evaluations
 
     def _keep(self) -> None:
-        """Drop the hypotheses that fell behind, merge those that met."""
+        """Drop the hypotheses that fell behind, merge those that met: of each place the best stays."""
         p = self._parameters
         self._hypotheses.sort(key=lambda h: -h.total)
+        taken = _Places()
         kept: list[_Hypothesis] = []
         for hypothesis in self._hypotheses:
             if len(kept) >= p.hypotheses or hypothesis.total < self._hypotheses[0].total - p.drop:
                 break
-            if not any(_same(hypothesis.pose, other.pose) for other in kept):
+            if taken.add(hypothesis.pose):
                 kept.append(hypothesis)
         self._hypotheses = kept
 
@@ -242,6 +251,22 @@ class Relocaliser:
                 polish_iterations=10,
             )
         return self._matcher
+
+
+class _Places:
+    """Poses that differ; sorted into cells, so that the time does not grow with the square of the map."""
+
+    def __init__(self) -> None:
+        self._cells: dict[tuple[int, int], list[Pose2]] = {}
+
+    def add(self, pose: Pose2) -> bool:
+        """Take a pose, unless one is near already; whether it was taken."""
+        u, v = floor(pose.x / _NEAR), floor(pose.y / _NEAR)
+        near = (other for du in (-1, 0, 1) for dv in (-1, 0, 1) for other in self._cells.get((u + du, v + dv), ()))
+        if any(_same(pose, other) for other in near):
+            return False
+        self._cells.setdefault((u, v), []).append(pose)
+        return True
 
 
 def _same(first: Pose2, second: Pose2) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 
 from hsloc.errors import ConfigError
 from hsloc.kernels.fitness import normal_equations
-from hsloc.kernels.search import STOPPED_AGREEMENT, SearchParameters, search
+from hsloc.kernels.search import STOPPED_AGREEMENT, SearchParameters, search, search_boxes
 from hsloc.matching.covariance import match_covariance
 from hsloc.matching.match import Match, StopReason
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.window import Window
+    from hsloc.model.pose2 import Pose2
 
     F64 = NDArray[np.float64]
 
@@ -116,6 +117,28 @@ class HarmonySearch:
     ) -> Match:
         """See `Matcher`. With `keep_history` the Match tells the best fitness after each evaluation."""
         return run_search(self, self._parameters(field, window), points, field, window, rng, keep_history)
+
+    def match_boxes(
+        self, points: F64, field: LikelihoodField, windows: list[Window], rng: Generator
+    ) -> tuple[list[Pose2], F64, int]:
+        """`match` in many windows of one size: the fittest pose in each, their fitness (n,), and the evaluations."""
+        if not windows or len(points) == 0:
+            return [window.centre for window in windows], np.zeros(len(windows)), 0
+        scaled = field.scale(points[spread_order(len(points))])
+        cells = np.array([field.to_cells(window.centre) for window in windows])
+        poses, fitness = np.empty_like(cells), np.empty(len(cells))
+        evaluations = search_boxes(
+            field.packed,
+            scaled,
+            scaled[: self.search_points],
+            cells,
+            half_widths_in(field, windows[0]) * (1.0 / field.resolution, 1.0 / field.resolution, 1.0),
+            self._parameters(field, windows[0]),
+            rng,
+            poses,
+            fitness,
+        )
+        return [field.from_cells(pose) for pose in poses], fitness, int(evaluations)
 
     def _differential_evolution(self) -> tuple[int, float, float]:
         """HRT, lambda and F: none in plain Harmony Search."""

@@ -141,7 +141,8 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
     replayed = time.perf_counter()
     if recording.scans == 0:
         where = "between --start and --end" if _cut(spec) else f"on {log.summary.scan_topic} that could be read"
-        raise LogError(f"{spec.logs[0]}: no scan {where}")
+        lost = f": {'; '.join(log.losses.lines())}" if log.losses.data_lost else ""
+        raise LogError(f"{spec.logs[0]}: no scan {where}{lost}")
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
     mapping = None
     if isinstance(estimator, Mapper):

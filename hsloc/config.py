@@ -15,6 +15,7 @@ from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.hide import Hide
 from hsloc.matching.icp import Icp
 from hsloc.slam.mapper import GraphMapperParameters
+from hsloc.slam.point_mapper import PointMapperParameters
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MATCHERS = ("hide", "harmony_search", "icp")
+MAPPERS = ("graph", "point")
 PRESETS = ("default", "paper", "paper-literal")
 
 
@@ -52,9 +54,14 @@ class Config:
     icp: Icp = field(default_factory=Icp)
     likelihood_field: FieldParameters = field(default_factory=FieldParameters)
     localiser: LocaliserParameters = field(default_factory=LocaliserParameters)
+    mapper: str = "graph"
+    """One of graph, point: the mapper that closes loops, or the report's."""
     graph_mapper: GraphMapperParameters = field(default_factory=GraphMapperParameters)
+    point_mapper: PointMapperParameters = field(default_factory=PointMapperParameters)
 
     def __post_init__(self) -> None:
+        if self.mapper not in MAPPERS:
+            raise ConfigError(f"mapper is {self.mapper!r}; it must be one of {', '.join(MAPPERS)}")
         if self.matcher not in MATCHERS:
             raise ConfigError(f"matcher is {self.matcher!r}; it must be one of {', '.join(MATCHERS)}")
 

@@ -79,6 +79,7 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Which algorithms, with which parameters."""
     group = parser.add_argument_group("algorithms")
     group.add_argument("--matcher", choices=("hide", "harmony_search", "hs", "icp"), help="default: hide")
+    group.add_argument("--mapper", choices=("graph", "point"), help="default: graph; point is the report's SLAM")
     group.add_argument("--preset", choices=("default", "paper", "paper-literal"), default="default", help="parameters")
     group.add_argument("--config", type=Path, metavar="FILE", help="parameters from YAML, on top of the preset")
     group.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of all randomness (default: 0)")
@@ -102,4 +103,6 @@ def config(arguments: argparse.Namespace) -> Config:
         chosen = load(arguments.config, chosen)
     if arguments.matcher is not None:
         chosen = replace(chosen, matcher="harmony_search" if arguments.matcher == "hs" else arguments.matcher)
+    if arguments.mapper is not None:
+        chosen = replace(chosen, mapper=arguments.mapper)
     return chosen

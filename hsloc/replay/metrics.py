@@ -40,7 +40,7 @@ def metrics(
     values: dict[str, object] = {
         "run": {
             "hsloc": __version__,
-            "mode": "localise" if result.mapping is None else "slam",
+            "mode": result.mode,
             "inputs": list(spec.names()),
             "input_sha256": result.input_sha256,
             "map": _map_name(result),
@@ -70,7 +70,7 @@ def metrics(
         "warnings": list(result.warnings),
     }
     if result.reference is not None and len(result.reference) > 1:
-        chosen = alignment or ("none" if result.mapping is None else "se2")
+        chosen = alignment or ("se2" if result.mode == "slam" else "none")
         values |= _against(result.trajectory, result.reference, chosen)
         if not result.localised.all() and result.localised.any():
             believed = Trajectory(
@@ -83,7 +83,7 @@ def metrics(
 
 
 def _map_name(result: Result) -> str:
-    if result.mapping is not None:
+    if result.mode == "slam":
         return "drawn"
     return "log" if result.spec.map_path is None else result.spec.map_path.name
 
@@ -91,10 +91,11 @@ def _map_name(result: Result) -> str:
 def _map_quality(result: Result, residuals: Residuals) -> dict[str, object]:
     """How well scans and map agree; for a drawn map also how crisp and how consistent it is, and against a true one."""
     values: dict[str, object] = {"residuals": residuals.to_dict()}
-    if result.mapping is None:
+    if result.mode != "slam":
         return values
     values["crispness"] = crispness(result.grid).to_dict()
-    values["mapping"] = result.mapping.quality.to_dict()
+    if result.mapping is not None:
+        values["mapping"] = result.mapping.quality.to_dict()
     if result.true_grid is not None and result.reference is not None:
         try:
             moved = compare(result.trajectory, result.reference, alignment="se2").T_reference_estimate

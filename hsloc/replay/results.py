@@ -71,8 +71,9 @@ def _write(
         write_tum(folder / "odometry.tum", result.odometry)
     if result.reference is not None:
         write_tum(folder / "reference.tum", result.reference)
-    if result.mapping is not None:
+    if result.mode == "slam":
         save_map(result.grid, folder)
+    if result.mapping is not None:
         result.mapping.graph.write_g2o(folder / "graph.g2o")
     write_json(folder / "metrics.json", values)
     write_json(folder / "timings.json", timings(result))

@@ -17,10 +17,12 @@ from hsloc.log.summary import LogSummary, Losses, ReadOptions
 from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.matching.window import Window
 from hsloc.model.events import Odometry, Scan
+from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
 from hsloc.replay.engine import replay
 from hsloc.replay.recording import Recording
 from hsloc.slam.mapper import Mapper
+from hsloc.slam.point_mapper import PointMapper
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -94,7 +96,7 @@ class Result:
     """What a run found, and what is needed to repeat it. `seconds` are wall times, the only thing not repeatable.
 
     `trajectory` has one pose for each odometry message; where there are none, one for each scan. `localised` says
-    which of them are believed. `grid` is the map that was used, or, with `mapping`, the one that was drawn; then
+    which of them are believed. `grid` is the map that was used, or, in `mode` "slam", the one that was drawn; then
     `true_grid` is the one that the log carries, if any.
     """
 
@@ -110,6 +112,7 @@ class Result:
     losses: Losses
     warnings: tuple[str, ...]
     seconds: dict[str, float]
+    mode: str = "localise"
     mapping: MappingResult | None = None
     true_grid: OccupancyGrid | None = None
 
@@ -145,7 +148,12 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
         raise LogError(f"{spec.logs[0]}: no scan {where}{lost}")
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
     mapping = None
+    if isinstance(estimator, PointMapper):
+        grid, true_grid = estimator.grid(), grid
+    else:
+        true_grid = None
     if isinstance(estimator, Mapper):
+        true_grid = grid
         mapping = estimator.finish(_share(progress, log.summary.duration_s, recording.scans))
         seconds["finish"] = time.perf_counter() - replayed
     trajectory, localised = recording.trajectory() if mapping is None else _mapped(recording, mapping)
@@ -162,8 +170,9 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
         losses=log.losses,
         warnings=(*log.summary.warnings, *warnings),
         seconds=seconds,
+        mode="localise" if localise else "slam",
         mapping=mapping,
-        true_grid=grid if mapping is not None else None,
+        true_grid=true_grid,
     )
 
 
@@ -208,7 +217,13 @@ def _must(grid: OccupancyGrid | None) -> OccupancyGrid:
     return grid
 
 
-def _mapper(spec: RunSpec) -> Mapper:
+def _mapper(spec: RunSpec) -> Mapper | PointMapper:
+    if spec.config.mapper == "point":
+        if spec.no_odometry:
+            raise ConfigError("the point mapper predicts with odometry; leave out --no-odom, or use --mapper graph")
+        matcher = spec.config.make_matcher()
+        start = IDENTITY if spec.initial_pose is None else spec.initial_pose
+        return PointMapper(matcher, spec.config.point_mapper, np.random.default_rng(spec.seed), start)
     parameters = replace(spec.config.graph_mapper, use_odometry=not spec.no_odometry)
     return Mapper(parameters, np.random.default_rng(spec.seed))
 

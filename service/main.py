@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import ipaddress
 import resource
+import signal
 import sys
 import time
 from typing import TYPE_CHECKING, Any
@@ -72,6 +73,9 @@ def serve(
         backlog=2048,
     )
     server = Server(config, app)
+    for which in (signal.SIGTERM, signal.SIGINT):
+        # uvicorn raises the signal once more when it is done; being asked to stop is no failure.
+        signal.signal(which, lambda *_: None)
     server.run()
     return 0 if server.started else 1
 

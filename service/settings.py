@@ -50,6 +50,8 @@ class Settings:
     """Event streams of one tenant at the same time."""
     requests_per_s: float = 200.0
     """Requests of one tenant, on average; a burst of twice as many passes."""
+    refusals_per_s: float = 1.0
+    """Requests of one address without a valid token, on average; a burst of twenty times as many passes."""
 
     job_memory_bytes: int = 4 * GIB
     """Address space of a job's process (RLIMIT_AS)."""

@@ -27,8 +27,10 @@ if TYPE_CHECKING:
 
 _LINE_BYTES = 1 << 18
 """The longest line of the pipe; more is a job gone mad."""
-_KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "NUMBA_CACHE_DIR", "MPLCONFIGDIR", "PYTHONPATH", "VIRTUAL_ENV")
-"""What a job's process sees of the server's environment: no token, no password."""
+_KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "MPLCONFIGDIR", "PYTHONPATH", "VIRTUAL_ENV")
+_KEPT_PREFIXES = ("OPENBLAS_", "OMP_", "MKL_", "NPY_", "NUMBA_")
+"""What a job's process sees of the server's environment: no token, no password; but all that decides the last bits of
+its arithmetic, which are to be those of `hsloc replay` in the same environment."""
 TICK_S = 0.1
 LOOK_S = 0.5
 """Time between two looks at the size of the folder, and between two notes of progress."""
@@ -125,7 +127,7 @@ class Attempt:
 
     def _start(self) -> tuple[subprocess.Popen[bytes], int]:
         """The process in a session and process group of its own; the reading end of its pipe."""
-        environment = {name: os.environ[name] for name in _KEPT if name in os.environ}
+        environment = {k: v for k, v in os.environ.items() if k in _KEPT or k.startswith(_KEPT_PREFIXES)}
         environment.setdefault("MPLCONFIGDIR", str(self._storage.cache.absolute()))
         threads = str(self._settings.job_threads)
         environment |= {

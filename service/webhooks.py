@@ -146,9 +146,9 @@ def post(url: str, body: bytes, headers: dict[str, str], private: bool) -> int:
     try:
         path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
         connection.request("POST", path, body=body, headers=headers)
-        response = connection.getresponse()
-        response.read(1024)
-        return response.status
+        with connection.getresponse() as response:
+            response.read(1024)
+            return response.status
     finally:
         connection.close()
         plain.close()

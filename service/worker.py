@@ -132,7 +132,7 @@ def linked_map(folder: Path, name: str, image: str) -> Path:
         wanted = values["image"]
     except (YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise MapError(f"{name}: not a map's YAML with an `image`") from error
-    if not isinstance(wanted, str) or wanted in (".", "..") or "/" in wanted or "\0" in wanted or len(wanted) > 200:
+    if not isinstance(wanted, str) or wanted in ("", ".", "..") or "/" in wanted or "\0" in wanted or len(wanted) > 200:
         raise MapError(f"{name}: image is {wanted!r:.100}; it must be the plain name of a file beside the YAML")
     target = folder / "map" / wanted
     if not target.exists():

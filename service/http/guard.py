@@ -97,7 +97,8 @@ class Guard:
         client = (scope.get("client") or ("unknown", 0))[0]
         who = await self._principal(headers)
         if who is None:
-            self._rates.take(("refused", client), 1.0, 20.0)
+            slow = self._settings.refusals_per_s
+            self._rates.take(("refused", client), slow, 20.0 * slow)
             missing = "authorization" not in headers
             raise ServiceError(
                 401,

@@ -83,7 +83,8 @@ def webhook_secret(ctx: Ctx, who: Admin) -> SecretView:
 
 def _measure(ctx: Context) -> None:
     with ctx.database.read() as session:
-        counts = dict(session.execute(select(JobRow.state, func.count()).group_by(JobRow.state)).tuples().all())
+        rows = session.execute(select(JobRow.state, func.count()).group_by(JobRow.state)).all()
+        counts = {row[0]: row[1] for row in rows}
         oldest = session.scalar(select(func.min(JobRow.created)).where(JobRow.state == "queued"))
         pending = session.scalar(select(func.count()).select_from(DeliveryRow).where(DeliveryRow.state == "pending"))
     for state in ("queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"):

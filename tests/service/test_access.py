@@ -1,0 +1,235 @@
+"""Who may do what: every route of the OpenAPI with every kind of token, and what pages of other sites may do."""
+
+from __future__ import annotations
+
+import socket
+import time
+import uuid
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from conftest import settings, submit, upload, wait
+from fastapi.testclient import TestClient
+
+from service.http.app import create_app
+from service.main import with_tokens
+from service.principal import Tokens
+from service.settings import SettingsError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from conftest import Live
+
+PUBLIC = {("get", "/healthz"), ("get", "/readyz")}
+READ = {
+    ("get", "/v1/files"),
+    ("get", "/v1/files/{file_id}"),
+    ("get", "/v1/info"),
+    ("get", "/v1/jobs"),
+    ("get", "/v1/jobs/{job_id}"),
+    ("get", "/v1/jobs/{job_id}/events"),
+    ("get", "/v1/jobs/{job_id}/results"),
+    ("get", "/v1/jobs/{job_id}/results.zip"),
+    ("get", "/v1/jobs/{job_id}/results/{name}"),
+    ("get", "/v1/jobs/{job_id}/webhooks"),
+    ("get", "/v1/options"),
+    ("head", "/v1/tus/{file_id}"),
+    ("options", "/v1/tus"),
+}
+ADMIN = {("get", "/metrics"), ("get", "/v1/webhook-secret")}
+WRITE = {
+    ("delete", "/v1/files/{file_id}"),
+    ("delete", "/v1/jobs/{job_id}"),
+    ("delete", "/v1/tus/{file_id}"),
+    ("patch", "/v1/tus/{file_id}"),
+    ("post", "/v1/files"),
+    ("post", "/v1/jobs"),
+    ("post", "/v1/jobs/{job_id}/cancel"),
+    ("post", "/v1/jobs/{job_id}/rerun"),
+    ("post", "/v1/run"),
+    ("post", "/v1/tus"),
+    ("put", "/v1/files/{file_id}"),
+}
+
+
+class World:
+    """Two tenants; one has a file, an upload in progress and a finished job."""
+
+    def __init__(self, client: TestClient) -> None:
+        self.client = client
+        tokens = Tokens(client.app.state.context.database)  # type: ignore[attr-defined]
+        self.tokens = {
+            "owner": tokens.issue("one"),
+            "other": tokens.issue("two"),
+            "reader": tokens.issue("one", ("read",)),
+            "expired": tokens.issue("one", expires=time.time() - 1.0),
+            "wrong": "hsl_00000000_nothing",
+        }
+        revoked = tokens.issue("one")
+        assert tokens.revoke(revoked.split("_")[1])
+        self.tokens["revoked"] = revoked
+        client.headers["Authorization"] = f"Bearer {self.tokens['owner']}"
+        self.job = submit(client)
+        wait(client, self.job)
+        self.file = str(client.get(f"/v1/jobs/{self.job}").json()["request"]["log"])
+        headers = {"Tus-Resumable": "1.0.0", "Upload-Length": "9"}
+        self.upload = client.post("/v1/tus", headers=headers).headers["location"].rsplit("/", 1)[1]
+        del client.headers["Authorization"]
+
+    def send(self, method: str, path: str, who: str | None) -> Any:
+        """A request that would succeed for the owner."""
+        headers = {} if who is None else {"Authorization": f"Bearer {self.tokens[who]}"}
+        file = self.upload if "/tus/" in path else self.file
+        url = path.replace("{file_id}", file).replace("{job_id}", self.job).replace("{name}", "trajectory.tum")
+        options: dict[str, Any] = {}
+        if "/tus" in path:
+            headers |= {"Tus-Resumable": "1.0.0", "Upload-Length": "9"}
+            if method == "patch":
+                headers |= {"Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
+                options["content"] = b"123"
+        elif path == "/v1/jobs" and method == "post":
+            options["json"] = {"log": self.file}
+        elif path == "/v1/run":
+            options["files"] = {"log": b"ok"}
+        elif method in ("put", "post"):
+            options["content"] = b"" if "/jobs/" in path else b"ok"
+        return self.client.request(method.upper(), url, headers=headers, **options)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    app = create_app(settings(tmp_path_factory.mktemp("access"), require_token=True, refusals_per_s=1e6))
+    with TestClient(app, raise_server_exceptions=False) as client:
+        yield World(client)
+
+
+def test_no_route_is_forgotten(world: World) -> None:
+    schema = world.client.app.openapi()  # type: ignore[attr-defined]
+    routes = {(method, path) for path, operations in schema["paths"].items() for method in operations}
+    assert routes == PUBLIC | READ | WRITE | ADMIN
+    for path, operations in schema["paths"].items():
+        for method, operation in operations.items():
+            assert ("security" in operation) == ((method, path) not in PUBLIC)
+
+
+@pytest.mark.parametrize(("method", "path"), sorted(READ | WRITE | ADMIN))
+@pytest.mark.parametrize("who", [None, "wrong", "expired", "revoked"])
+def test_no_valid_token_no_answer(world: World, method: str, path: str, who: str | None) -> None:
+    answer = world.send(method, path, who)
+    assert answer.status_code == 401
+    assert answer.headers["www-authenticate"].startswith("Bearer")
+
+
+@pytest.mark.parametrize(("method", "path"), sorted(WRITE | ADMIN))
+def test_a_reader_may_not_write(world: World, method: str, path: str) -> None:
+    answer = world.send(method, path, "reader")
+    assert (answer.status_code, answer.json()["code"]) == (403, "scope")
+
+
+@pytest.mark.parametrize(("method", "path"), sorted(READ))
+def test_a_reader_may_read(world: World, method: str, path: str) -> None:
+    assert world.send(method, path, "reader").status_code in (200, 204)
+
+
+@pytest.mark.parametrize(
+    ("method", "path"), sorted(r for r in READ | WRITE if "{" in r[1] or r == ("post", "/v1/jobs"))
+)
+def test_another_tenant_finds_nothing(world: World, method: str, path: str) -> None:
+    assert world.send(method, path, "other").status_code == 404
+    assert world.send("get", "/v1/files/{file_id}", "owner").status_code == 200  # and has changed nothing
+    assert world.send("get", "/v1/jobs/{job_id}", "owner").json()["state"] == "succeeded"
+
+
+def test_lists_show_ones_own(world: World) -> None:
+    assert world.send("get", "/v1/jobs", "other").json()["jobs"] == []
+    mine = [each["id"] for each in world.send("get", "/v1/jobs", "owner").json()["jobs"]]
+    assert world.job in mine
+
+
+def test_a_large_body_without_a_token_is_not_read(make_live: Callable[..., Live]) -> None:
+    live = make_live(HSLOC_REQUIRE_TOKEN="1")
+    head = f"POST /v1/files HTTP/1.1\r\nHost: 127.0.0.1:{live.port}\r\nContent-Length: 100000000\r\n\r\n"
+    sent = 0
+    with socket.create_connection(("127.0.0.1", live.port), 10.0) as line:
+        line.sendall(head.encode())
+        try:
+            while sent < 100_000_000:
+                sent += line.send(bytes(65536))
+        except OSError:
+            pass  # the server has closed
+    assert sent < 20_000_000  # what the kernel's buffers took
+    with socket.create_connection(("127.0.0.1", live.port), 10.0) as line:
+        line.sendall(head.encode())
+        assert line.recv(4096).startswith(b"HTTP/1.1 401")
+    assert list((live.data / "uploads").iterdir()) == []
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "evil.example:8000", ""])
+def test_other_names_of_this_server_are_refused(client: TestClient, host: str) -> None:
+    assert client.get("/v1/jobs", headers={"Host": host}).status_code == 421
+
+
+def test_pages_of_other_sites_are_refused(client: TestClient) -> None:
+    assert client.get("/v1/jobs", headers={"Origin": "http://evil.example"}).status_code == 403
+    assert client.post("/v1/files", content=b"x", headers={"Sec-Fetch-Site": "cross-site"}).status_code == 403
+    assert client.get("/v1/jobs", headers={"Origin": "null"}).status_code == 403
+    assert client.get("/v1/jobs", headers={"Origin": "http://testserver"}).status_code == 200
+
+
+def test_headers_of_every_answer(client: TestClient) -> None:
+    for path in ("/", "/healthz", "/v1/jobs", "/v1/nothing", "/web/app.js", f"/v1/jobs/{uuid.uuid4()}"):
+        headers = client.get(path).headers
+        assert headers["x-content-type-options"] == "nosniff"
+        assert "default-src 'self'" in headers["content-security-policy"]
+        assert "frame-ancestors 'none'" in headers["content-security-policy"]
+        assert headers["referrer-policy"] == "no-referrer"
+        assert "access-control-allow-origin" not in headers
+
+
+def test_guessing_tokens_is_slowed_down(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(require_token=True)
+    codes = [client.get("/v1/jobs", headers={"Authorization": f"Bearer {k}"}).status_code for k in range(30)]
+    assert codes[0] == 401
+    assert codes[-1] == 429
+
+
+def test_too_many_requests(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(requests_per_s=5.0)
+    answers = [client.get("/v1/files") for _ in range(40)]
+    refused = [answer for answer in answers if answer.status_code == 429]
+    assert refused
+    assert int(refused[0].headers["retry-after"]) >= 1
+
+
+def test_it_does_not_listen_beyond_loopback_without_a_token(tmp_path: Path) -> None:
+    chosen = settings(tmp_path)
+    with pytest.raises(SettingsError, match="no token exists"):
+        with_tokens(chosen, "0.0.0.0", open_to_all=False, first_token=False, secret=None)
+    assert not with_tokens(chosen, "127.0.0.1", False, False, None).require_token
+    assert not with_tokens(chosen, "0.0.0.0", True, False, None).require_token
+    with pytest.raises(SettingsError, match="24 or more"):
+        with_tokens(chosen, "0.0.0.0", False, False, "short")
+    assert with_tokens(chosen, "0.0.0.0", False, False, "x" * 32).require_token
+    assert with_tokens(chosen, "127.0.0.1", True, False, None).require_token  # now there is a token
+
+
+def test_the_token_is_not_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    chosen = settings(tmp_path)
+    assert with_tokens(chosen, "0.0.0.0", False, True, None).require_token
+    token = capsys.readouterr().out.split(": ")[1].strip()
+    assert token.startswith("hsl_")
+    with_tokens(chosen, "0.0.0.0", False, True, None)
+    assert capsys.readouterr().out == ""  # the first start only
+    for path in chosen.data.iterdir():
+        assert token.encode() not in path.read_bytes()
+        assert token.rsplit("_", 1)[1].encode() not in path.read_bytes()
+
+
+def test_upload_of_another_tenant_is_no_log_of_mine(world: World) -> None:
+    world.client.headers["Authorization"] = f"Bearer {world.tokens['other']}"
+    mine = upload(world.client)
+    answer = world.client.post("/v1/jobs", json={"log": mine, "map": {"yaml": world.file, "image": mine}})
+    del world.client.headers["Authorization"]
+    assert answer.status_code == 404

@@ -1,0 +1,135 @@
+"""The real localiser behind the service: the same bytes as `hsloc replay`; hostile files fail with a reason."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from conftest import upload, wait
+
+from hsloc.errors import MapError
+from service.settings import Settings
+from service.worker import linked_map
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from fastapi.testclient import TestClient
+
+RECORDINGS = Path(__file__).parents[2] / "recordings"
+REAL = Settings().worker_command
+
+
+def test_the_result_is_that_of_hsloc_replay_byte_for_byte(
+    make_client: Callable[..., TestClient], tmp_path: Path
+) -> None:
+    client = make_client(worker_command=REAL, job_memory_bytes=4 << 30)
+    file = upload(client, (RECORDINGS / "office.mcap").read_bytes(), "office.mcap")
+    request = {"log": file, "seed": 11, "config": {"hide": {"budget": 250}}}
+    job = client.post("/v1/jobs", json=request).json()["id"]
+    (tmp_path / "c.yaml").write_text("hide: {budget: 250}\n")
+    command = [sys.executable, "-m", "hsloc.cli.main", "replay", str(RECORDINGS / "office.mcap"), "-q"]
+    command += ["--config", str(tmp_path / "c.yaml"), "--seed", "11", "--out", str(tmp_path / "out")]
+    subprocess.run(command, check=True)
+    ended = wait(client, job, 60.0)
+    assert ended["state"] == "succeeded", ended
+    names = {each["name"] for each in client.get(f"/v1/jobs/{job}/results").json()["assets"]}
+    theirs = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names - theirs == {"viewer.json", "viewer-map.png"}
+    assert theirs <= names
+    for name in theirs - {"timings.json"}:  # wall times
+        ours = client.get(f"/v1/jobs/{job}/results/{name}").content
+        assert ours == (tmp_path / "out" / name).read_bytes(), name
+    viewer = client.get(f"/v1/jobs/{job}/results/viewer.json").json()
+    assert len(viewer["trajectory"]["x"]) == len(viewer["trajectory"]["t"]) <= 3000
+    ape = ended["summary"]["metrics"]["ape"]["trans_part"]
+    assert max(viewer["errors"]["position"]) <= ape["max"] + 1e-3
+
+
+def chunk(compression: bytes, claimed: int, data: bytes) -> bytes:
+    """A chunk record of an MCAP, with whatever size it claims."""
+    body = struct.pack("<QQQI", 0, 1, claimed, 0) + struct.pack("<I", len(compression)) + compression
+    body += struct.pack("<Q", len(data)) + data
+    return b"\x06" + struct.pack("<Q", len(body)) + body
+
+
+MAGIC = b"\x89MCAP0\r\n"
+HEADER = b"\x01" + struct.pack("<Q", 8) + struct.pack("<II", 0, 0)
+
+
+def zeros(size: int) -> bytes:
+    import zstandard
+
+    compressor = zstandard.ZstdCompressor(level=3).compressobj(size=size)
+    block = bytes(1 << 20)
+    return b"".join(compressor.compress(block) for _ in range(size >> 20)) + compressor.flush()
+
+
+def schema(name: bytes, encoding: bytes, text: bytes) -> bytes:
+    body = struct.pack("<H", 1) + b"".join(struct.pack("<I", len(each)) + each for each in (name, encoding, text))
+    return b"\x03" + struct.pack("<Q", len(body)) + body
+
+
+HOSTILE: dict[str, Callable[[], bytes]] = {
+    "empty": lambda: b"",
+    "truncated": lambda: (RECORDINGS / "office.mcap").read_bytes()[:1000],
+    "8 GiB of zeros": lambda: MAGIC + HEADER + chunk(b"zstd", 8 << 30, zeros(8 << 30)),
+    "huge array": lambda: MAGIC + HEADER + schema(b"a/msg/B", b"ros2msg", b"string[3000000] x"),
+    "nested constants": lambda: (
+        MAGIC
+        + HEADER
+        + schema(
+            b"a/msg/B", b"ros2idl", b"module a{module msg{const long X = " + b"(" * 18 + b"1" + b")" * 18 + b";};};"
+        )
+    ),
+    "sqlite": lambda: b"SQLite format 3\x00" + os.urandom(5000),
+}
+
+
+def test_hostile_files_fail_in_seconds_with_a_reason(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(worker_command=REAL, job_memory_bytes=2 << 30, slots=2, job_wall_s=30.0)
+    begin = time.monotonic()
+    jobs = {}
+    for name, content in HOSTILE.items():
+        jobs[name] = client.post("/v1/jobs", json={"log": upload(client, content(), f"{name}.mcap")}).json()["id"]
+    for name, job in jobs.items():
+        ended = wait(client, job, 60.0)
+        assert (ended["state"], ended["reason"]) in (("failed", "invalid_input"), ("failed", "out_of_memory")), (
+            name,
+            ended,
+        )
+        assert ended["message"], name
+        assert "/data/" not in ended["message"], ended["message"]  # the server's folders are its own business
+    assert time.monotonic() - begin < 60.0
+    assert client.get("/healthz").status_code == 200
+
+
+@pytest.mark.parametrize("image", ["/etc/passwd", "../input/log.mcap", "..", "a/b.pgm", "", 3, None])
+def test_a_map_may_not_name_a_file_elsewhere(tmp_path: Path, image: object) -> None:
+    (tmp_path / "map").mkdir()
+    (tmp_path / "map" / "map.yaml").write_text(f"image: {json.dumps(image)}\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    with pytest.raises(MapError, match="plain name"):
+        linked_map(tmp_path, "map.yaml", ".image")
+
+
+def test_a_map_of_two_uploads(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(worker_command=REAL, job_memory_bytes=2 << 30)
+    yaml = (
+        b"image: my map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+    )
+    pixels = b"P5 100 100 255\n" + (b"\x00" * 100 + b"\xfe" * 100) * 50
+    chart = {"yaml": upload(client, yaml, "map.yaml"), "image": upload(client, pixels, "other.pgm")}
+    log = upload(client, (RECORDINGS / "paper.mcap").read_bytes(), "paper.mcap")
+    job = client.post("/v1/jobs", json={"log": log, "map": chart}).json()["id"]
+    ended = wait(client, job, 30.0)
+    assert ended["state"] == "succeeded", ended
+    assert ended["summary"]["metrics"]["run"]["map"] == "map.yaml"
+    viewer = client.get(f"/v1/jobs/{job}/results/viewer.json").json()
+    assert (viewer["map"]["width"], viewer["map"]["height"]) == (100, 100)

@@ -1,0 +1,243 @@
+"""Jobs through the API, with the fake worker."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import time
+import uuid
+import zipfile
+from typing import TYPE_CHECKING
+
+import pytest
+from conftest import submit, upload, wait
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from fastapi.testclient import TestClient
+
+
+def test_a_job_runs_and_its_results_are_named_by_a_manifest(client: TestClient) -> None:
+    job = submit(client, seed=7)
+    ended = wait(client, job)
+    assert (ended["state"], ended["reason"], ended["attempt"]) == ("succeeded", None, 1)
+    manifest = client.get(f"/v1/jobs/{job}/results").json()
+    assert [each["name"] for each in manifest["assets"]] == ["metrics.json", "trajectory.tum"]
+    for each in manifest["assets"]:
+        answer = client.get(each["href"])
+        assert hashlib.sha256(answer.content).hexdigest() == each["sha256"]
+        assert len(answer.content) == each["size"]
+        assert answer.headers["etag"] == f'"{each["sha256"]}"'
+        assert "sandbox" in answer.headers["content-security-policy"]
+    assert client.get(f"/v1/jobs/{job}/results/trajectory.tum").text == "7 []\n"
+
+
+def test_ranges_and_etags(client: TestClient) -> None:
+    job = submit(client)
+    wait(client, job)
+    path = f"/v1/jobs/{job}/results/trajectory.tum"
+    whole = client.get(path)
+    part = client.get(path, headers={"Range": "bytes=2-3"})
+    assert (part.status_code, part.content) == (206, whole.content[2:4])
+    assert client.get(path, headers={"Range": "bytes=99-"}).status_code == 416
+    assert client.get(path, headers={"If-None-Match": whole.headers["etag"]}).status_code == 304
+    assert client.get(path, headers={"If-Range": '"other"', "Range": "bytes=2-3"}).status_code == 200
+
+
+def test_all_results_in_one_archive(client: TestClient) -> None:
+    job = submit(client)
+    wait(client, job)
+    answer = client.get(f"/v1/jobs/{job}/results.zip")
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert archive.testzip() is None
+        assert archive.read("trajectory.tum") == b"0 []\n"
+
+
+def test_only_plain_files_of_the_output_become_results(client: TestClient) -> None:
+    job = submit(client, b"tricks")
+    wait(client, job)
+    names = [each["name"] for each in client.get(f"/v1/jobs/{job}/results").json()["assets"]]
+    assert names == ["metrics.json", "trajectory.tum"]
+    for name in ("passwd", "..%2f..%2fhsloc.db", "%2e%2e%2fhsloc.db", "%2e%2e", "sub"):
+        assert client.get(f"/v1/jobs/{job}/results/{name}").status_code in (404, 422)
+
+
+def test_the_same_idempotency_key_makes_one_job(client: TestClient) -> None:
+    request = {"log": upload(client), "seed": 3}
+    first = client.post("/v1/jobs", json=request, headers={"Idempotency-Key": "k"})
+    again = client.post("/v1/jobs", json=request, headers={"Idempotency-Key": "k"})
+    assert (first.status_code, again.status_code) == (201, 200)
+    assert first.json()["id"] == again.json()["id"]
+    other = client.post("/v1/jobs", json={**request, "seed": 4}, headers={"Idempotency-Key": "k"})
+    assert (other.status_code, other.json()["code"]) == (409, "idempotency")
+    assert len(client.get("/v1/jobs").json()["jobs"]) == 1
+
+
+def test_a_running_job_tells_its_progress(client: TestClient) -> None:
+    job = submit(client, b"slow 3")
+    wait(client, job, states=("running",))
+    time.sleep(1.3)
+    found = client.get(f"/v1/jobs/{job}").json()
+    assert found["progress"]["phase"] == "replay"
+    assert 0.1 < found["progress"]["fraction"] < 0.9
+    assert found["progress"]["age_s"] < 2.0
+    assert found["heartbeat_age_s"] < 2.0
+    assert wait(client, job)["progress"] is None
+
+
+def test_events_have_a_cursor(client: TestClient) -> None:
+    job = submit(client, b"slow 0.6")
+    wait(client, job)
+    text = client.get(f"/v1/jobs/{job}/events").text
+    blocks = [
+        dict(line.split(": ", 1) for line in block.splitlines()) for block in text.split("\n\n") if "id: " in block
+    ]
+    assert [json.loads(b["data"])["state"] for b in blocks if b["event"] == "state"] == [
+        "queued",
+        "running",
+        "succeeded",
+    ]
+    assert sum(b["event"] == "progress" for b in blocks) <= 1  # older progress is replaced
+    last = blocks[-2]["id"]
+    rest = client.get(f"/v1/jobs/{job}/events", headers={"Last-Event-ID": last}).text
+    assert rest.count("id: ") == 1
+    assert f"id: {blocks[-1]['id']}\n" in rest
+
+
+def test_a_waiting_job_is_cancelled_at_once_and_a_running_one_when_it_is_dead(client: TestClient) -> None:
+    running, waiting = submit(client, b"slow 60"), submit(client, b"slow 60")
+    wait(client, running, states=("running",))
+    assert client.post(f"/v1/jobs/{waiting}/cancel").json()["state"] == "cancelled"
+    assert client.post(f"/v1/jobs/{running}/cancel").json()["state"] == "cancelling"
+    ended = wait(client, running, 5.0)
+    assert (ended["state"], ended["reason"]) == ("cancelled", "cancelled")
+    assert client.post(f"/v1/jobs/{running}/cancel").json()["state"] == "cancelled"
+
+
+def test_run_again_keeps_the_seed_and_takes_changes(client: TestClient) -> None:
+    job = submit(client, seed=5)
+    wait(client, job)
+    again = client.post(f"/v1/jobs/{job}/rerun").json()
+    assert (again["request"]["seed"], again["rerun_of"]) == (5, job)
+    changed = client.post(f"/v1/jobs/{job}/rerun", json={"seed": 6, "matcher": "icp"}).json()
+    assert (changed["request"]["seed"], changed["request"]["matcher"]) == (6, "icp")
+    assert wait(client, changed["id"])["state"] == "succeeded"
+
+
+def test_delete_removes_results_but_not_what_is_active(client: TestClient) -> None:
+    job = submit(client)
+    wait(client, job)
+    storage = client.app.state.context.storage  # type: ignore[attr-defined]
+    assert len(list(storage.results.iterdir())) == 1
+    assert client.delete(f"/v1/jobs/{job}").status_code == 204
+    assert client.get(f"/v1/jobs/{job}").status_code == 404
+    assert list(storage.results.iterdir()) == []
+    active = submit(client, b"slow 30")
+    file = client.get(f"/v1/jobs/{active}").json()["request"]["log"]
+    assert client.delete(f"/v1/jobs/{active}").status_code == 409
+    assert client.delete(f"/v1/files/{file}").status_code == 409
+    client.post(f"/v1/jobs/{active}/cancel")
+    wait(client, active)
+    assert client.delete(f"/v1/files/{file}").status_code == 204
+
+
+def test_the_queue_has_an_end(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(max_queued=2)
+    file = upload(client, b"slow 30")
+    jobs = [client.post("/v1/jobs", json={"log": file}).json()["id"]]
+    wait(client, jobs[0], states=("running",))
+    jobs += [client.post("/v1/jobs", json={"log": file}).json()["id"] for _ in range(2)]
+    refused = client.post("/v1/jobs", json={"log": file})
+    assert (refused.status_code, refused.json()["code"]) == (429, "too_many")
+    assert int(refused.headers["retry-after"]) >= 1
+    for job in reversed(jobs):
+        client.post(f"/v1/jobs/{job}/cancel")
+
+
+def test_pages_of_the_list(client: TestClient) -> None:
+    jobs = [submit(client) for _ in range(5)]
+    first = client.get("/v1/jobs", params={"limit": 3}).json()
+    rest = client.get("/v1/jobs", params={"limit": 3, "before": first["next"]}).json()
+    assert [each["id"] for each in first["jobs"] + rest["jobs"]] == jobs[::-1]
+    assert rest["next"] is None
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        ({"seed": False}, "seed"),
+        ({"seed": -1}, "seed"),
+        ({"seed": 1.5}, "seed"),
+        ({"preset": "nice"}, "preset"),
+        ({"unknown": 1}, "unknown"),
+        ({"initial_pose": [1, 2]}, "initial_pose"),
+        ({"initial_pose": [1, 2, "x"]}, "initial_pose"),
+        ({"webhook": "file:///etc/passwd"}, "webhook"),
+        ({"config": {"hide": {"memory": 3}}}, "config.hide.memory"),
+        ({"config": {"hide": {"memory_size": "3"}}}, "config.hide.memory_size"),
+        ({"config": {"matcher": "magic"}}, "config.matcher"),
+    ],
+)
+def test_a_request_that_does_not_fit_is_refused_with_its_place(
+    client: TestClient, change: dict[str, object], where: str
+) -> None:
+    answer = client.post("/v1/jobs", json={"log": upload(client), **change})
+    assert answer.status_code == 422
+    assert where in answer.json()["message"]
+
+
+def test_not_a_number_is_no_number(client: TestClient) -> None:
+    body = b'{"log": "%s", "initial_pose": [NaN, 0, 0]}' % upload(client).encode()
+    answer = client.post("/v1/jobs", content=body, headers={"content-type": "application/json"})
+    assert answer.status_code == 422
+
+
+def test_a_log_that_is_not_there(client: TestClient) -> None:
+    assert client.post("/v1/jobs", json={"log": str(uuid.uuid4())}).status_code == 404
+
+
+def test_a_large_json_body_is_refused(client: TestClient) -> None:
+    answer = client.post("/v1/jobs", content=b"[" * (1 << 20), headers={"content-type": "application/json"})
+    assert answer.status_code == 413
+    deep = client.post("/v1/jobs", content=b"[" * 100_000, headers={"content-type": "application/json"})
+    assert deep.status_code in (400, 422)
+
+
+def test_everything_in_one_request(client: TestClient) -> None:
+    files = {"log": ("my run.mcap", b"ok"), "map": ("m.yaml", b"image: m.pgm"), "map_image": ("m.pgm", b"P5")}
+    answer = client.post("/v1/run", files=files, data={"request": '{"seed": 9}'})
+    assert answer.status_code == 201, answer.text
+    job = answer.json()
+    assert (job["log"], job["request"]["seed"]) == ("my run.mcap", 9)
+    assert wait(client, job["id"])["state"] == "succeeded"
+
+
+def test_a_one_shot_that_cannot_be_queued_leaves_no_file(client: TestClient) -> None:
+    for data in ({"request": '{"seed": "x"}'}, {"request": "{"}, {"nonsense": "1"}):
+        answer = client.post("/v1/run", files={"log": b"ok"}, data=data)
+        assert answer.status_code == 422, answer.text
+    assert client.post("/v1/run", files={"map": b"ok"}).status_code == 422
+    broken = client.post("/v1/run", content=b"--x\r\n", headers={"content-type": "multipart/form-data; boundary=x"})
+    assert broken.status_code == 400
+    assert client.get("/v1/files").json()["files"] == []
+    assert list(client.app.state.context.storage.uploads.iterdir()) == []  # type: ignore[attr-defined]
+
+
+def test_options_have_a_schema(client: TestClient) -> None:
+    options = client.get("/v1/options").json()
+    assert options["config_schema"]["properties"]["matcher"]["enum"] == ["hide", "harmony_search", "icp"]
+    assert set(options["presets"]) == {"default", "paper", "paper-literal"}
+    for values in options["presets"].values():  # a preset passes its own schema
+        answer = client.post("/v1/jobs", json={"log": upload(client), "config": values})
+        assert answer.status_code == 201, answer.text
+
+
+def test_health_and_metrics(client: TestClient) -> None:
+    submit(client)
+    assert client.get("/healthz").json() == {"status": "ok"}
+    assert client.get("/readyz").status_code == 200
+    text = client.get("/metrics").text
+    assert 'hsloc_jobs{state="queued"}' in text
+    assert "hsloc_request_seconds_bucket" in text

@@ -1,0 +1,138 @@
+"""Leases and fences, on the database alone."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+from conftest import settings
+
+from service.database import Database
+from service.files import Files
+from service.jobs import Jobs
+from service.leases import Leases
+from service.principal import ANYBODY, Principal
+from service.storage import Asset, Storage
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+OTHER = Principal("other", ANYBODY.scopes)
+
+
+class Parts:
+    def __init__(self, folder: Path) -> None:
+        chosen = settings(folder)
+        chosen.data.mkdir()
+        self.database = Database(chosen.data / "hsloc.db")
+        self.storage = Storage(chosen.data)
+        self.files = Files(self.database, self.storage, chosen)
+        self.jobs = Jobs(self.database, self.storage, chosen)
+
+    def leases(self, lease_s: float = 30.0, max_attempts: int = 3) -> Leases:
+        return Leases(self.database, lease_s, max_attempts)
+
+    def submit(self, who: Principal = ANYBODY) -> str:
+        file = self.files.create(who, "run.mcap", 0)
+        self.files.complete(file.id, 0, "00")
+        return self.jobs.submit(who, {"log": file.id, "map": None}).job.id
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> Iterator[Parts]:
+    made = Parts(tmp_path)
+    yield made
+    made.database.close()
+    made.storage.close()
+
+
+ASSET = [Asset("a", 1, "00", "text/plain")]
+
+
+def test_a_job_is_claimed_once(parts: Parts) -> None:
+    job = parts.submit()
+    leases = parts.leases()
+    claim = leases.claim("a")
+    assert claim is not None
+    assert (claim.job_id, claim.attempt) == (job, 1)
+    assert leases.claim("b") is None
+
+
+def test_an_expired_lease_is_taken_over_and_the_first_owner_is_fenced_off(parts: Parts) -> None:
+    job = parts.submit()
+    short, long = parts.leases(lease_s=0.0), parts.leases()
+    first = short.claim("a")
+    time.sleep(0.01)
+    assert long.recover() == [job]
+    second = long.claim("b")
+    assert first is not None
+    assert second is not None
+    assert second.attempt == 2
+    assert not long.beat(first, None).mine
+    assert not long.succeed(first, "first", ASSET, {})
+    assert not long.fail(first, "failed", "x", "x")
+    long.release(first, "x")
+    assert long.beat(second, None).mine
+    assert long.succeed(second, "second", ASSET, {})
+    assert not long.succeed(second, "third", ASSET, {})
+    done = parts.jobs.get(ANYBODY, job)
+    assert (done.state, done.folder, done.attempt) == ("succeeded", "second", 2)
+    states = [row.data["state"] for row in parts.jobs.events(ANYBODY, job, 0)[1]]
+    assert states == ["queued", "running", "queued", "running", "succeeded"]
+
+
+def test_a_job_that_kills_its_server_is_given_up(parts: Parts) -> None:
+    job = parts.submit()
+    leases = parts.leases(max_attempts=3)
+    for owner in "abc":
+        assert leases.claim(owner) is not None
+        leases.recover("the next server")
+    found = parts.jobs.get(ANYBODY, job)
+    assert (found.state, found.reason) == ("crashed", "attempts")
+    assert leases.claim("d") is None
+
+
+def test_recover_leaves_a_live_lease_alone(parts: Parts) -> None:
+    parts.submit()
+    leases = parts.leases()
+    assert leases.claim("a") is not None
+    assert leases.recover() == []
+    assert leases.recover("a") == []
+
+
+def test_cancel_wins_over_success(parts: Parts) -> None:
+    job = parts.submit()
+    leases = parts.leases()
+    claim = leases.claim("a")
+    assert claim is not None
+    parts.jobs.cancel(ANYBODY, job)
+    assert leases.beat(claim, None).cancel
+    assert not leases.succeed(claim, "folder", ASSET, {})
+    assert leases.fail(claim, "failed", "x", "x")
+    assert parts.jobs.get(ANYBODY, job).state == "cancelled"
+
+
+def test_cancelled_while_its_server_dies(parts: Parts) -> None:
+    job = parts.submit()
+    leases = parts.leases()
+    leases.claim("a")
+    parts.jobs.cancel(ANYBODY, job)
+    leases.recover("b")
+    assert parts.jobs.get(ANYBODY, job).state == "cancelled"
+
+
+def test_a_tenant_with_many_jobs_does_not_hold_up_another(parts: Parts) -> None:
+    many = [parts.submit() for _ in range(4)]
+    single = parts.submit(OTHER)
+    leases = parts.leases()
+    order = [claim.job_id for _ in range(3) if (claim := leases.claim("a"))]
+    assert order == [many[0], single, many[1]]
+
+
+def test_the_journal_is_durable(parts: Parts) -> None:
+    with parts.database.read() as session:
+        connection = session.connection()
+        assert connection.exec_driver_sql("PRAGMA journal_mode").scalar_one() == "wal"
+        assert connection.exec_driver_sql("PRAGMA synchronous").scalar_one() == 2

@@ -1,0 +1,159 @@
+"""Job processes that misbehave: each ends in the right state with a reason, and the API does not notice."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from conftest import free_port, submit, wait
+
+from service.processes import marked
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from conftest import Live
+    from fastapi.testclient import TestClient
+
+LIMITS: dict[str, Any] = {
+    "job_memory_bytes": 1 << 29,
+    "job_cpu_s": 1.0,
+    "job_wall_s": 3.0,
+    "job_output_bytes": 64 << 20,
+    "max_attempts": 2,
+    "slots": 2,
+}
+
+
+@pytest.mark.parametrize(
+    ("word", "state", "reason", "attempts"),
+    [
+        (b"ignore-term 60", "failed", "wall_limit", 1),
+        (b"silent", "failed", "wall_limit", 1),
+        (b"allocate", "failed", "out_of_memory", 1),
+        (b"spin", "failed", "cpu_limit", 1),
+        (b"fill", "failed", "output_limit", 1),
+        (b"fill-one", "failed", "output_limit", 1),
+        (b"abort", "crashed", "signal", 1),
+        (b"exit 3", "crashed", "exit", 1),
+        (b"lie", "crashed", "exit", 1),
+        (b"nonsense", "crashed", "protocol", 1),
+        (b"kill-self", "crashed", "attempts", 2),
+        (b"bad-input", "failed", "invalid_input", 1),
+    ],
+)
+def test_ends_with_a_reason(
+    make_client: Callable[..., TestClient], word: bytes, state: str, reason: str, attempts: int
+) -> None:
+    client = make_client(**LIMITS)
+    job = submit(client, word)
+    missed: list[float] = []
+    stop = threading.Event()
+
+    def poll() -> None:
+        while not stop.wait(0.1):
+            begin = time.monotonic()
+            client.get(f"/v1/jobs/{job}")
+            if (took := time.monotonic() - begin) > 1.0:
+                missed.append(took)
+
+    poller = threading.Thread(target=poll)
+    poller.start()
+    ended = wait(client, job)
+    stop.set()
+    poller.join()
+    assert (ended["state"], ended["reason"], ended["attempt"]) == (state, reason, attempts)
+    assert ended["message"]
+    assert missed == []
+    storage = client.app.state.context.storage  # type: ignore[attr-defined]
+    assert list(marked(f"{storage.instance}:")) == []
+    deadline = time.monotonic() + 2.0
+    while list(storage.work.iterdir()) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert list(storage.work.iterdir()) == []
+    assert list(storage.results.iterdir()) == []
+
+
+def test_cancel_ends_what_ignores_sigterm_and_leaves_the_group(make_client: Callable[..., TestClient]) -> None:
+    client = make_client()
+    mark = f"{client.app.state.context.storage.instance}:"  # type: ignore[attr-defined]
+    job = submit(client, b"ignore-term 60")
+    wait(client, job, states=("running",))
+    deadline = time.monotonic() + 5.0
+    while len(list(marked(mark))) < 3 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert len(list(marked(mark))) == 3  # itself, a child, a child in a session of its own
+    client.post(f"/v1/jobs/{job}/cancel")
+    begin = time.monotonic()
+    assert wait(client, job)["state"] == "cancelled"
+    assert time.monotonic() - begin < 0.3 + 1.0
+    assert list(marked(mark)) == []
+
+
+def test_sigterm_puts_running_jobs_back_and_leaves_no_process(make_live: Callable[..., Live]) -> None:
+    live = make_live()
+    with live.client() as client:
+        job = submit(client, b"slow 2")
+        wait(client, job, states=("running",))
+        with client.stream("GET", f"/v1/jobs/{job}/events"):  # an open stream does not hold the server up
+            begin = time.monotonic()
+            assert live.end(signal.SIGTERM) == 0
+            assert time.monotonic() - begin < 3.0
+    instance = (live.data / "instance").read_text()
+    assert list(marked(f"{instance}:")) == []
+    live.start()
+    with live.client() as client:
+        ended = wait(client, job)
+        assert (ended["state"], ended["attempt"]) == ("succeeded", 2)
+
+
+def test_kill_9_loses_nothing(make_live: Callable[..., Live]) -> None:
+    live = make_live()
+    with live.client() as client:
+        jobs = [submit(client, b"ignore-term 1")] + [submit(client) for _ in range(5)]
+        wait(client, jobs[0], states=("running",))
+        time.sleep(0.5)
+    live.end(signal.SIGKILL)
+    instance = (live.data / "instance").read_text()
+    live.start()  # kills the grandchildren that outlived the server
+    with live.client() as client:
+        for job in jobs:
+            assert wait(client, job)["state"] == "succeeded"
+    assert list(marked(f"{instance}:")) == []
+    assert len(list((live.data / "results").iterdir())) == len(jobs)
+
+
+def test_a_second_server_is_refused_the_folder(make_live: Callable[..., Live]) -> None:
+    live = make_live()
+    first = live.process
+    live.port = free_port()
+    with pytest.raises(RuntimeError, match="another hsloc service is using this folder"):
+        live.start()
+    assert first is not None
+    first.send_signal(signal.SIGTERM)
+    first.wait(10.0)
+
+
+def test_the_process_sees_no_secret_of_the_server(make_live: Callable[..., Live]) -> None:
+    token = "a-token-of-the-operator-0123456789"
+    live = make_live(HSLOC_TOKEN=token)
+    with live.client() as client:
+        client.headers["Authorization"] = f"Bearer {token}"
+        job = submit(client, b"slow 5")
+        wait(client, job, states=("running",))
+        deadline = time.monotonic() + 5.0
+        pids: list[int] = []
+        while not pids and time.monotonic() < deadline:
+            pids = list(marked((live.data / "instance").read_text()))
+        environment = Path(f"/proc/{pids[0]}/environ").read_bytes()
+        assert token.encode() not in environment
+        client.post(f"/v1/jobs/{job}/cancel")
+        wait(client, job)
+    for path in live.data.rglob("*"):
+        if path.is_file() and os.access(path, os.R_OK):
+            assert token.encode() not in path.read_bytes()

@@ -1,0 +1,113 @@
+"""Slow clients are cut off, others are served meanwhile."""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from typing import TYPE_CHECKING
+
+import httpx2 as httpx
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from conftest import Live
+
+QUICK = {"HSLOC_HEADER_TIMEOUT_S": "1", "HSLOC_BODY_TIMEOUT_S": "1", "HSLOC_WRITE_TIMEOUT_S": "2"}
+
+
+def closed(lines: list[socket.socket], seconds: float) -> int:
+    """How many of the connections the other side ends within the time."""
+    left, deadline = set(lines), time.monotonic() + seconds
+    while left and time.monotonic() < deadline:
+        for line in select.select(list(left), [], [], 0.1)[0]:
+            try:
+                if line.recv(65536) == b"":
+                    left.discard(line)
+            except ConnectionError:
+                left.discard(line)
+    return len(lines) - len(left)
+
+
+def test_half_open_requests_are_closed_and_others_served(make_live: Callable[..., Live]) -> None:
+    live = make_live(**QUICK)
+    lines = [socket.create_connection(("127.0.0.1", live.port)) for _ in range(120)]
+    host = f"Host: 127.0.0.1:{live.port}\r\n"
+    begin = "GET /v1/jobs HTTP/1.1\r\n" + host
+    body = "POST /v1/files HTTP/1.1\r\n" + host + "Content-Length: 1000\r\n\r\n123"
+    for k, line in enumerate(lines):
+        line.sendall((b"", begin.encode(), body.encode())[k % 3])
+    try:
+        for _ in range(5):
+            start = time.monotonic()
+            assert httpx.get(f"{live.url}/v1/jobs").status_code == 200
+            assert time.monotonic() - start < 1.0
+        assert closed(lines, 5.0) == len(lines)
+    finally:
+        for line in lines:
+            line.close()
+    deadline = time.monotonic() + 5.0
+    while (left := list((live.data / "uploads").iterdir())) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert left == []
+
+
+def test_a_header_in_drops_does_not_win_time(make_live: Callable[..., Live]) -> None:
+    live = make_live(**QUICK)
+    with socket.create_connection(("127.0.0.1", live.port)) as line:
+        begin = time.monotonic()
+        try:
+            for byte in b"GET /healthz HTTP/1.1\r\nX: " + b"a" * 1000:
+                line.sendall(bytes([byte]))
+                time.sleep(0.05)
+                if select.select([line], [], [], 0)[0] and line.recv(1) == b"":
+                    break
+        except ConnectionError:
+            pass
+        assert time.monotonic() - begin < 4.0
+
+
+def test_a_second_request_on_a_connection_may_take_its_time_but_not_for_ever(make_live: Callable[..., Live]) -> None:
+    live = make_live(**QUICK)
+    request = f"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1:{live.port}\r\n\r\n".encode()
+    with socket.create_connection(("127.0.0.1", live.port)) as line:
+        for _ in range(2):
+            line.sendall(request)
+            answer = b""
+            while not answer.endswith(b'{"status":"ok"}'):
+                answer += line.recv(4096)
+            assert answer.startswith(b"HTTP/1.1 200")
+            time.sleep(1.5)  # idle between requests: that is keep-alive's business
+        line.sendall(request[:20])
+        assert closed([line], 4.0) == 1
+
+
+def test_a_slow_but_steady_upload_passes(make_live: Callable[..., Live]) -> None:
+    live = make_live(**QUICK)
+
+    def drops() -> object:
+        for _ in range(8):
+            time.sleep(0.3)
+            yield b"x" * 100
+
+    answer = httpx.post(f"{live.url}/v1/files", content=drops())  # type: ignore[arg-type]
+    assert (answer.status_code, answer.json()["size"]) == (201, 800)
+
+
+def test_a_client_that_takes_nothing_is_cut_off(make_live: Callable[..., Live]) -> None:
+    live = make_live(**QUICK)
+    with socket.socket() as line:
+        line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        line.connect(("127.0.0.1", live.port))
+        request = f"GET /openapi.json HTTP/1.1\r\nHost: 127.0.0.1:{live.port}\r\n\r\n".encode()
+        line.sendall(request * 400)  # takes none of the answers
+        time.sleep(5.0)
+        line.settimeout(5.0)
+        got = 0
+        try:
+            while block := line.recv(1 << 20):
+                got += block.count(b"HTTP/1.1 200")
+        except ConnectionError:
+            pass
+    assert got < 400  # only what the kernel had taken before

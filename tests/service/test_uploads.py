@@ -1,0 +1,236 @@
+"""Uploads: one request, tus 1.0, limits, and what happens when the line breaks."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import os
+import socket
+import time
+import uuid
+from typing import TYPE_CHECKING, Any
+
+import httpx2 as httpx
+import pytest
+from conftest import upload
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from conftest import Live
+    from fastapi.testclient import TestClient
+
+TUS = {"Tus-Resumable": "1.0.0"}
+PATCH = {**TUS, "Content-Type": "application/offset+octet-stream"}
+
+
+def stored(client: TestClient, file: str) -> bytes:
+    path: Path = client.app.state.context.storage.upload_path(file)  # type: ignore[attr-defined]
+    return path.read_bytes()
+
+
+def begin(client: Any, size: int, name: str = "run.mcap", **headers: str) -> str:
+    metadata = f"filename {base64.b64encode(name.encode()).decode()}"
+    answer = client.post("/v1/tus", headers={**TUS, "Upload-Length": str(size), "Upload-Metadata": metadata, **headers})
+    assert answer.status_code == 201, answer.text
+    return str(answer.headers["location"])
+
+
+def offset(client: Any, path: str) -> int:
+    answer = client.head(path, headers=TUS)
+    assert answer.status_code == 200
+    assert answer.headers["cache-control"] == "no-store"
+    return int(answer.headers["upload-offset"])
+
+
+def append(client: Any, path: str, at: int, body: bytes, **headers: str) -> Any:
+    return client.patch(path, content=body, headers={**PATCH, "Upload-Offset": str(at), **headers})
+
+
+def test_a_raw_body_becomes_a_file(client: TestClient) -> None:
+    content = os.urandom(3_000_000)
+    file = upload(client, content, name="../../etc/<img src=x onerror=alert(1)>")
+    found = client.get(f"/v1/files/{file}").json()
+    assert found["name"] == "../../etc/<img src=x onerror=alert(1)>"  # a label, given back as it came
+    assert (found["state"], found["size"]) == ("complete", len(content))
+    assert found["sha256"] == hashlib.sha256(content).hexdigest()
+    assert stored(client, file) == content
+    assert client.delete(f"/v1/files/{file}").status_code == 204
+    assert client.get(f"/v1/files/{file}").status_code == 404
+
+
+def test_an_upload_without_announced_length(client: TestClient) -> None:
+    blocks = [os.urandom(700_000) for _ in range(4)]
+    answer = client.post("/v1/files", content=iter(blocks))
+    assert answer.json()["sha256"] == hashlib.sha256(b"".join(blocks)).hexdigest()
+
+
+def test_put_may_be_sent_again(client: TestClient) -> None:
+    path, digest = f"/v1/files/{uuid.uuid4()}", hashlib.sha256(b"abc").digest()
+    headers = {"Repr-Digest": f"sha-256=:{base64.b64encode(digest).decode()}:"}
+    assert client.put(path, content=b"abc", headers=headers).status_code == 201
+    assert client.put(path, content=b"abc", headers=headers).status_code == 200
+    assert client.put(path, content=b"abc").status_code == 409
+    other = client.put(f"/v1/files/{uuid.uuid4()}", content=b"abd", headers=headers)
+    assert (other.status_code, other.json()["code"]) == (460, "checksum")
+    assert len(client.get("/v1/files").json()["files"]) == 1
+
+
+@pytest.mark.parametrize("announced", [True, False])
+def test_too_large_is_refused_by_bytes_received(make_client: Callable[..., TestClient], announced: bool) -> None:
+    client = make_client(max_upload_bytes=2_000_000)
+    content = bytes(5_000_000)
+    answer = client.post("/v1/files", content=content if announced else iter([content[:1_000_000]] * 5))
+    assert answer.status_code == 413
+    assert client.get("/v1/files").json()["files"] == []
+    context = client.app.state.context  # type: ignore[attr-defined]
+    assert list(context.storage.uploads.iterdir()) == []
+
+
+def test_quota_and_reservation(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(tenant_bytes=1000)
+    first = begin(client, 800)
+    refused = client.post("/v1/tus", headers={**TUS, "Upload-Length": "300"})
+    assert (refused.status_code, refused.json()["code"]) == (507, "no_space")
+    assert client.delete(first, headers=TUS).status_code == 204
+    begin(client, 300)
+
+
+def test_more_than_the_disk_has_is_refused_when_announced(client: TestClient) -> None:
+    answer = client.post("/v1/tus", headers={**TUS, "Upload-Length": str(1 << 36)})
+    free = client.get("/v1/info").json()["free_bytes"]
+    assert answer.status_code == (507 if free < 1 << 36 else 201)
+
+
+def test_tus_from_beginning_to_end(client: TestClient) -> None:
+    content = os.urandom(2_500_000)
+    path = begin(client, len(content), "ünïcode.mcap")
+    assert offset(client, path) == 0
+    assert append(client, path, 0, content[:1_000_000]).headers["upload-offset"] == "1000000"
+    wrong = append(client, path, 999_999, content[1_000_000:])
+    assert (wrong.status_code, wrong.json()["code"]) == (409, "offset")
+    assert offset(client, path) == 1_000_000
+    assert append(client, path, 1_000_000, content[1_000_000:]).status_code == 204
+    found = client.get(path.replace("tus", "files")).json()
+    assert (found["state"], found["name"]) == ("complete", "ünïcode.mcap")
+    assert found["sha256"] == hashlib.sha256(content).hexdigest()
+    assert append(client, path, len(content), b"x").status_code == 409
+    assert offset(client, path) == len(content)
+
+
+def test_tus_checks_what_it_is_told(client: TestClient) -> None:
+    path = begin(client, 10)
+    assert client.head(path).status_code == 412
+    assert client.patch(path, headers={**TUS, "Upload-Offset": "0"}, content=b"x").status_code == 415
+    assert client.patch(path, headers=PATCH, content=b"x").status_code == 400
+    assert append(client, path, 0, b"x" * 11).status_code == 413
+    assert offset(client, path) == 0
+    assert client.post("/v1/tus", headers=TUS).status_code == 400
+    assert client.post("/v1/tus", headers={**TUS, "Upload-Length": "-1"}).status_code == 422
+    bad = {**TUS, "Upload-Length": "1", "Upload-Metadata": "filename ***"}
+    assert client.post("/v1/tus", headers=bad).status_code == 400
+    options = client.options("/v1/tus")
+    assert options.status_code == 204
+    assert set(options.headers["tus-extension"].split(",")) >= {"creation", "checksum", "termination", "expiration"}
+
+
+def test_a_body_with_a_wrong_checksum_is_not_taken(client: TestClient) -> None:
+    content = os.urandom(1_500_000)
+    path = begin(client, len(content))
+    right = f"sha1 {base64.b64encode(hashlib.sha1(content).digest()).decode()}"
+    spoiled = append(client, path, 0, content[:-1] + b"\0\0"[:1], **{"Upload-Checksum": right})
+    if content[-1:] != b"\0":
+        assert spoiled.status_code == 460
+        assert offset(client, path) == 0
+        assert append(client, path, 0, content, **{"Upload-Checksum": right}).status_code == 204
+    assert client.get(path.replace("tus", "files")).json()["sha256"] == hashlib.sha256(content).hexdigest()
+    assert append(client, begin(client, 1), 0, b"x", **{"Upload-Checksum": "crc32 AAAA"}).status_code == 400
+
+
+def test_creation_with_upload_and_empty_files(client: TestClient) -> None:
+    answer = client.post("/v1/tus", content=b"abc", headers={**PATCH, "Upload-Length": "3"})
+    assert (answer.status_code, answer.headers["upload-offset"]) == (201, "3")
+    empty = begin(client, 0)
+    assert client.get(empty.replace("tus", "files")).json()["state"] == "complete"
+
+
+def test_termination(client: TestClient) -> None:
+    path = begin(client, 10)
+    append(client, path, 0, b"12345")
+    assert client.delete(path, headers=TUS).status_code == 204
+    assert client.head(path, headers=TUS).status_code == 404
+    assert list(client.app.state.context.storage.uploads.iterdir()) == []  # type: ignore[attr-defined]
+
+
+def test_bytes_beyond_the_offset_do_not_count(client: TestClient) -> None:
+    """After a kill the file may be longer than the database says; and a disk may have lost its end."""
+    content = os.urandom(3000)
+    path = begin(client, len(content))
+    append(client, path, 0, content[:1000])
+    file = client.app.state.context.storage.upload_path(path.rsplit("/", 1)[1])  # type: ignore[attr-defined]
+    with file.open("ab") as longer:
+        longer.write(b"never acknowledged")
+    assert append(client, path, 1000, content[1000:2000]).status_code == 204
+    os.truncate(file, 1500)
+    lost = append(client, path, 2000, content[2000:])
+    assert lost.status_code == 409
+    assert offset(client, path) == 1500
+    assert append(client, path, 1500, content[1500:]).status_code == 204
+    assert client.get(path.replace("tus", "files")).json()["sha256"] == hashlib.sha256(content).hexdigest()
+
+
+def test_an_unfinished_upload_expires(make_client: Callable[..., TestClient]) -> None:
+    from service.housekeeping import Housekeeping
+
+    client = make_client(upload_ttl_s=10.0)
+    path, whole = begin(client, 10), upload(client)
+    append(client, path, 0, b"12345")
+    context = client.app.state.context  # type: ignore[attr-defined]
+    tidy = Housekeeping(context.database, context.storage, context.settings).tidy
+    tidy(time.time())
+    assert offset(client, path) == 5
+    tidy(time.time() + 11.0)
+    assert client.head(path, headers=TUS).status_code == 404
+    assert client.get(f"/v1/files/{whole}").status_code == 200
+    assert len(list(context.storage.uploads.iterdir())) == 1
+
+
+def test_a_broken_connection_keeps_what_arrived_and_only_one_may_write(make_live: Callable[..., Live]) -> None:
+    live = make_live()
+    content = os.urandom(5_000_000)
+    with live.client() as client:
+        path = begin(client, len(content))
+        head = (
+            f"PATCH {path} HTTP/1.1\r\nHost: 127.0.0.1:{live.port}\r\nTus-Resumable: 1.0.0\r\n"
+            "Content-Type: application/offset+octet-stream\r\nUpload-Offset: 0\r\n"
+            f"Content-Length: {len(content)}\r\n\r\n"
+        ).encode()
+        with socket.create_connection(("127.0.0.1", live.port)) as line:
+            line.sendall(head + content[:3_000_000])
+            time.sleep(0.3)
+            begun = time.monotonic()
+            assert append(client, path, 0, b"x").status_code == 423
+            assert client.get("/healthz").status_code == 200
+            assert time.monotonic() - begun < 0.5
+        deadline = time.monotonic() + 5.0
+        while (at := offset(client, path)) == 0 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert at == 3_000_000
+        assert append(client, path, at, content[at:]).status_code == 204
+        assert client.get(path.replace("tus", "files")).json()["sha256"] == hashlib.sha256(content).hexdigest()
+
+
+def test_an_independent_tus_client(make_live: Callable[..., Live]) -> None:
+    tusclient = pytest.importorskip("tusclient.client")
+    live = make_live()
+    content = os.urandom(1_000_000)
+    options = {"file_stream": io.BytesIO(content), "chunk_size": 300_000, "upload_checksum": True}
+    first = tusclient.TusClient(f"{live.url}/v1/tus").uploader(metadata={"filename": "run.mcap"}, **options)
+    first.upload_chunk()
+    again = tusclient.TusClient(f"{live.url}/v1/tus").uploader(url=first.url, **options)
+    assert again.offset == 300_000
+    again.upload()
+    found = httpx.get(first.url.replace("tus", "files")).json()
+    assert (found["state"], found["sha256"]) == ("complete", hashlib.sha256(content).hexdigest())

@@ -1,0 +1,107 @@
+"""Webhooks: signed, retried, and never to a private address."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from conftest import submit, wait
+
+from service import webhooks
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from fastapi.testclient import TestClient
+
+
+class Receiver(HTTPServer):
+    """Answers with the statuses that it is given, then 200."""
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.statuses: list[int] = []
+        self.got: list[tuple[dict[str, str], bytes]] = []
+
+
+class Handler(BaseHTTPRequestHandler):
+    server: Receiver
+
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers["content-length"]))
+        self.server.got.append(({k.lower(): v for k, v in self.headers.items()}, body))
+        status = self.server.statuses.pop(0) if self.server.statuses else 200
+        self.send_response(status)
+        if status == 302:
+            self.send_header("Location", "/elsewhere")
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def receiver() -> Iterator[Receiver]:
+    with Receiver() as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def deliveries(client: TestClient, job: str, seconds: float = 8.0) -> dict[str, Any]:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        found = client.get(f"/v1/jobs/{job}/webhooks").json()["deliveries"]
+        if found and found[0]["state"] != "pending":
+            assert len(found) == 1
+            return dict(found[0])
+        time.sleep(0.05)
+    raise AssertionError("the webhook is still pending")
+
+
+def test_signed_and_retried(make_client: Callable[..., TestClient], receiver: Receiver) -> None:
+    client = make_client(webhook_private=True, webhook_backoff_s=0.05)
+    receiver.statuses = [500, 302]
+    job = submit(client, webhook=f"http://127.0.0.1:{receiver.server_port}/hook?x=1")
+    wait(client, job)
+    found = deliveries(client, job)
+    assert (found["state"], found["attempts"], found["last_status"]) == ("delivered", 3, 200)
+    assert len({headers["hsloc-event-id"] for headers, _ in receiver.got}) == 1
+    secret = client.get("/v1/webhook-secret").json()["secret"]
+    headers, body = receiver.got[-1]
+    stamp, mac = (part.split("=")[1] for part in headers["hsloc-signature"].split(","))
+    assert hmac.compare_digest(mac, hmac.new(secret.encode(), f"{stamp}.".encode() + body, hashlib.sha256).hexdigest())
+    assert json.loads(body)["job"] == job
+    assert json.loads(body)["state"] == "succeeded"
+
+
+def test_given_up_after_some_attempts(make_client: Callable[..., TestClient], receiver: Receiver) -> None:
+    client = make_client(webhook_private=True, webhook_backoff_s=0.01, webhook_attempts=3)
+    receiver.statuses = [500] * 10
+    job = submit(client, webhook=f"http://127.0.0.1:{receiver.server_port}/")
+    wait(client, job)
+    found = deliveries(client, job)
+    assert (found["state"], found["attempts"]) == ("given_up", 3)
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["127.0.0.1", "localhost", "[::1]", "10.0.0.1", "169.254.169.254", "[::ffff:127.0.0.1]", "0.0.0.0", "2130706433"],
+)
+def test_private_addresses_are_refused(host: str) -> None:
+    with pytest.raises(webhooks.ForbiddenAddress):
+        webhooks.post(f"http://{host}:1/", b"", {}, private=False)
+
+
+def test_other_schemes_and_user_names_are_refused() -> None:
+    for url in ("file:///etc/passwd", "ftp://x/", "http://user:password@example.com/", "http://"):
+        with pytest.raises(ValueError):
+            webhooks.post(url, b"", {}, private=False)

@@ -56,6 +56,8 @@ class OdometryMessage(NamedTuple):
     child_frame_id: str
     pose: Pose2
     covariance: NDArray[np.float64] | None
+    quaternion: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+    """As in the message, not normalised."""
 
 
 class LinkMessage(NamedTuple):
@@ -175,12 +177,12 @@ def odometry(data: Payload) -> OdometryMessage:
     stamp, frame, at = _header(data, 4)
     child, at = _string(data, at)
     at = _aligned(at, 8)
-    pose = _pose2(_POSE.unpack_from(data, at))
+    values = _POSE.unpack_from(data, at)
     at += _POSE.size
     raw = bytes(data[at : at + _COVARIANCE_BYTES])
     if len(raw) < _COVARIANCE_BYTES:
         raise ValueError("the covariance is cut off")
-    return OdometryMessage(stamp, frame, child, pose, _plane_covariance(raw))
+    return OdometryMessage(stamp, frame, child, _pose2(values), _plane_covariance(raw), values[3:])
 
 
 def transforms(data: Payload) -> list[LinkMessage]:
@@ -266,7 +268,9 @@ def object_odometry(message: Any) -> OdometryMessage:
     """From a message object."""
     raw = np.array(message.pose.covariance, dtype="<f8").tobytes()
     child = str(message.child_frame_id).lstrip("/")
-    return OdometryMessage(*_object_header(message), child, _object_pose(message.pose.pose), _plane_covariance(raw))
+    pose, q = _object_pose(message.pose.pose), message.pose.pose.orientation
+    quaternion = (float(q.x), float(q.y), float(q.z), float(q.w))
+    return OdometryMessage(*_object_header(message), child, pose, _plane_covariance(raw), quaternion)
 
 
 def object_transforms(message: Any) -> list[LinkMessage]:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from hsloc.log.container import Container
-    from hsloc.log.source import Source
+    from hsloc.log.source import Observation, Source
     from hsloc.model import Event, OccupancyGrid, Pose2
 
 _BAG_MAGIC = b"#ROSBAG V"
@@ -61,6 +61,14 @@ class Log:
                 return
             if start is None or effective >= start:
                 yield event
+
+    def observations(self) -> Iterator[Observation]:
+        """All scans, odometry and transforms of all topics as the log has them, in its order; for checks.
+
+        Counts its losses anew, as `events` does; `start_s` and `end_s` have no say.
+        """
+        self.losses = self._source.losses_at_opening.copy()
+        return self._source.observations(self.losses)
 
     def map(self) -> OccupancyGrid | None:
         """The map that the log carries on /map, or None."""

@@ -7,11 +7,12 @@ from operator import itemgetter
 from typing import TYPE_CHECKING
 
 from hsloc.log import definitions
-from hsloc.log.decoders import Undecodable
+from hsloc.log.decoders import Undecodable, canonical_type, is_decodable
 from hsloc.log.feeds import OdometryFeed, PoseFeed, ScanFeed, TransformFeed
 from hsloc.log.frames import BASE_FRAMES
 from hsloc.log.ordering import KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH, Reorder, TopicClock
 from hsloc.log.ros_survey import First, Survey
+from hsloc.log.source import Observation
 from hsloc.log.summary import Losses
 from hsloc.log.topics import TF, of_type
 from hsloc.model import Pose2
@@ -60,6 +61,23 @@ class RosSource:
                 elif reorder.push(clock, event, log_time):
                     yield from reorder.ready()
         yield from reorder.rest()
+
+    def observations(self, losses: Losses) -> Iterator[Observation]:
+        """As `Source.observations`."""
+        kinds = (definitions.LASER_SCAN, definitions.ODOMETRY, definitions.TF_MESSAGE)
+        for number, container in enumerate(self._containers):
+            chosen = {
+                channel.id: (channel.topic, self._survey.decoder(number, channel))
+                for channel in container.channels.values()
+                if is_decodable(channel) and canonical_type(channel.typename) in kinds
+            }
+            for log_time, _, channel_id, data in container.messages(chosen.keys(), losses):
+                topic, decoder = chosen[channel_id]
+                try:
+                    yield Observation(topic, log_time, decoder(data))
+                except Undecodable as error:
+                    losses.undecodable_messages[topic] += 1
+                    losses.note(f"{topic}: a message cannot be decoded ({error})")
 
     def _feeds(self, losses: Losses) -> list[Feed]:
         survey = self._survey

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from hsloc.log.decode import LinkMessage, OdometryMessage, ScanMessage
     from hsloc.log.summary import LogSummary, Losses
     from hsloc.model import Event, OccupancyGrid, Pose2
+
+
+class Observation(NamedTuple):
+    """A message as the log has it, in the order of the log: nothing is sorted, chosen or put right."""
+
+    topic: str
+    log_time_ns: int
+    message: ScanMessage | OdometryMessage | list[LinkMessage]
 
 
 class Source(Protocol):
@@ -23,6 +32,10 @@ class Source(Protocol):
 
     def events(self, losses: Losses) -> Iterator[tuple[int, Event]]:
         """All events."""
+        ...
+
+    def observations(self, losses: Losses) -> Iterator[Observation]:
+        """All scans, odometry and transforms of all topics, for checks."""
         ...
 
     def map(self) -> OccupancyGrid | None:

@@ -9,7 +9,9 @@ from decimal import Decimal, InvalidOperation
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple, Protocol, cast
 
 from hsloc.errors import LogFormatError, TopicError
+from hsloc.log.decode import OdometryMessage, ScanMessage
 from hsloc.log.ranges import RANGE_MIN, RangeRule
+from hsloc.log.source import Observation
 from hsloc.log.summary import LogSummary, Losses, ReadOptions, TopicStatistics, TopicSummary
 from hsloc.model import IDENTITY, Odometry, Pose2, Scan, Truth
 
@@ -167,6 +169,19 @@ class TextSource:
             )
         if line.truth is not None:
             yield line.truth
+
+    def observations(self, losses: Losses) -> Iterator[Observation]:
+        """As `Source.observations`; a text log has no clock beside its stamps."""
+        for keyword, line in self._parsed(losses):
+            for event in self._events_of(line):
+                if isinstance(event, Scan):
+                    limits = event.range_min, event.range_max
+                    values = event.angle_min, event.angle_increment, event.time_increment, *limits, event.ranges
+                    message = ScanMessage(event.stamp_ns, event.frame_id, *values, None)
+                    yield Observation(keyword, event.stamp_ns, message)
+                elif isinstance(event, Odometry):
+                    pose = OdometryMessage(event.stamp_ns, "", "", event.T_odom_base, None)
+                    yield Observation(keyword, event.stamp_ns, pose)
 
     def _survey(self) -> LogSummary:
         """First reading: counts, times, and what the end of the scale means."""

@@ -1,0 +1,109 @@
+"""Check a log: stamps, gaps, frames, ranges, odometry, damage; each finding with its remedy.
+
+Exit code 0: nothing that spoils results; 1: errors were found; 3: the file is damaged.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from hsloc.cli.arguments import add_read_arguments, read_options
+from hsloc.cli.progress import ProgressLine
+
+if TYPE_CHECKING:
+    import argparse
+
+    from hsloc.log.check import CheckReport
+    from hsloc.log.findings import Finding
+
+HELP = "check a log for what spoils results"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `hsloc check`."""
+    parser.add_argument("log", nargs="+", metavar="LOG", help="the log: a file, its parts, or a folder with them")
+    add_read_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors and damage only")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Check; returns the exit code."""
+    from dataclasses import replace
+
+    from hsloc.log.check import check_log
+    from hsloc.log.reader import open_log
+
+    log = open_log(arguments.log, replace(read_options(arguments), require_scan=False, require_odometry=False))
+    start, span = log.summary.start_ns, max(log.summary.end_ns - log.summary.start_ns, 1)
+    with ProgressLine(arguments.quiet or arguments.json) as line:
+        report = check_log(log, lambda log_time: line.show("check", (log_time - start) / span))
+    if arguments.json:
+        from json import dumps
+
+        print(dumps(_values(report, [str(path) for path in log.summary.paths], start), indent=2))
+    else:
+        print("\n".join(_lines(report, start, arguments.quiet)))
+    if report.has_errors:
+        return 1
+    return 3 if report.losses.data_lost else 0
+
+
+def _values(report: CheckReport, paths: list[str], start_ns: int) -> dict[str, Any]:
+    return {
+        "paths": paths,
+        "ok": not report.has_errors and not report.losses.data_lost,
+        "data_lost": report.losses.data_lost,
+        "messages": report.messages,
+        "findings": [
+            {
+                "code": finding.code,
+                "severity": finding.severity.value,
+                "topic": finding.topic,
+                "count": finding.count,
+                "text": finding.text,
+                "remedy": finding.remedy,
+                "first": None
+                if finding.first is None
+                else {
+                    "message": finding.first.number,
+                    "stamp_ns": finding.first.stamp_ns,
+                    "log_time_ns": finding.first.log_time_ns,
+                    "seconds": (finding.first.log_time_ns - start_ns) / 1e9,
+                },
+            }
+            for finding in report.findings
+        ],
+        "intervals": {topic: intervals.to_dict() for topic, intervals in report.intervals.items()},
+        "losses": report.losses.lines(),
+        "reasons": report.losses.reasons,
+    }
+
+
+def _lines(report: CheckReport, start_ns: int, quiet: bool) -> list[str]:
+    shown = [f for f in report.findings if not quiet or f.severity.value in ("error", "damage")]
+    lines = [line for finding in shown for line in _finding_lines(finding, start_ns)]
+    if quiet:
+        return lines
+    for topic, intervals in report.intervals.items():
+        values = intervals.to_dict()
+        if values["usual_s"] is not None:
+            span = f"from {values['shortest_s']:.3f} to {values['longest_s']:.3f} s"
+            lines.append(f"{topic}: every {values['usual_s']:.3f} s, {span}")
+            lines.append("  " + ", ".join(_bin(edge, count) for edge, count in values["histogram"]))
+    counts = {name: sum(f.severity.value == name for f in report.findings) for name in ("damage", "error", "warning")}
+    found = ", ".join(f"{n} {name}{'s' * (n > 1 and name != 'damage')}" for name, n in counts.items() if n)
+    return [*lines, f"{report.messages} messages checked: {found or 'nothing wrong'}"]
+
+
+def _bin(edge: float | None, count: int) -> str:
+    return f"{count} longer" if edge is None else f"{count} up to {edge * 1000:g} ms"
+
+
+def _finding_lines(finding: Finding, start_ns: int) -> list[str]:
+    where = f"{finding.topic}: " if finding.topic else ""
+    times = f" ({finding.count} times)" if finding.count > 1 else ""
+    if finding.first is not None:
+        seconds = (finding.first.log_time_ns - start_ns) / 1e9
+        times += f", first at {seconds:.3f} s (message {finding.first.number})"
+    return [f"{finding.severity.value}: {where}{finding.text}{times}", f"  remedy: {finding.remedy}"]

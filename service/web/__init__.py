@@ -1,1 +1,0 @@
-"""The web page: static files, no build step."""

@@ -1,0 +1,180 @@
+"""The web page in a real browser: upload, watch, look, download; by keyboard; with names full of HTML.
+
+Needs Playwright and a Chromium; `HSLOC_SCREENSHOTS=DIR` keeps pictures.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from conftest import upload
+
+from service.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from conftest import Live
+
+sync_api = pytest.importorskip("playwright.sync_api")
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
+
+RECORDINGS = Path(__file__).parents[2] / "recordings"
+REAL = ",".join(Settings().worker_command)
+NASTY = "<img src=x onerror=alert(1)>.mcap"
+FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, "--disable-component-update"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
+    """Pages that fail the test on a dialogue, an error in the console or a breach of the content policy."""
+    contexts, complaints = [], []
+
+    def make(url: str, **options: Any) -> Any:
+        contexts.append(browser.new_context(accept_downloads=True, **options))
+        page = contexts[-1].new_page()
+        page.on("dialog", lambda dialog: (complaints.append(f"dialog: {dialog.message}"), dialog.dismiss()))
+        page.on("pageerror", lambda error: complaints.append(f"error: {error}"))
+        page.on(
+            "console",
+            lambda message: (
+                complaints.append(message.text)
+                if message.type == "error" and "the server responded with a status of 401" not in message.text
+                else None
+            ),
+        )
+        page.set_default_timeout(30_000)
+        page.goto(url)
+        return page
+
+    yield make
+    for context in contexts:
+        context.close()
+    assert complaints == []
+
+
+def picture(page: Any, name: str) -> None:
+    folder = os.environ.get("HSLOC_SCREENSHOTS")
+    if folder:
+        page.screenshot(path=f"{folder}/{name}.png", full_page=True)
+
+
+def inked(page: Any, selector: str) -> int:
+    """How many different colours a canvas shows."""
+    script = """(s) => { const c = document.querySelector(s); const d = c.getContext('2d').getImageData(
+      0, 0, c.width, c.height).data; const found = new Set();
+      for (let k = 0; k < d.length; k += 4) found.add(d[k] << 16 | d[k + 1] << 8 | d[k + 2]); return found.size; }"""
+    return int(page.evaluate(script, selector))
+
+
+def test_upload_watch_look_download(
+    make_live: Callable[..., Live], open_page: Callable[..., Any], tmp_path: Path
+) -> None:
+    live = make_live(HSLOC_WORKER_COMMAND=REAL, HSLOC_JOB_MEMORY_BYTES="4G")
+    log = tmp_path / NASTY
+    shutil.copy(RECORDINGS / "office.mcap", log)
+    page = open_page(live.url, viewport={"width": 1280, "height": 900})
+    picture(page, "1-empty")
+    page.set_input_files("#log", str(log))
+    page.click("#go")
+    page.wait_for_selector("#job-state .running")
+    picture(page, "2-running")
+    page.wait_for_selector("#job-state .succeeded")
+    page.wait_for_selector("#result:not([hidden])")
+    page.wait_for_function("() => document.querySelector('#time-text').textContent !== ''")
+    assert page.text_content("#job-title") == NASTY
+    assert page.locator("#jobs img, #job img").count() == 0
+    assert inked(page, "#view") > 5
+    assert inked(page, "#plot") > 3
+    assert re.search(r"rmse \d+\.\d cm", page.text_content("#metrics") or "")
+    picture(page, "3-result")
+    with page.expect_download() as download:
+        page.click("text=trajectory.tum")
+    assert download.value.suggested_filename == "trajectory.tum"
+    with live.client() as client:
+        job = client.get("/v1/jobs").json()["jobs"][0]
+        assert job["log"] == NASTY
+        content = client.get(f"/v1/jobs/{job['id']}/results/trajectory.tum").content
+    assert Path(download.value.path()).read_bytes() == content
+    before = page.text_content("#time-text")
+    page.focus("#view")
+    for key in ("+", "+", "ArrowLeft", ",", ","):
+        page.keyboard.press(key)
+    assert page.text_content("#time-text") != before
+    page.mouse.move(700, 400)
+    page.mouse.wheel(0, -400)
+    page.uncheck("#legend input >> nth=1")
+    picture(page, "4-zoomed")
+    page.click("text=Run again")
+    page.wait_for_function("() => document.querySelectorAll('#jobs li').length === 2")
+    page.wait_for_selector("#result:not([hidden])")
+    assert page.text_content("#job-state") == "succeeded"
+
+
+def test_on_a_phone_in_the_dark_by_keyboard_and_cancel(
+    make_live: Callable[..., Live], open_page: Callable[..., Any]
+) -> None:
+    live = make_live()
+    with live.client() as client:
+        file = upload(client, b"slow 60", NASTY)
+        client.post("/v1/jobs", json={"log": file})
+    options = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "color_scheme": "dark"}
+    page = open_page(live.url, **options)
+    page.wait_for_selector("#jobs button")
+    for _ in range(30):
+        if page.evaluate("document.activeElement.dataset.job !== undefined"):
+            break
+        page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#job-state .running")
+    page.wait_for_function("() => document.querySelector('#job-state').textContent.includes('replay')")
+    picture(page, "5-phone")
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")  # nothing sticks out
+    page.click("text=Cancel")
+    page.wait_for_selector("#job-state .cancelled")
+    picture(page, "6-phone-cancelled")
+
+
+def test_a_token_is_asked_for(make_live: Callable[..., Live], open_page: Callable[..., Any]) -> None:
+    token = "a-token-of-the-operator-0123456789"
+    live = make_live(HSLOC_TOKEN=token)
+    page = open_page(live.url)
+    page.wait_for_selector("#token-form:not([hidden])")
+    page.fill("#token", token)
+    page.keyboard.press("Enter")
+    page.wait_for_function("() => document.querySelector('#server').textContent.includes('version')")
+    assert page.is_hidden("#token-form")
+
+
+def test_an_upload_survives_a_server_that_drops_it(
+    make_live: Callable[..., Live], open_page: Callable[..., Any], tmp_path: Path, browser: Any
+) -> None:
+    live = make_live(HSLOC_FAULT_DROP_UPLOADS="0.5")
+    log = tmp_path / "large.log"
+    log.write_bytes(b"ok " + os.urandom(20_000_000))
+    context = browser.new_context()
+    page = context.new_page()  # the failures are in the console, as they should be
+    page.goto(live.url)
+    page.set_input_files("#log", str(log))
+    page.click("#go")
+    page.wait_for_selector("#job-state .succeeded", timeout=60_000)
+    with live.client() as client:
+        file = client.get("/v1/files").json()["files"][0]
+    import hashlib
+
+    assert file["sha256"] == hashlib.sha256(log.read_bytes()).hexdigest()
+    context.close()

@@ -111,6 +111,8 @@ _FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
 """No motion is known better than this (m^2, rad^2)."""
 _FORGET = 0.05
 """Weight of a new match in the usual fitness."""
+_KNOWN = 0.85
+"""A point is spared whose nearest node scores as much: the local map has one within a part of a cell."""
 _CONVINCING = 0.9
 """A match in the wide window must reach this part of the usual fitness."""
 
@@ -251,7 +253,7 @@ class LocalMatcher:
         moved = found.pose @ points[np.hypot(points[:, 0], points[:, 1]) < p.local_range]
         if found.status is Status.MATCHED or len(self._maps) == 1:
             for local, _ in self._maps:
-                local.draw(moved)
+                local.draw(moved, _KNOWN)
         return found
 
 

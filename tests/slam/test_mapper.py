@@ -1,0 +1,161 @@
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from conftest import ape_rmse, drive
+
+from hsloc.model import IDENTITY, Odometry, PairedScan, Pose2, Status
+from hsloc.slam.mapper import GraphMapperParameters, Mapper
+
+
+def mapped(events, parameters=None, seed=0):
+    mapper = Mapper(parameters or GraphMapperParameters(), np.random.default_rng(seed))
+    said = [mapper.update(event) for event in events]
+    return mapper.finish(), said
+
+
+def scans_of(events):
+    return [event for event in events if isinstance(event, PairedScan)]
+
+
+@pytest.fixture(scope="module")
+def office_map(office):
+    return mapped(office[0])
+
+
+@pytest.fixture(scope="module")
+def loop_map(loop):
+    return mapped(loop[0])
+
+
+def test_the_office_is_mapped_to_the_centimetre(office, office_map):
+    events, truth = office
+    result, said = office_map
+    assert ape_rmse(events, result.scan_poses, truth) < 0.02
+    matched = [estimate for estimate in said if estimate.status is Status.MATCHED]
+    assert len(matched) > 0.8 * len(scans_of(events))
+    assert all(estimate.fitness is not None and estimate.covariance is not None for estimate in matched)
+    assert result.quality.residual_median < 0.04
+    assert result.quality.conflict < 0.01
+
+
+def test_every_event_has_its_pose_in_the_order_of_the_log(office, office_map):
+    events, _ = office
+    result, said = office_map
+    messages = [event for event in events if isinstance(event, Odometry)]
+    assert len(said) == len(events)
+    assert result.odometry_poses.shape == (len(messages), 3)
+    assert result.scan_poses.shape == (len(scans_of(events)), 3)
+    assert [k for k, _ in result.revision] == list(range(len(messages)))
+    for (_, T_map_odom), message, pose in zip(result.revision, messages, result.odometry_poses, strict=True):
+        assert (T_map_odom @ message.T_odom_base).distance(Pose2.from_array(pose)) < 1e-9
+    steps = [a.distance(b) for a, b in pairwise(Pose2.from_array(pose) for pose in result.odometry_poses)]
+    assert max(steps) < 0.1, "no jumps"
+
+
+def test_the_grid_shows_walls_free_and_unknown(office_map):
+    result, _ = office_map
+    grid = result.grid
+    assert grid.occupied().sum() > 500
+    assert grid.free().sum() > 5 * grid.occupied().sum()
+    assert (grid.cells == -1).sum() > 0
+    for pose in result.keyscan_poses[::20]:
+        column, row = ((pose[:2] - (grid.origin.x, grid.origin.y)) / grid.resolution).astype(int)
+        assert grid.cells[row, column] < 20, "the robot drives through free space"
+
+
+def test_a_long_loop_is_closed_without_a_wrong_one(loop, loop_map):
+    events, truth = loop
+    result, said = loop_map
+    assert result.quality.loops >= 1
+    assert ape_rmse(events, result.scan_poses, truth) <= 0.05
+    online = np.array(
+        [e.T_map_base.to_array() for e, event in zip(said, events, strict=True) if isinstance(event, PairedScan)]
+    )
+    assert ape_rmse(events, online, truth) > ape_rmse(events, result.scan_poses, truth)
+
+
+def test_loops_say_why_they_were_refused(loop_map):
+    result, _ = loop_map
+    for loop in result.loops:
+        assert loop.accepted == (loop.reason == "")
+        assert loop.first < loop.second - 3
+
+
+def test_the_same_seed_gives_the_same_bytes(office, office_map):
+    result, _ = office_map
+    again, _ = mapped(office[0])
+    assert again.scan_poses.tobytes() == result.scan_poses.tobytes()
+    assert again.grid.cells.tobytes() == result.grid.cells.tobytes()
+    other, _ = mapped(office[0], seed=1)
+    assert np.abs(other.scan_poses - result.scan_poses)[:, :2].max() < 0.02, "another seed changes little"
+
+
+def test_without_odometry_a_constant_velocity_predicts(office):
+    events, truth = office
+    scans = [PairedScan(event.scan, IDENTITY) for event in scans_of(events)]
+    result, said = mapped(scans, GraphMapperParameters(use_odometry=False))
+    assert ape_rmse(events, result.scan_poses, truth) < 0.03
+    assert result.revision == ()
+    assert sum(estimate.status is Status.MATCHED for estimate in said) > 0.9 * len(said)
+
+
+def test_odometry_that_is_not_to_be_used_is_not_used(office):
+    events, truth = office
+    spoilt = [
+        Odometry(event.stamp_ns, Pose2(99.0, -5.0, 2.0)) if isinstance(event, Odometry) else event for event in events
+    ]
+    result, _ = mapped(spoilt, GraphMapperParameters(use_odometry=False))
+    assert ape_rmse(events, result.scan_poses, truth) < 0.03
+    assert np.abs(result.odometry_poses[:, 0]).max() < 40.0
+
+
+def test_a_stretch_without_returns_is_bridged(office):
+    events, truth = office
+    blind = [
+        PairedScan(replace(event.scan, ranges=np.full_like(event.scan.ranges, np.inf)), event.T_odom_base)
+        if isinstance(event, PairedScan) and 8.0 < event.scan.stamp_ns * 1e-9 % 1000 < 12.0
+        else event
+        for event in events
+    ]
+    result, said = mapped(blind)
+    skipped = [estimate for estimate in said if estimate.status is Status.NO_RETURNS]
+    assert skipped
+    assert all("0 returns" in estimate.reason for estimate in skipped)
+    assert ape_rmse(events, result.scan_poses, truth) < 0.1
+
+
+def test_slipping_wheels_and_people_do_no_harm():
+    events, truth = drive("slip", seed=2, duration_s=40.0)
+    result, _ = mapped(events)
+    assert ape_rmse(events, result.scan_poses, truth) < 0.03
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_in_a_corridor_of_twins_no_wrong_loop_is_closed(seed):
+    events, truth = drive("symmetric-corridor", seed=seed)
+    result, _ = mapped(events, seed=seed)
+    assert ape_rmse(events, result.scan_poses, truth) < 0.3, "a wrong loop is 5 m off or more"
+    assert any("ambiguous" in loop.reason for loop in result.loops)
+
+
+@pytest.mark.parametrize("what", ["nothing", "odometry", "no returns", "one scan", "standing"])
+def test_next_to_nothing_is_no_error(office, what):
+    events, _ = office
+    scan = scans_of(events)[0]
+    told = {
+        "nothing": [],
+        "odometry": [event for event in events if isinstance(event, Odometry)][:20],
+        "no returns": [
+            PairedScan(replace(scan.scan, ranges=np.full_like(scan.scan.ranges, np.nan)), Pose2(float(k)))
+            for k in range(5)
+        ],
+        "one scan": [scan],
+        "standing": [scan] * 5,
+    }[what]
+    result, said = mapped(told)
+    assert len(said) == len(told)
+    assert len(result.scan_poses) + len(result.odometry_poses) == len(told)
+    assert result.quality.keyscans == (1 if what in ("one scan", "standing") else 0)
+    assert result.quality.to_dict()["loop_max"] is None

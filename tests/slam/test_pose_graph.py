@@ -1,0 +1,107 @@
+import numpy as np
+import pytest
+
+from hsloc.errors import LogFormatError, OutputError
+from hsloc.model.pose2 import compose_poses, relative_poses
+from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
+from hsloc.slam.sparse import BlockSystem
+
+TIGHT = np.diag((1e4, 1e4, 1e5))
+
+
+def circle(n=40, radius=5.0):
+    angle = 2 * np.pi * np.arange(n) / n
+    return np.column_stack((radius * np.cos(angle), radius * np.sin(angle), angle + np.pi / 2))
+
+
+def edges_of(poses, pairs, scale=np.inf):
+    pairs = np.array(pairs)
+    measured = relative_poses(poses[pairs[:, 0]], poses[pairs[:, 1]])
+    return Edges(pairs, measured, np.broadcast_to(TIGHT, (len(pairs), 3, 3)).copy(), np.full(len(pairs), scale))
+
+
+def dead_reckoned(true, edges):
+    poses = [true[0]]
+    for step in edges.measured:
+        poses.append(compose_poses(poses[-1], step)[0])
+    return np.array(poses)
+
+
+def test_a_sparse_system_is_that_of_its_dense_matrix():
+    random = np.random.default_rng(0)
+    rows, columns = np.array([0, 1, 3, 0, 0]), np.array([1, 2, 0, 3, 1])
+    off = random.normal(size=(5, 3, 3))
+    diagonal = np.broadcast_to(30.0 * np.eye(3), (4, 3, 3)).copy()
+    right = random.normal(size=(4, 3))
+    dense = np.zeros((12, 12))
+    for k in range(4):
+        dense[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += diagonal[k]
+    for i, j, block in zip(rows, columns, off, strict=True):
+        dense[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] += block
+        dense[3 * j : 3 * j + 3, 3 * i : 3 * i + 3] += block.T
+    got = BlockSystem(4, rows, columns).solve(diagonal, off, right)
+    np.testing.assert_allclose(got.reshape(-1), np.linalg.solve(dense, right.reshape(-1)), rtol=1e-9)
+
+
+def test_a_loop_takes_the_drift_out():
+    true = circle()
+    steps = edges_of(true, [(k, k + 1) for k in range(39)])
+    steps.measured[:] += np.random.default_rng(1).normal(0, (0.02, 0.02, 0.01), steps.measured.shape)
+    drifted = dead_reckoned(true, steps)
+    closed = solve_edges(drifted, Edges.joined([steps, edges_of(true, [(39, 0), (30, 2), (20, 5)])]))
+    before, after = (np.hypot(*(poses - true)[:, :2].T).max() for poses in (drifted, closed))
+    assert before > 0.3
+    assert after < 0.4 * before
+    np.testing.assert_allclose(closed[0], true[0], atol=1e-6)
+
+
+def test_a_wrong_loop_with_a_robust_weight_is_harmless():
+    true = circle()
+    steps = edges_of(true, [(k, k + 1) for k in range(39)])
+    right = edges_of(true, [(39, 0), (30, 1)], scale=1.0)
+    wrong = edges_of(true, [(35, 10)], scale=1.0)
+    wrong.measured[:] += (2.0, -1.0, 0.4)
+    poses = solve_edges(dead_reckoned(true, steps), Edges.joined([steps, right, wrong]))
+    assert np.hypot(*(poses - true)[:, :2].T).max() < 0.05
+    _, _, chi = edge_errors(poses, wrong)
+    assert chi[0] > 50.0
+
+
+def test_without_edges_nothing_moves():
+    poses = circle(5)
+    np.testing.assert_array_equal(solve_edges(poses, Edges.none()), poses)
+
+
+def test_g2o_is_read_as_it_was_written(tmp_path):
+    true = circle(7)
+    graph = PoseGraph(np.arange(7), true, edges_of(true, [(k, k + 1) for k in range(6)] + [(6, 0)]))
+    graph.write_g2o(tmp_path / "graph.g2o")
+    read = PoseGraph.read_g2o(tmp_path / "graph.g2o")
+    np.testing.assert_array_equal(read.poses, true)
+    np.testing.assert_array_equal(read.edges.pairs, graph.edges.pairs)
+    np.testing.assert_array_equal(read.edges.measured, graph.edges.measured)
+    np.testing.assert_array_equal(read.edges.information, graph.edges.information)
+    assert (tmp_path / "graph.g2o").read_text().startswith("VERTEX_SE2 0 5.0 0.0 ")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("VERTEX_SE2 0 1 2\n", "line 1"),
+        ("VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n", "vertex 1"),
+        ("VERTEX_SE2 0 nan 0 0\n", "finite"),
+        ("hello\n", "no VERTEX_SE2"),
+    ],
+)
+def test_a_damaged_g2o_is_named(tmp_path, text, message):
+    path = tmp_path / "bad.g2o"
+    path.write_text(text)
+    with pytest.raises(LogFormatError, match=message):
+        PoseGraph.read_g2o(path)
+
+
+def test_g2o_that_cannot_be_read_or_written(tmp_path):
+    with pytest.raises(LogFormatError, match=r"none\.g2o"):
+        PoseGraph.read_g2o(tmp_path / "none.g2o")
+    with pytest.raises(OutputError, match=r"x\.g2o"):
+        PoseGraph(np.zeros(1, int), np.zeros((1, 3)), Edges.none()).write_g2o(tmp_path / "no" / "x.g2o")

@@ -1,17 +1,18 @@
 """What is put side by side on the matching cases: our matchers, and peers that are installed.
 
-The peers that search get the same compiled fitness over all points of the scan, the same window and the prediction as
-one of their first candidates; what is compared is the search. small_gicp pairs points and knows no window.
+The peers that search get the same compiled fitness over all points of the scan and the same window, and begin with
+candidates of their own: given the prediction among them they do a little worse. What is compared is the search.
+small_gicp pairs points and knows no window.
 """
 
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
-from hsloc.kernels.fitness import score_sum
+from hsloc.kernels.fitness import fitness_many, score_sum
 from hsloc.matching import HarmonySearch, Hide, LikelihoodField
 from hsloc.model import Pose2
 from hsloc.model.pose2 import wrap_angle
@@ -53,10 +54,8 @@ def peers(grid: OccupancyGrid) -> tuple[list[Method], list[str]]:
     """Those that are installed, and a line for each that is not."""
     field = LikelihoodField.from_grid(grid)
     methods: list[Method] = [
-        ScipyEvolution(
-            "scipy DE, 2000 evaluations", field, {"popsize": 15, "maxiter": 43, "polish": False, "tol": 0.0}
-        ),
-        ScipyEvolution("scipy DE, its defaults", field, {}),
+        ScipyEvolution("scipy DE, 2000 evaluations", field, is_fixed=True),
+        ScipyEvolution("scipy DE, its defaults", field, is_fixed=False),
     ]
     missing = []
     makers: tuple[tuple[str, Callable[[Any], list[Method]]], ...] = (
@@ -90,17 +89,23 @@ class _Objective:
 
     def __init__(self, field: LikelihoodField, points: F64, window: Window) -> None:
         self._packed, self._scaled, self._scale = field.packed, field.scale(points), field.resolution
-        self._x, self._y, self._theta = field.to_cells(window.centre)
+        self._x, self._y, self._theta = field.to_cells(window.centre).tolist()
         self._count = max(len(points), 1)
         self.calls = 0
 
     def __call__(self, offset: F64) -> float:
         self.calls += 1
-        x, y, theta = offset
-        total = score_sum(
-            self._packed, self._scaled, self._x + x / self._scale, self._y + y / self._scale, self._theta + theta, -2.0
-        )
-        return -float(total) / self._count
+        # Plain floats: with numpy's own scalars the call would cost the peer half as much again.
+        x, y, theta = offset.tolist()
+        x, y, theta = self._x + x / self._scale, self._y + y / self._scale, self._theta + theta
+        return -score_sum(self._packed, self._scaled, x, y, theta, -2.0) / self._count
+
+    def many(self, offsets: F64) -> F64:
+        """Of offsets (3, k) at once, shape (k,)."""
+        self.calls += offsets.shape[1]
+        scale = np.array((1.0 / self._scale, 1.0 / self._scale, 1.0))
+        poses = offsets.T * scale + (self._x, self._y, self._theta)
+        return -fitness_many(self._packed, self._scaled, poses)
 
 
 def _moved(window: Window, offset: F64) -> Pose2:
@@ -109,30 +114,40 @@ def _moved(window: Window, offset: F64) -> Pose2:
 
 
 class ScipyEvolution:
-    """scipy.optimize.differential_evolution."""
+    """scipy.optimize.differential_evolution: as it comes, or in its fastest form with a fixed number of evaluations.
 
-    def __init__(self, name: str, field: LikelihoodField, options: dict[str, Any]) -> None:
+    The fastest form evaluates a whole generation of 45 rows in one call; it takes a third of the time.
+    """
+
+    _FIXED: ClassVar = {
+        "popsize": 15, "maxiter": BUDGET // 45 - 1, "tol": 0.0, "polish": False, "vectorized": True,
+        "updating": "deferred",
+    }  # fmt: skip
+
+    def __init__(self, name: str, field: LikelihoodField, *, is_fixed: bool) -> None:
         from scipy.optimize import differential_evolution
 
-        self.name, self._field, self._options = name, field, options
+        self.name, self._field, self._is_fixed = name, field, is_fixed
         self._solve: Any = differential_evolution
 
     def match(self, points: F64, window: Window, seed: int) -> tuple[Pose2, int]:
         """See `Method`."""
         objective = _Objective(self._field, points, window)
         half = window.half_widths()
-        found = self._solve(
-            objective,
-            list(zip(-half, half, strict=True)),
-            rng=np.random.default_rng(seed),
-            x0=np.zeros(3),
-            **self._options,
-        )
+        bounds = list(zip(-half, half, strict=True))
+        rng = np.random.default_rng(seed)
+        if self._is_fixed:
+            found = self._solve(objective.many, bounds, rng=rng, **self._FIXED)
+        else:
+            found = self._solve(objective, bounds, rng=rng)
         return _moved(window, found.x), objective.calls
 
 
 class MealpyHarmonySearch:
-    """mealpy's OriginalHS, 30 rows, its own rates."""
+    """mealpy's OriginalHS, with 30 rows and the rates of [M], with which it does better than with its own.
+
+    PAR is constant there: the middle of 0.55 -> 0.98.
+    """
 
     name = "mealpy OriginalHS, 2000 evaluations"
 
@@ -151,10 +166,8 @@ class MealpyHarmonySearch:
             "minmax": "min",
             "log_to": None,
         }
-        model = self._search(epoch=BUDGET // 30, pop_size=30)
-        rows = np.random.default_rng(seed).uniform(-half, half, (30, 3))
-        rows[0] = 0.0
-        best = model.solve(problem, seed=seed, starting_solutions=list(rows))
+        model = self._search(epoch=BUDGET // 30, pop_size=30, c_r=0.88, pa_r=0.765)
+        best = model.solve(problem, seed=seed)
         return _moved(window, best.solution), objective.calls
 
 

@@ -90,7 +90,7 @@ def _connect(figure: Figure, whole: Axes, part: Axes, centre: F64) -> None:
         Rectangle((corner[0], corner[1]), side, side, fill=False, edgecolor=style.INK, linewidth=1.2, zorder=8)
     )
     line = ConnectionPatch(
-        xyA=(corner[0] + side, corner[1] + side / 2), coordsA=whole.transData, xyB=(0.0, 0.62), coordsB=part.transAxes,
+        xyA=(corner[0] + side, corner[1] + side / 2), coordsA=whole.transData, xyB=(0.0, 1.0), coordsB=part.transAxes,
         color=style.MUTED, linewidth=0.9, zorder=1,
     )  # fmt: skip
     figure.add_artist(line)

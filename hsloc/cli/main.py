@@ -19,7 +19,20 @@ from hsloc.errors import HslocError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-COMMANDS = ("record", "replay", "info", "check", "eval", "convert", "reproduce", "bench", "config", "serve")
+COMMANDS = (
+    "record",
+    "replay",
+    "info",
+    "check",
+    "eval",
+    "sweep",
+    "convert",
+    "reproduce",
+    "bench",
+    "config",
+    "serve",
+    "submit",
+)
 
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_DATA_LOST = 0, 1, 2, 3
 """Exit codes: done; failed; wrong use; done, but part of the input was lost."""

@@ -105,7 +105,6 @@ class Attempt:
         job: dict[str, Any] = {
             "request": request,
             "log": self._link("input", request["log"], "log"),
-            "alignment": request.get("alignment", "none"),
             "limits": {
                 "memory_bytes": settings.job_memory_bytes,
                 "cpu_s": settings.job_cpu_s,

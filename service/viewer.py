@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hsloc.model.pose2 import Pose2, compose_poses, wrap_angles
+from hsloc.model.trajectory import Trajectory
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from hsloc.model.trajectory import Trajectory
     from hsloc.replay.run import Result
 
     Floats = NDArray[np.float64]
@@ -25,24 +26,41 @@ SIDE = 4096
 """A map with a longer side is drawn from every n-th cell."""
 
 
-def write_viewer(result: Result, folder: Path) -> None:
-    """Write `viewer.json` and `viewer-map.png`; times in seconds since the first odometry message."""
-    start = int(result.odometry.stamps_ns[0])
-    first = Pose2(*result.trajectory.poses[0]) @ Pose2(*result.odometry.poses[0]).inverse()
-    odometry = compose_poses(first.to_array(), result.odometry.poses)
+def write_viewer(result: Result, folder: Path, metrics: Mapping[str, Any]) -> None:
+    """Write `viewer.json` and `viewer-map.png`; times in seconds since the first pose.
+
+    Everything is in the frame of the map that was used or drawn: the odometry begins where the trajectory does, and the
+    reference is moved by the alignment of the metrics.
+    """
+    start = int(result.trajectory.stamps_ns[0])
     values: dict[str, Any] = {
         "map": _draw_map(result, folder / "viewer-map.png"),
         "trajectory": _path(result.trajectory.stamps_ns, result.trajectory.poses, start),
-        "odometry": _path(result.odometry.stamps_ns, odometry, start),
+        "odometry": None,
         "reference": None,
         "errors": None,
         "fitness": _columns((result.diagnostics.stamps_ns - start) / 1e9, fitness=result.diagnostics.fitness),
     }
+    if len(result.odometry) > 0:
+        first = Pose2(*result.trajectory.poses[0]) @ Pose2(*result.odometry.poses[0]).inverse()
+        values["odometry"] = _path(
+            result.odometry.stamps_ns, compose_poses(first.to_array(), result.odometry.poses), start
+        )
     if result.reference is not None and len(result.reference) > 1:
-        values["reference"] = _path(result.reference.stamps_ns, result.reference.poses, start)
-        values["errors"] = _errors(result.trajectory, result.reference, start)
+        reference = _moved(result.reference, metrics)
+        values["reference"] = _path(reference.stamps_ns, reference.poses, start)
+        values["errors"] = _errors(result.trajectory, reference, start)
     text = json.dumps(values, separators=(",", ":"), allow_nan=False)
     (folder / "viewer.json").write_text(text, encoding="utf-8")
+
+
+def _moved(reference: Trajectory, metrics: Mapping[str, Any]) -> Trajectory:
+    """The reference in the frame of the estimate."""
+    found = metrics.get("alignment_transform")
+    if not isinstance(found, dict):
+        return reference
+    T_estimate_reference = Pose2(found["x"], found["y"], found["theta"]).inverse()
+    return Trajectory(reference.stamps_ns, compose_poses(T_estimate_reference.to_array(), reference.poses))
 
 
 def _draw_map(result: Result, path: Path) -> dict[str, Any]:

@@ -70,10 +70,10 @@ def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, 
     metrics = write_results(
         result,
         folder / "output",
-        alignment=job.get("alignment", "none"),
+        alignment=job["request"].get("alignment"),
         progress=lambda share: report("write", share, 1.0, scans),
     )
-    write_viewer(result, folder / "output")
+    write_viewer(result, folder / "output", metrics)
     return {
         "metrics": {key: metrics[key] for key in ("run", "log", "scans", "ape", "losses") if key in metrics},
         "data_lost": result.losses.data_lost,
@@ -94,8 +94,8 @@ def make_spec(job: Mapping[str, Any], folder: Path) -> RunSpec:
 
     request = job["request"]
     config = from_dict(Config, request.get("config") or {}, preset(request["preset"]))
-    if request.get("matcher") is not None:
-        config = replace(config, matcher=request["matcher"])
+    chosen = {name: request[name] for name in ("matcher", "mapper") if request.get(name) is not None}
+    config = replace(config, **chosen)
     pose = request.get("initial_pose")
     read = request.get("read") or {}
     laser = read.get("laser_pose")
@@ -111,6 +111,8 @@ def make_spec(job: Mapping[str, Any], folder: Path) -> RunSpec:
         unknown_start=request["unknown_start"],
         seed=request["seed"],
         preset=request["preset"],
+        mode=request.get("mode", "auto"),
+        no_odometry=request.get("no_odometry", False),
     )
 
 

@@ -85,7 +85,7 @@ def rerun(
     changed: dict[str, Any] = {} if changes is None else changes.model_dump(exclude_unset=True)
     if changed.get("config") is not None:
         options.check(changed["config"])
-    for name in ("preset", "seed", "unknown_start"):
+    for name in ("mode", "preset", "seed", "unknown_start"):
         if changed.get(name, ...) is None:
             del changed[name]
     job = ctx.jobs.rerun(who, job_id, changed)

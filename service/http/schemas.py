@@ -63,6 +63,7 @@ class ReadRequest(Strict):
     laser_pose: PoseList | None = None
     start_s: FiniteFloat | None = None
     end_s: FiniteFloat | None = None
+    deskew: bool = False
 
 
 class JobRequest(Strict):
@@ -70,13 +71,19 @@ class JobRequest(Strict):
 
     log: Ident = Field(description="id of the uploaded log")
     map: MapFiles | None = Field(default=None, description="map; default: the one in the log")
-    mode: Literal["localise"] = "localise"
+    mode: Literal["auto", "localise", "slam"] = Field(
+        default="auto", description="auto: localise if there is a map, else draw one"
+    )
     matcher: Literal["hide", "harmony_search", "icp"] | None = None
+    mapper: Literal["graph", "point"] | None = None
     preset: Literal["default", "paper", "paper-literal"] = "default"
     seed: int = Field(default=0, ge=0, le=2**63 - 1)
     initial_pose: PoseList | None = Field(default=None, description="start: x, y (m), yaw (rad)")
     unknown_start: bool = Field(default=False, description="search the whole map, whatever the log says")
-    alignment: Literal["none", "origin", "se2"] = "none"
+    no_odometry: bool = Field(default=False, description="do not look at the log's odometry (slam alone)")
+    alignment: Literal["none", "origin", "se2"] | None = Field(
+        default=None, description="of the trajectory with the truth; default: none on a given map, se2 on a drawn one"
+    )
     read: ReadRequest | None = None
     config: dict[str, Any] | None = Field(default=None, description="parameters, on top of the preset; see /v1/options")
     webhook: Annotated[str, Field(max_length=2000, pattern=r"^https?://[^\s]+$")] | None = Field(
@@ -87,7 +94,9 @@ class JobRequest(Strict):
 class RerunRequest(Strict):
     """What to change in a job that is run again; the rest, and the seed, stay."""
 
+    mode: Literal["auto", "localise", "slam"] | None = None
     matcher: Literal["hide", "harmony_search", "icp"] | None = None
+    mapper: Literal["graph", "point"] | None = None
     preset: Literal["default", "paper", "paper-literal"] | None = None
     seed: int | None = Field(default=None, ge=0, le=2**63 - 1)
     initial_pose: PoseList | None = None

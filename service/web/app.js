@@ -72,7 +72,7 @@ for (const kind of ["dragover", "dragleave", "drop"]) {
 }
 
 function options() {
-  const found = { preset: $("preset").value, seed: Number($("seed").value), unknown_start: $("unknown").checked };
+  const found = { mode: $("mode").value, preset: $("preset").value, seed: Number($("seed").value), unknown_start: $("unknown").checked };
   if ($("matcher").value) found.matcher = $("matcher").value;
   if ($("pose").value.trim()) {
     found.initial_pose = $("pose").value.trim().split(/[\s,]+/).map(Number);

@@ -27,17 +27,22 @@ RECORDINGS = Path(__file__).parents[2] / "recordings"
 REAL = Settings().worker_command
 
 
+@pytest.mark.parametrize(
+    ("request_", "options"),
+    [
+        ({"seed": 11, "config": {"hide": {"budget": 250}}}, ["--seed", "11", "--config", "c.yaml"]),
+        ({"mode": "slam", "read": {"end_s": 20.0}}, ["--mode", "slam", "--end", "20"]),
+    ],
+)
 def test_the_result_is_that_of_hsloc_replay_byte_for_byte(
-    make_client: Callable[..., TestClient], tmp_path: Path
+    make_client: Callable[..., TestClient], tmp_path: Path, request_: dict[str, object], options: list[str]
 ) -> None:
     client = make_client(worker_command=REAL, job_memory_bytes=4 << 30)
     file = upload(client, (RECORDINGS / "office.mcap").read_bytes(), "office.mcap")
-    request = {"log": file, "seed": 11, "config": {"hide": {"budget": 250}}}
-    job = client.post("/v1/jobs", json=request).json()["id"]
+    job = client.post("/v1/jobs", json={"log": file, **request_}).json()["id"]
     (tmp_path / "c.yaml").write_text("hide: {budget: 250}\n")
-    command = [sys.executable, "-m", "hsloc.cli.main", "replay", str(RECORDINGS / "office.mcap"), "-q"]
-    command += ["--config", str(tmp_path / "c.yaml"), "--seed", "11", "--out", str(tmp_path / "out")]
-    subprocess.run(command, check=True)
+    command = [sys.executable, "-m", "hsloc.cli.main", "replay", str(RECORDINGS / "office.mcap"), "-q", *options]
+    subprocess.run([*command, "--out", str(tmp_path / "out")], check=True, cwd=tmp_path)
     ended = wait(client, job, 60.0)
     assert ended["state"] == "succeeded", ended
     names = {each["name"] for each in client.get(f"/v1/jobs/{job}/results").json()["assets"]}
@@ -50,7 +55,7 @@ def test_the_result_is_that_of_hsloc_replay_byte_for_byte(
     viewer = client.get(f"/v1/jobs/{job}/results/viewer.json").json()
     assert len(viewer["trajectory"]["x"]) == len(viewer["trajectory"]["t"]) <= 3000
     ape = ended["summary"]["metrics"]["ape"]["trans_part"]
-    assert max(viewer["errors"]["position"]) <= ape["max"] + 1e-3
+    assert max(viewer["errors"]["position"]) <= ape["max"] + 2e-3
 
 
 def chunk(compression: bytes, claimed: int, data: bytes) -> bytes:

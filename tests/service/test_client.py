@@ -1,0 +1,105 @@
+"""The client and `hsloc submit`, against servers that behave badly on purpose."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from hsloc.client import Client, ClientError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from conftest import Live
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    path = tmp_path / "run one.mcap"
+    path.write_bytes(b"ok " + os.urandom(3_000_000))
+    return path
+
+
+def test_upload_submit_wait_download_through_faults(make_live: Callable[..., Live], log: Path, tmp_path: Path) -> None:
+    live = make_live(HSLOC_FAULT_DROP_UPLOADS="0.3", HSLOC_FAULT_FAIL_REQUESTS="0.3")
+    client = Client(live.url, attempts=30, block=1_100_000)
+    seen: list[int] = []
+    ident = client.upload(log, lambda done, total: seen.append(done))
+    assert seen[-1] == log.stat().st_size
+    job = client.submit(ident, seed=4)
+    assert client.wait(job["id"], every_s=0.1)["state"] == "succeeded"
+    paths = client.download(job["id"], tmp_path / "out")
+    assert {path.name for path in paths} == {"metrics.json", "trajectory.tum"}
+    assert (tmp_path / "out" / "trajectory.tum").read_text().startswith("4 ")
+    with live.client() as plain:
+        found: list[Any] = []
+        while not found:
+            answer = plain.get("/v1/jobs")
+            found = answer.json()["jobs"] if answer.status_code == 200 else []
+    assert len(found) == 1  # however often it was sent
+
+
+def test_waiting_outlives_a_server_that_is_killed(make_live: Callable[..., Live], tmp_path: Path) -> None:
+    live = make_live()
+    (tmp_path / "slow.mcap").write_bytes(b"slow 1")
+    client = Client(live.url)
+    job = client.submit(client.upload(tmp_path / "slow.mcap"))
+    ended: list[dict[str, Any]] = []
+    waiter = threading.Thread(target=lambda: ended.append(client.wait(job["id"])))
+    waiter.start()
+    time.sleep(0.7)
+    live.end(signal.SIGKILL)
+    live.start()
+    waiter.join(20.0)
+    assert ended[0]["state"] == "succeeded"
+
+
+def test_refusals_are_told_at_once(make_live: Callable[..., Live], log: Path) -> None:
+    live = make_live(HSLOC_TOKEN="a-token-of-the-operator-0123456789", HSLOC_MAX_UPLOAD_BYTES="1M")
+    with pytest.raises(ClientError, match="send a token") as refused:
+        Client(live.url).upload(log)
+    assert refused.value.status == 401
+    with pytest.raises(ClientError, match="at most 1048576 are taken"):
+        Client(live.url, "a-token-of-the-operator-0123456789").upload(log)
+    with pytest.raises(ClientError, match="cannot be reached"):
+        Client("http://127.0.0.1:1", attempts=2).job("x")
+    with pytest.raises(ClientError, match="begins with http"):
+        Client("localhost:8000")
+    with pytest.raises(ClientError, match="cannot be read"):
+        Client(live.url).upload(log.parent / "not there")
+
+
+def submit(live: Live, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "hsloc.cli.main", "submit", "--url", live.url, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_the_command(make_live: Callable[..., Live], log: Path, tmp_path: Path) -> None:
+    live = make_live()
+    done = submit(live, str(log), "--wait", "--out", str(tmp_path / "got"), "--seed", "8")
+    assert done.returncode == 0, done.stderr
+    assert "succeeded" in done.stdout
+    assert (tmp_path / "got" / "trajectory.tum").read_text().startswith("8 ")
+    log.write_bytes(b"bad-input")
+    failed = submit(live, str(log), "--wait")
+    assert failed.returncode == 1
+    assert "run.mcap: no scan" in failed.stdout
+    missing = submit(live, str(log.parent / "nothing.mcap"))
+    assert missing.returncode == 1
+    assert missing.stderr.count("\n") == 1
+    assert "Traceback" not in missing.stderr
+
+
+def test_failing_on_purpose(make_live: Callable[..., Live], log: Path) -> None:
+    live = make_live(HSLOC_FAULT_FAIL_JOBS="1")
+    done = submit(live, str(log), "--wait")
+    assert done.returncode == 1
+    assert "fault_injection" in done.stdout

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 _GOLDEN = 0.6180339887498949
 _ALL = 10**9
-_ONE_BASIN = 0.35 * 0.35 * radians(14.0)
-"""A window of +-0.35 m and 14 degrees, m^2 rad: about what one optimum of an indoor scan draws in."""
+_ONE_BASIN = 0.2 * 0.2 * radians(8.0)
+"""A window of +-0.2 m and 8 degrees, m^2 rad: about what one optimum of an indoor scan draws in."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +48,7 @@ class HarmonySearch:
       counts improvisations alone, as the program of [P] does. The evaluations reported are the true number always.
 
     Ours, and off in the presets of the papers: `restarts` of the whole search, ended early when `agreement` of them
-    found the same best pose (one more for each time the window is four times as large as +-0.35 m, 14 degrees);
+    found the same best pose (one more for each time the window is four times as large as +-0.2 m, 8 degrees);
     `search_points`, at most so many of the scan's points, evenly chosen, while searching; `polish_iterations`
     Gauss-Newton steps on the interpolated field at the end of each restart, and for the winner on all points.
     """
@@ -63,11 +63,11 @@ class HarmonySearch:
     bandwidth_max: float = 0.3
     bandwidth_min: float = 0.003
     relative_bandwidth: bool = True
-    budget: int = 300
+    budget: int = 240
     count_improvisations: bool = False
     restarts: int = 24
     agreement: int = 2
-    search_points: int = 100
+    search_points: int = 80
     polish_iterations: int = 15
 
     def __post_init__(self) -> None:

@@ -126,7 +126,7 @@ def test_evaluations_are_counted_truly(scene):
     # 250 improvisations, 17 passes of 30 rows after every 14 of them, 30 rows to begin with.
     assert Hide.paper_literal().match(points, field, window, rng).evaluations == 30 + 250 + 17 * 30 + 1
     history = Hide().match(points, field, window, rng, keep_history=True).history
-    assert len(history) == 300
+    assert len(history) == 240
     assert (np.diff(history) >= 0.0).all()
 
 

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.model.pose2 import Pose2
+    from hsloc.slam.calibration import OdometryCalibration
     from hsloc.slam.loop_closer import Loop
     from hsloc.slam.pose_graph import PoseGraph
 
@@ -69,3 +70,5 @@ class MappingResult:
     loops: tuple[Loop, ...]
     """All that were searched for, accepted or not."""
     quality: MappingQuality
+    calibration: OdometryCalibration
+    """What the map says of the odometry."""

@@ -10,6 +10,7 @@ import numpy as np
 from hsloc.model.estimate import Status
 from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import Pose2, relative_poses, wrap_angles
+from hsloc.slam.calibration import OdometryCalibration
 from hsloc.slam.drawing import draw_grid
 from hsloc.slam.keyscans import KeyScans
 from hsloc.slam.loop_closer import Loop, LoopCloser
@@ -66,7 +67,8 @@ def finish(
     refined, passes = _refine(poses, joined, edges, parameters, lambda part: tell(0.5 + 0.4 * part))
     grid = draw_grid(refined.poses, joined, parameters.drawing)
     tell(1.0)
-    odometry_poses, scan_poses = track.corrected(refined.poses)
+    calibration = track.calibrated(refined.poses) if parameters.use_odometry else OdometryCalibration()
+    odometry_poses, scan_poses = track.corrected(refined.poses, calibration)
     return MappingResult(
         odometry_poses=odometry_poses,
         scan_poses=scan_poses,
@@ -77,6 +79,7 @@ def finish(
         graph=PoseGraph(stamps_ns, refined.poses, edges),
         loops=tuple(loops),
         quality=_quality(refined, passes, loops, loop_edges, grid, joined),
+        calibration=calibration,
     )
 
 
@@ -225,6 +228,7 @@ def _empty(track: Track) -> MappingResult:
         graph=PoseGraph(none, np.zeros((0, 3)), Edges.none()),
         loops=(),
         quality=MappingQuality(nan, nan, nan, nan, 0, 0, nan, nan, nan, nan, 0, 0, 0.0),
+        calibration=OdometryCalibration(),
     )
 
 

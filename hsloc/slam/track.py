@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.model.pose2 import Pose2, compose_poses, relative_poses, wrap_angles
+from hsloc.slam.calibration import OdometryCalibration, apply, calibrate
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -35,7 +36,13 @@ class Track:
         """Odometry of the keyscans, shape (n, 3)."""
         return np.array([self._poses[k] for k in self._keys]).reshape(-1, 3)
 
-    def corrected(self, key_poses: F64) -> tuple[F64, F64]:
+    def calibrated(self, key_poses: F64) -> OdometryCalibration:
+        """What the final poses of the keyscans say of the odometry."""
+        return calibrate(
+            self._index(), np.array(self._poses).reshape(-1, 3), np.array(self._keys, dtype=int), key_poses
+        )
+
+    def corrected(self, key_poses: F64, calibration: OdometryCalibration | None = None) -> tuple[F64, F64]:
         """Poses in the map of all odometry messages (k, 3) and of all scans (m, 3).
 
         Each event lies between two keyscans, on the odometry seen from both; what they disagree in is shared out
@@ -45,6 +52,8 @@ class Track:
         is_scan = np.array(self._is_scan, dtype=bool)
         if len(self._keys) == 0:
             return odometry[~is_scan], odometry[is_scan]
+        if calibration is not None:
+            odometry = apply(calibration, self._index(), odometry)
         steps = relative_poses(odometry[:-1], odometry[1:])
         lengths = np.hypot(steps[:, 0], steps[:, 1]) + self._turn_length * np.abs(steps[:, 2])
         way = np.concatenate(([0.0], np.cumsum(lengths)))
@@ -60,6 +69,14 @@ class Track:
         poses = from_before + fraction[:, None] * apart
         poses[:, 2] = wrap_angles(poses[:, 2])
         return poses[~is_scan], poses[is_scan]
+
+    def _index(self) -> F64:
+        """For each event the number of odometry messages before it, a scan between two messages being half-way."""
+        poses, is_scan = np.array(self._poses).reshape(-1, 3), np.array(self._is_scan, dtype=bool)
+        last = np.maximum.accumulate(np.where(is_scan, -1, np.arange(len(is_scan))))
+        between = is_scan & (last >= 0) & (poses != poses[np.maximum(last, 0)]).any(axis=1)
+        index: F64 = np.cumsum(~is_scan) + 0.5 * between
+        return np.asarray(np.maximum.accumulate(index), dtype=np.float64)
 
     def odometry(self) -> F64:
         """Odometry messages as the log told them, shape (k, 3)."""

@@ -1,0 +1,103 @@
+"""What the scans say of the odometry, once they know better: its scale, and how late it is.
+
+Wheels are a few per cent too large or too small, and a message may tell of a moment some hundredths of a second before
+or after the scan that bears its stamp. Neither matters to the keyscans; between two of them, where poses come from the
+odometry alone, both do. Delays are counted in messages, not in seconds: stamps of real logs run backwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.model.pose2 import compose_poses, relative_poses, wrap_angles
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    F64 = NDArray[np.float64]
+    I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryCalibration:
+    """The odometry is the one told `delay` messages earlier, its turns times `turn`, its way times `way`."""
+
+    delay: float = 0.0
+    way: float = 1.0
+    turn: float = 1.0
+    steps: int = 0
+    """Steps between keyscans from which this was found; 0: nothing was found."""
+
+
+_FEWEST = 100
+"""Steps without which nothing is said."""
+_DELAYS = np.arange(-10, 11) / 10.0
+"""Delays tried (messages)."""
+_OUTLIER = 0.1
+"""A step whose turn the scans see so differently (rad) slipped."""
+_GAIN = 0.97
+"""A delay must bring the error of the turns below this part of what it is without one."""
+_WORST_SCALE = 0.15
+"""A scale farther from 1 is not believed."""
+
+
+def calibrate(index: F64, odometry: F64, keys: I64, key_poses: F64) -> OdometryCalibration:
+    """Find the calibration that brings the steps of the odometry nearest to those of the keyscans.
+
+    `odometry` (n, 3) are poses told at `index` (n,), counted in messages; rows `keys` (m,) are keyscans, in the end at
+    `key_poses` (m, 3).
+    """
+    seen = relative_poses(key_poses[:-1], key_poses[1:])
+    if len(seen) < _FEWEST:
+        return OdometryCalibration()
+
+    def turns(delay: float) -> tuple[F64, float]:
+        told = delayed(index, odometry, delay)[keys]
+        steps = relative_poses(told[:-1], told[1:])
+        error = np.abs(wrap_angles(steps[:, 2] - seen[:, 2]))
+        return steps, float(np.minimum(error, _OUTLIER).mean())
+
+    errors = [turns(float(delay))[1] for delay in _DELAYS]
+    best = int(np.argmin(errors))
+    delay = float(_DELAYS[best]) if errors[best] < _GAIN * turns(0.0)[1] else 0.0
+    steps, _ = turns(delay)
+    fair = np.abs(wrap_angles(steps[:, 2] - seen[:, 2])) < _OUTLIER
+    forward, sideways = steps[fair, :2].T
+    way = _scale(np.concatenate((forward, sideways)), np.concatenate((seen[fair, 0], seen[fair, 1])))
+    return OdometryCalibration(delay, way, _scale(steps[fair, 2], seen[fair, 2]), int(fair.sum()))
+
+
+def _scale(told: F64, seen: F64) -> float:
+    """Least squares, held towards 1 by as much as a hundred steps of average length would."""
+    power = float((told**2).sum())
+    prior = 100.0 * power / max(len(told), 1)
+    scale = (float((told * seen).sum()) + prior) / (power + prior) if power > 0.0 else 1.0
+    return scale if abs(scale - 1.0) <= _WORST_SCALE else 1.0
+
+
+def apply(calibration: OdometryCalibration, index: F64, odometry: F64) -> F64:
+    """The odometry as it should have been, shape (n, 3); the first pose stays."""
+    told = delayed(index, odometry, calibration.delay)
+    if calibration.way == 1.0 and calibration.turn == 1.0:
+        return told
+    steps = relative_poses(told[:-1], told[1:]) * (calibration.way, calibration.way, calibration.turn)
+    theta = told[0, 2] + np.concatenate(([0.0], np.cumsum(steps[:, 2])))
+    c, s = np.cos(theta[:-1]), np.sin(theta[:-1])
+    x = told[0, 0] + np.concatenate(([0.0], np.cumsum(c * steps[:, 0] - s * steps[:, 1])))
+    y = told[0, 1] + np.concatenate(([0.0], np.cumsum(s * steps[:, 0] + c * steps[:, 1])))
+    return np.column_stack((x, y, wrap_angles(theta)))
+
+
+def delayed(index: F64, odometry: F64, delay: float) -> F64:
+    """The poses told `delay` messages before each, interpolated, shape (n, 3); `index` never decreases."""
+    if delay == 0.0:
+        return odometry
+    wanted = np.clip(index - delay, index[0], index[-1])
+    after = np.clip(np.searchsorted(index, wanted, side="right"), 1, len(index) - 1)
+    span = index[after] - index[after - 1]
+    fraction = np.where(span > 0.0, (wanted - index[after - 1]) / np.maximum(span, 1e-12), 0.0)
+    step = relative_poses(odometry[after - 1], odometry[after])
+    return compose_poses(odometry[after - 1], step * fraction[:, None])

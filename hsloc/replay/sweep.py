@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import threading
 import traceback
 from concurrent.futures import BrokenExecutor, CancelledError, as_completed
 from dataclasses import dataclass, fields
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 KEY_FILE = "sweep_key.json"
 """In a run's folder: what it was made of."""
+STOP = threading.Event()
+"""Set in a process, it has the runs there end at the next scan, in good order, with KeyboardInterrupt."""
 DONE, SKIPPED, FAILED = "done", "skipped", "failed"
 
 
@@ -146,9 +149,9 @@ def do_run(item: SweepRun, folder: Path, key: str) -> Outcome:
     """One run, in whatever process the executor chose; raises nothing but BaseException."""
     target = folder / item.name
     try:
-        result = run(item.spec)
+        result = run(item.spec, _heed_stop)
         # Only what looks like a run of ours is replaced.
-        values = write_results(result, target, overwrite=(target / "metrics.json").exists())
+        values = write_results(result, target, overwrite=(target / "metrics.json").exists(), progress=_heed_stop)
         (target / KEY_FILE).write_text(json.dumps({"key": key}) + "\n", encoding="utf-8")
         return Outcome(item, DONE, target, values, timings(result))
     except HslocError as error:
@@ -158,6 +161,11 @@ def do_run(item: SweepRun, folder: Path, key: str) -> Outcome:
         trace = folder / f"{item.name}.error.txt"
         trace.write_text(traceback.format_exc(), encoding="utf-8")
         return Outcome(item, FAILED, target, error=f"{type(error).__name__}: {reason} (see {trace})")
+
+
+def _heed_stop(_: object) -> None:
+    if STOP.is_set():
+        raise KeyboardInterrupt
 
 
 def finished(item: SweepRun, folder: Path, key: str) -> Outcome | None:

@@ -9,7 +9,7 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPool
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from hsloc.replay.sweep import BROKEN, FAILED, Outcome, SweepRun, sweep
+from hsloc.replay.sweep import BROKEN, FAILED, STOP, Outcome, SweepRun, sweep
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -48,31 +48,12 @@ def _is_broken(outcome: Outcome) -> bool:
 
 def _options() -> dict[str, Any]:
     # A fork would copy the compiler's threads in any state.
-    return {"mp_context": multiprocessing.get_context("spawn"), "initializer": _ignore_interrupts}
+    return {"mp_context": multiprocessing.get_context("spawn"), "initializer": _note_interrupts}
 
 
-def _ignore_interrupts() -> None:
-    """Idle workers have nothing to interrupt."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _interruptible_call(call: Callable[..., Any], *arguments: Any) -> Any:
-    """Ctrl-C reaches a worker while it works, and never between two runs."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        return call(*arguments)
-    finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-class _Told(Executor):
-    """Passes everything on to another executor, whose workers can be interrupted."""
-
-    def __init__(self, inner: Executor) -> None:
-        self._inner = inner
-
-    def submit(self, call: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        return self._inner.submit(_interruptible_call, call, *arguments, **named)
+def _note_interrupts() -> None:
+    """Ctrl-C ends a worker's run at its next scan: an exception out of the blue would leave halves behind."""
+    signal.signal(signal.SIGINT, lambda *_: STOP.set())
 
 
 class _OneEach(Executor):
@@ -98,7 +79,7 @@ def _interruptible(pool: Executor) -> Iterator[Executor]:
     """The pool, shut down at the end; on KeyboardInterrupt its workers are interrupted first."""
     before = set(multiprocessing.active_children())
     try:
-        yield _Told(pool)
+        yield pool
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
         for process in set(multiprocessing.active_children()) - before:

@@ -26,7 +26,7 @@ from hsloc.replay.sweep_table import COLUMNS, as_csv, as_json, as_text
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 OFFICE, HALL = RECORDINGS / "office.mcap", RECORDINGS / "hall.mcap"
-SHORT = ReadOptions(end_s=1.5)
+SHORT = ReadOptions(end_s=3.0)
 DEFAULT = {"default": Config()}
 
 

@@ -138,8 +138,11 @@ def _convert(hint: Any, value: Any, base: Any, where: str) -> Any:
     raise ConfigError(f"{where} is {value!r}; it must be of type {getattr(hint, '__name__', hint)}")
 
 
-def load(path: Path, base: Config | None = None) -> Config:
-    """A configuration from a YAML file, on top of `base`."""
+def load(path: Path, base: Config | None = None, warnings: list[str] | None = None) -> Config:
+    """A configuration from a YAML file, on top of `base`.
+
+    A ROS 2 parameter file is taken as well (see `from_ros_parameters`); what it has to warn of is added to `warnings`.
+    """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
@@ -150,9 +153,78 @@ def load(path: Path, base: Config | None = None) -> Config:
     except (YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
     try:
+        if is_ros_parameters(values):
+            values, ignored = from_ros_parameters(values)
+            if warnings is not None:
+                warnings += [f"{path}: {text}" for text in ignored]
         return from_dict(Config, {} if values is None else values, base)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
+
+
+_ROS = "ros__parameters"
+_ROS_KEYS = {name: ("localiser", name) for name in ("update_min_d", "update_min_a")} | {
+    f"alpha{n}": ("localiser", "odometry_noise", f"alpha{n}") for n in range(1, 5)
+}
+"""Parameters of AMCL that mean the same here, and where they stand."""
+_ROS_FLAGS = {
+    "scan_topic": "--scan-topic",
+    "base_frame_id": "--base-frame",
+    "base_frame": "--base-frame",
+    "initial_pose": "--initial-pose",
+    "random_seed": "--seed",
+    "yaml_filename": "--map",
+}
+"""Parameters that are no matter of the configuration, but of the run."""
+
+
+def is_ros_parameters(values: Any) -> bool:
+    """Whether a YAML document is a ROS 2 parameter file: `node: {ros__parameters: {...}}`, also in namespaces."""
+    return isinstance(values, dict) and any(
+        isinstance(node, dict) and (_ROS in node or is_ros_parameters(node)) for node in values.values()
+    )
+
+
+def from_ros_parameters(values: dict[str, Any], where: str = "") -> tuple[dict[str, Any], list[str]]:
+    """Keys of `Config` from a ROS 2 parameter file, and a line for each node on what was not used.
+
+    Names are those of AMCL, in any node; where several nodes state a parameter, the last counts.
+    """
+    found: dict[str, Any] = {}
+    ignored: list[str] = []
+    for name, node in values.items():
+        if not isinstance(node, dict):
+            ignored.append(f"{where}{name} is ignored")
+        elif isinstance(node.get(_ROS), dict):
+            unused = []
+            for key, value in node[_ROS].items():
+                if key in _ROS_KEYS:
+                    _put(found, _ROS_KEYS[key], value)
+                else:
+                    flag = _ROS_FLAGS.get(key)
+                    unused.append(f"{key} (give {flag})" if flag else str(key))
+            if unused:
+                ignored.append(f"parameters of {where}{name} that are ignored: {', '.join(unused)}")
+        else:
+            inner, more = from_ros_parameters(node, f"{where}{name}/")
+            for path in _ROS_KEYS.values():
+                value = _get(inner, path)
+                if value is not None:
+                    _put(found, path, value)
+            ignored += more
+    return found, ignored
+
+
+def _put(values: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
+    for name in path[:-1]:
+        values = values.setdefault(name, {})
+    values[path[-1]] = value
+
+
+def _get(values: Any, path: tuple[str, ...]) -> Any:
+    for name in path:
+        values = values.get(name) if isinstance(values, dict) else None
+    return values
 
 
 def dump(config: Config) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -81,7 +82,9 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--matcher", choices=("hide", "harmony_search", "hs", "icp"), help="default: hide")
     group.add_argument("--mapper", choices=("graph", "point"), help="default: graph; point is the report's SLAM")
     group.add_argument("--preset", choices=("default", "paper", "paper-literal"), default="default", help="parameters")
-    group.add_argument("--config", type=Path, metavar="FILE", help="parameters from YAML, on top of the preset")
+    group.add_argument(
+        "--config", type=Path, metavar="FILE", help="parameters from YAML (also of a ROS 2 node), on top of the preset"
+    )
     group.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of all randomness (default: 0)")
 
 
@@ -100,7 +103,10 @@ def config(arguments: argparse.Namespace) -> Config:
 
     chosen = preset(arguments.preset)
     if arguments.config is not None:
-        chosen = load(arguments.config, chosen)
+        ignored: list[str] = []
+        chosen = load(arguments.config, chosen, ignored)
+        for line in ignored:
+            print(f"hsloc: warning: {line}", file=sys.stderr)
     if arguments.matcher is not None:
         chosen = replace(chosen, matcher="harmony_search" if arguments.matcher == "hs" else arguments.matcher)
     if arguments.mapper is not None:

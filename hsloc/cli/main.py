@@ -30,6 +30,7 @@ COMMANDS = (
     "reproduce",
     "bench",
     "config",
+    "completion",
     "serve",
     "submit",
 )

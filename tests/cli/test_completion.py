@@ -1,0 +1,42 @@
+"""Completion: generated from the parser, so nothing is forgotten; bash is asked for real."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+
+import pytest
+
+from hsloc.cli.main import COMMANDS, main
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_every_command_is_known_to_every_shell(capsys, shell):
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert all(name in script for name in COMMANDS)
+    assert "deskew" in script
+    if shutil.which(shell):
+        subprocess.run([shell, "-n"], input=script, text=True, check=True, timeout=30)
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [("hsloc re", {"record", "replay", "reproduce"}), ("hsloc replay --unk", {"--unknown-start"})],
+)
+def test_bash_completes(capsys, words, expected):
+    assert main(["completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    asked = (
+        f"{script}\nCOMP_WORDS=({words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); COMP_LINE='{words}';"
+        "f=$(complete -p hsloc | sed 's/.*-F \\([^ ]*\\).*/\\1/'); $f; printf '%s\\n' \"${COMPREPLY[@]}\""
+    )
+    done = subprocess.run(["bash", "-c", asked], capture_output=True, text=True, check=True, timeout=30)
+    assert expected <= {word.strip() for word in done.stdout.split()}
+
+
+def test_other_shells_are_wrong_use(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["completion", "cmd"])
+    assert stop.value.code == 2

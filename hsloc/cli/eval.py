@@ -1,13 +1,14 @@
 """Compare trajectories with a reference (APE, RPE, per axis) or with checked relations; figures as evo's.
 
-Files are TUM (`t x y z qx qy qz qw`). With --relations a single file is an estimate of its own and needs no
-reference.
+Files are TUM (`t x y z qx qy qz qw`), or folders of results: where the first is one, each brings its own reference.
+With --relations a single file is an estimate of its own and needs no reference.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.errors import EvaluationError
@@ -26,7 +27,7 @@ COLUMNS = ("rmse", "mean", "median", "std", "min", "max", "sse")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Files, how to pair and align them, and what to print."""
-    parser.add_argument("files", nargs="+", metavar="TUM", help="REFERENCE ESTIMATE [ESTIMATE ...]")
+    parser.add_argument("files", nargs="+", metavar="TUM", help="REFERENCE ESTIMATE ..., or RESULTS ...")
     parser.add_argument(
         "--alignment", "-a", choices=("none", "origin", "se2", "se3"), default="none",
         help="move the estimate onto the reference first: by its first pose, or by least squares (default: none)",
@@ -62,8 +63,10 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.evaluation.tum import read_tum
 
     files: list[str] = arguments.files
-    alone = arguments.relations is not None and (arguments.no_reference or len(files) == 1)
-    if not alone and len(files) == 1:
+    # The results of a run bring their own reference.
+    own = Path(files[0]).is_dir() and not arguments.no_reference
+    alone = arguments.relations is not None and (arguments.no_reference or (len(files) == 1 and not own))
+    if not alone and not own and len(files) == 1:
         print("hsloc eval: error: give REFERENCE and at least one ESTIMATE, or --relations", file=sys.stderr)
         return 2
     if arguments.no_reference and arguments.relations is None:
@@ -71,14 +74,21 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     delta = Delta(arguments.delta, arguments.delta_unit, arguments.all_pairs)
     relations = None if arguments.relations is None else read_relations(arguments.relations)
-    reference = None if alone else read_tum(files[0])
+    reference = None if alone or own else read_tum(files[0])
     results = {
-        path: _evaluate(path, read_tum(path), reference, relations, delta, arguments)
-        for path in files[0 if alone else 1 :]
+        path: _evaluate(
+            path,
+            read_tum(_inside(path, "trajectory.tum")),
+            read_tum(_inside(path, "reference.tum")) if own else reference,
+            relations,
+            delta,
+            arguments,
+        )
+        for path in files[0 if alone or own else 1 :]
     }
     if arguments.json:
         document = {
-            "reference": None if alone else files[0],
+            "reference": None if alone or own else files[0],
             "relations": arguments.relations,
             "estimates": [
                 {
@@ -93,6 +103,11 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print("\n".join(_report(results, delta)))
     return 0
+
+
+def _inside(path: str, name: str) -> str:
+    """The file of a folder of results; a file is meant itself."""
+    return str(Path(path) / name) if Path(path).is_dir() else path
 
 
 Result = tuple["Evaluation | None", "RelationsResult | None"]

@@ -101,3 +101,24 @@ def test_mistakes(files, capsys):
     with pytest.raises(EvaluationError, match=r"good\.tum: no pose of the estimate .* overlap by 0\.000 s"):
         run("reference.tum", "good.tum", "--t-offset", "1000")
     assert capsys.readouterr().out == ""
+
+
+def test_folders_of_results_bring_their_own_reference(files, capsys, tmp_path):
+    reference, estimates = files
+    for name, estimate in zip(("first", "second"), estimates, strict=True):
+        (tmp_path / name).mkdir()
+        write_tum(tmp_path / name / "trajectory.tum", estimate)
+        write_tum(tmp_path / name / "reference.tum", reference)
+    assert run("first", "second", "--json") == 0
+    alone = json.loads(capsys.readouterr().out)
+    assert [entry["estimate"] for entry in alone["estimates"]] == ["first", "second"]
+    assert alone["reference"] is None
+    assert run("reference.tum", "first", "bad.tum", "--json") == 0
+    named = json.loads(capsys.readouterr().out)
+    for a, b in zip(alone["estimates"], named["estimates"], strict=True):
+        assert a["ape"] == b["ape"]
+    assert run("first") == 0
+    assert "APE translation" in capsys.readouterr().out
+    (tmp_path / "second" / "reference.tum").unlink()
+    with pytest.raises(EvaluationError, match=r"second.reference\.tum"):
+        run("first", "second")

@@ -14,6 +14,7 @@ class ProgressLine:
     def __init__(self, quiet: bool = False) -> None:
         self._on = not quiet and sys.stderr.isatty()
         self._begin = time.monotonic()
+        self._phase = ""
         self._next = 0.0
         self._length = 0
 
@@ -25,12 +26,14 @@ class ProgressLine:
 
     @property
     def elapsed(self) -> float:
-        """Seconds since it began."""
+        """Seconds since the phase began."""
         return time.monotonic() - self._begin
 
     def show(self, phase: str, share: float, note: str = "") -> None:
         """A bar at `share` of 1, at most ten times a second."""
         now = time.monotonic()
+        if phase != self._phase:
+            self._phase, self._begin = phase, now
         if not self._on or now < self._next:
             return
         self._next = now + _EVERY

@@ -38,6 +38,8 @@ _DELAYS = np.arange(-10, 11) / 10.0
 """Delays tried (messages)."""
 _OUTLIER = 0.1
 """A step whose turn the scans see so differently (rad) slipped."""
+_STRETCH = 20
+"""Steps in a row over which turns are compared."""
 _GAIN = 0.97
 """A delay must bring the error of the turns below this part of what it is without one."""
 _WORST_SCALE = 0.15
@@ -57,7 +59,8 @@ def calibrate(index: F64, odometry: F64, keys: I64, key_poses: F64) -> OdometryC
     def turns(delay: float) -> tuple[F64, float]:
         told = delayed(index, odometry, delay)[keys]
         steps = relative_poses(told[:-1], told[1:])
-        error = np.abs(wrap_angles(steps[:, 2] - seen[:, 2]))
+        # Each delay is judged with the scale that suits it best, or a wrong scale would drown it.
+        error = np.abs(wrap_angles(_turn_scale(steps, seen) * steps[:, 2] - seen[:, 2]))
         return steps, float(np.minimum(error, _OUTLIER).mean())
 
     errors = [turns(float(delay))[1] for delay in _DELAYS]
@@ -67,7 +70,19 @@ def calibrate(index: F64, odometry: F64, keys: I64, key_poses: F64) -> OdometryC
     fair = np.abs(wrap_angles(steps[:, 2] - seen[:, 2])) < _OUTLIER
     forward, sideways = steps[fair, :2].T
     way = _scale(np.concatenate((forward, sideways)), np.concatenate((seen[fair, 0], seen[fair, 1])))
-    return OdometryCalibration(delay, way, _scale(steps[fair, 2], seen[fair, 2]), int(fair.sum()))
+    return OdometryCalibration(delay, way, _turn_scale(steps, seen), int(fair.sum()))
+
+
+def _turn_scale(told: F64, seen: F64) -> float:
+    """The scale of turns, from stretches of `_STRETCH` steps.
+
+    In single steps a delay, or the interpolation that undoes it, blurs the beginning and end of every turn, and least
+    squares would take the blur for a scale.
+    """
+    fair = np.abs(wrap_angles(told[:, 2] - seen[:, 2])) < _OUTLIER
+    sums = [np.concatenate(([0.0], np.cumsum(np.where(fair, steps[:, 2], 0.0)))) for steps in (told, seen)]
+    told_turns, seen_turns = (turned[_STRETCH:] - turned[:-_STRETCH] for turned in sums)
+    return _scale(told_turns, seen_turns)
 
 
 def _scale(told: F64, seen: F64) -> float:

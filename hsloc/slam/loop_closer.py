@@ -61,10 +61,14 @@ class LoopParameters:
     """Decay of its score (m)."""
     scan_range: float = 15.0
     """Hits farther away are left out (m)."""
-    min_fitness: float = 0.55
+    min_fitness: float = 0.5
     """Of a place's points on the other place's field."""
     max_rival: float = 0.85
     """Another pose may reach at most this part of the fitness."""
+    wide: float = 2.0
+    """A window with half-widths of more metres is a wide one (m): where so much is possible, more is asked."""
+    min_lead: float = 0.11
+    """In a wide window the fitness must be so much above that of any other pose."""
     max_conflict: float = 0.1
     """At most this part of the points may lie where the other place looked through."""
     min_paired: float = 0.15
@@ -111,11 +115,19 @@ _DISTINCT = (0.8, radians(12.0))
 class LoopCloser:
     """State: poses of the places, and the loops found so far."""
 
-    def __init__(self, places: Places, scans: KeyScans, parameters: LoopParameters, rng: Generator) -> None:
+    def __init__(
+        self,
+        places: Places,
+        scans: KeyScans,
+        parameters: LoopParameters,
+        rng: Generator,
+        banned: frozenset[tuple[int, int]] = frozenset(),
+    ) -> None:
         self._places = places
         self._scans = scans
         self._parameters = parameters
         self._rng = rng
+        self._banned = banned
         self.poses = places.poses[places.reference].copy()
         self.loops: list[Loop] = []
         self._chosen = scans.chosen(_COMPARED)
@@ -166,6 +178,8 @@ class LoopCloser:
         order = np.lexsort((old[could], distance[could]))
         chosen: list[tuple[int, float]] = []
         for candidate in old[could][order]:
+            if (int(candidate), place) in self._banned:
+                continue
             if all(abs(candidate - other) > 2 for other, _ in chosen):
                 chosen.append((int(candidate), float(way[candidate])))
             if len(chosen) == p.most_candidates:
@@ -208,6 +222,10 @@ class LoopCloser:
             rival = self._rival(points, likelihood, pooled, match.pose, centre, half, half_angle)
             if not rival <= p.max_rival:
                 reason = f"ambiguous: another pose reaches {100.0 * rival:.0f} % of the fitness"
+            elif half > p.wide and match.fitness * (1.0 - rival) < p.min_lead:
+                reason = (
+                    f"ambiguous in a wide window: fitness {match.fitness:.2f}, another pose {100.0 * rival:.0f} % of it"
+                )
         covariance = match.covariance + np.diag((p.sigma_edge**2, p.sigma_edge**2, p.sigma_edge_angle**2))
         return Loop(
             old,

@@ -37,6 +37,8 @@ _ODOMETRY_FLOOR = np.diag((0.01**2, 0.01**2, 0.005**2))
 """No step of the odometry is known better than this (m^2, rad^2)."""
 _TORN = 6.0
 """A loop whose chi is larger than this once the graph is solved was wrong."""
+_MOST_TORN = 5
+"""So often at most the loops are looked for anew, each time without the worst wrong one."""
 _RESIDUAL_SCANS = 400
 """Scans whose residuals are measured."""
 
@@ -98,20 +100,33 @@ def _close_loops(
     p = parameters.loops
     turn_length = parameters.local_matching.turn_length
     places = Places.along(poses, motions, covariances, p.place_length, turn_length, _refused(local))
-    closer = LoopCloser(places, scans, p, rng)
-    closer.close(progress)
-    loops = closer.loops
-    solved = places.expand(closer.poses)
+    torn: list[Loop] = []
     while True:
-        edges = _between_keyscans(loops, places, p.robust)
-        solved = solve_edges(solved, Edges.joined([chain, edges]))
-        _, _, chi = edge_errors(solved, edges)
-        if not (chi > _TORN).any():
-            return solved, loops, edges
-        # The worst goes first: a wrong loop tears at the right ones too.
-        worst = [loop for loop in loops if loop.accepted][int(np.argmax(chi))]
-        torn = replace(worst, accepted=False, reason=f"torn: {chi.max():.0f} sigma off once the graph was solved")
-        loops = [torn if loop is worst else loop for loop in loops]
+        banned = frozenset((loop.first, loop.second) for loop in torn)
+        closer = LoopCloser(places, scans, p, rng, banned)
+        closer.close(progress)
+        solved, edges, worst = _solved(closer, places, chain, p.robust)
+        if worst is None or len(torn) >= _MOST_TORN:
+            break
+        # What was searched for after a wrong loop was searched for in wrong places: all of it once more, without it.
+        torn.append(worst)
+    loops = closer.loops
+    while worst is not None:
+        loops = [loop if loop.first != worst.first or loop.second != worst.second else worst for loop in loops]
+        closer.loops = loops
+        solved, edges, worst = _solved(closer, places, chain, p.robust)
+    return solved, [*loops, *torn], edges
+
+
+def _solved(closer: LoopCloser, places: Places, chain: Edges, robust: float) -> tuple[F64, Edges, Loop | None]:
+    """The graph of keyscans solved with the loops, and the loop that tears worst, if any does, as refused."""
+    edges = _between_keyscans(closer.loops, places, robust)
+    solved = solve_edges(places.expand(closer.poses), Edges.joined([chain, edges]))
+    _, _, chi = edge_errors(solved, edges)
+    if not (chi > _TORN).any():
+        return solved, edges, None
+    loop = closer.accepted[int(np.argmax(chi))]
+    return solved, edges, replace(loop, accepted=False, reason=f"torn: {chi.max():.0f} sigma off, the graph solved")
 
 
 def _between_keyscans(loops: list[Loop], places: Places, robust: float) -> Edges:
@@ -188,7 +203,7 @@ def _quality(
         scan_rms=refined.rms,
         conflict=refined.conflict,
         loops=len(edges),
-        loops_refused=len(loops) - len(edges),
+        loops_refused=sum(not loop.accepted for loop in loops),
         loop_median=float(np.median(distance)) if len(edges) else nan,
         loop_max=float(distance.max()) if len(edges) else nan,
         loop_angle_median_deg=float(np.degrees(np.median(angle))) if len(edges) else nan,

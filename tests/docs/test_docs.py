@@ -1,0 +1,109 @@
+"""The guides tell the truth: every command and every example in them is run, and every link leads somewhere."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hsloc.cli.main import COMMANDS, build_parser, main
+
+ROOT = Path(__file__).resolve().parents[2]
+GUIDES = sorted((ROOT / "docs").glob("*.md"))
+_BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+_EXIT = re.compile(r"#.*exit code (\d)")
+
+
+def blocks(path: Path, language: str) -> list[str]:
+    return [text for kind, text in _BLOCK.findall(path.read_text(encoding="utf-8")) if kind == language]
+
+
+def commands(path: Path) -> list[str]:
+    lines = [line for block in blocks(path, "sh") for line in block.replace("\\\n", " ").splitlines()]
+    return [line for line in lines if line.strip() and not line.startswith("#")]
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch, recordings):
+    (tmp_path / "recordings").symlink_to(recordings, target_is_directory=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run_line(line: str, capsys: pytest.CaptureFixture[str]) -> int:
+    """A line of a shell; commands of ours in this process, as starting it anew takes most of the time."""
+    words = shlex.split(line, comments=True)
+    if words[0] != "hsloc":
+        return subprocess.run(["bash", "-c", line], check=False, timeout=60).returncode
+    target = None
+    if ">" in words:
+        target = Path(words[words.index(">") + 1])
+        words = words[: words.index(">")]
+    capsys.readouterr()
+    status = main(words[1:])
+    if target is not None:
+        target.write_text(capsys.readouterr().out)
+    return status
+
+
+@pytest.mark.parametrize("path", [path for path in GUIDES if commands(path)], ids=lambda path: path.name)
+def test_every_command_of_a_guide_does_what_it_says(path, here, capsys):
+    for line in commands(path):
+        wanted = _EXIT.search(line)
+        status = run_line(line, capsys)
+        printed = capsys.readouterr()
+        assert status == (int(wanted.group(1)) if wanted else 0), f"{line}\n{printed.err}"
+        assert "Traceback" not in printed.err
+
+
+@pytest.mark.parametrize("path", [path for path in GUIDES if blocks(path, "python")], ids=lambda path: path.name)
+def test_the_examples_run_from_top_to_bottom(path, here):
+    names: dict[str, object] = {"__name__": "example"}
+    for number, block in enumerate(blocks(path, "python")):
+        exec(compile(block, f"{path.name}, example {number + 1}", "exec"), names)
+
+
+@pytest.mark.parametrize("path", [ROOT / "README.md", *GUIDES], ids=lambda path: path.name)
+def test_every_command_that_is_named_exists(path):
+    """Also those that are too long to run: the parser must take them."""
+    for line in commands(path):
+        words = shlex.split(line, comments=True)
+        if words[0] == "hsloc":
+            build_parser().parse_args(words[1 : words.index(">") if ">" in words else None])
+    flags = set(re.findall(r"--[a-z][a-z0-9-]+", " ".join(re.findall(r"`([^`]+)`", path.read_text(encoding="utf-8")))))
+    known = {text for parser in parsers() for action in parser._actions for text in action.option_strings}
+    foreign = {"--version"}
+    assert flags - known - foreign == set()
+
+
+def parsers():
+    (subparsers,) = (action for action in build_parser()._actions if action.dest == "command")
+    return subparsers.choices.values()
+
+
+@pytest.mark.parametrize("path", [ROOT / "README.md", *GUIDES], ids=lambda path: path.name)
+def test_every_link_leads_somewhere(path):
+    for link in re.findall(r"\]\(([^)#]+)", path.read_text(encoding="utf-8")):
+        if not link.startswith(("http:", "https:")):
+            assert (path.parent / link).exists(), link
+
+
+def test_every_guide_is_in_the_list():
+    text = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    assert [path.name for path in GUIDES if path.name != "README.md" and f"({path.name})" not in text] == []
+
+
+def test_the_help_of_every_command_fits_a_terminal():
+    for name in COMMANDS:
+        done = subprocess.run(
+            [sys.executable, "-m", "hsloc.cli.main", name, "--help"],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=60,
+        )
+        assert done.stdout.startswith("usage: hsloc ")

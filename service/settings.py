@@ -76,7 +76,7 @@ class Settings:
 
     header_timeout_s: float = 5.0
     """A client must send its request line and headers within this time."""
-    body_timeout_s: float = 10.0
+    body_timeout_s: float = 8.0
     """A client that sends nothing of its announced body for so long is cut off."""
     write_timeout_s: float = 60.0
     """A client that takes nothing of its answer for so long is cut off."""

@@ -13,11 +13,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+from sqlalchemy.exc import OperationalError
+
 from service.errors import no_space
 from service.settings import SettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 _ASSET_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}\Z")
@@ -126,6 +128,16 @@ class Storage:
             return
         with suppress(OSError), path.open("wb") as file:
             os.posix_fallocate(file.fileno(), 0, BALLAST_BYTES)
+
+    def with_room(self, work: Callable[[], None]) -> None:
+        """Do what frees room, even if the disk is full to the last byte: the database needs a little to delete."""
+        try:
+            work()
+        except OperationalError as error:
+            if "full" not in str(error.orig):
+                raise
+            self.drop_ballast()
+            work()
 
     def upload_path(self, file_id: str) -> Path:
         """Where the bytes of an upload are."""

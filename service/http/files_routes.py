@@ -91,7 +91,7 @@ async def delete(ctx: Ctx, who: Writer, file_id: FileId) -> None:
     """Remove an upload; refused while an active job needs it."""
     await to_thread.run_sync(ctx.files.get, who, file_id)
     with ctx.receiver.writer(file_id):
-        await to_thread.run_sync(ctx.files.delete, who, file_id)
+        await to_thread.run_sync(ctx.storage.with_room, lambda: ctx.files.delete(who, file_id))
         ctx.receiver.forget(file_id)
 
 

@@ -97,7 +97,7 @@ def rerun(
 @router.delete("/{job_id}", status_code=204, responses=problems(404, 409))
 def delete(ctx: Ctx, who: Writer, job_id: JobId) -> None:
     """Remove a job that has ended, and its results. The upload stays."""
-    ctx.jobs.delete(who, job_id)
+    ctx.storage.with_room(lambda: ctx.jobs.delete(who, job_id))
 
 
 @router.get("/{job_id}/webhooks", responses=problems(404))

@@ -131,7 +131,7 @@ async def terminate(ctx: Ctx, who: Writer, file_id: FileId) -> Response:
     """Give an upload up; the address is gone afterwards."""
     await to_thread.run_sync(ctx.files.get, who, file_id)
     with ctx.receiver.writer(file_id):
-        await to_thread.run_sync(ctx.files.delete, who, file_id)
+        await to_thread.run_sync(ctx.storage.with_room, lambda: ctx.files.delete(who, file_id))
         ctx.receiver.forget(file_id)
     return Response(status_code=204, headers={"Tus-Resumable": VERSION})
 

@@ -1,0 +1,67 @@
+"""A server to be mistreated: `hsloc serve` on loopback with the tests' fake worker, started, killed, started again."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+FAKE_WORKER = Path(__file__).parents[2] / "tests" / "service" / "fake_worker.py"
+
+
+class Server:
+    def __init__(self, data: Path, real: bool = False, **variables: str) -> None:
+        self.data = data
+        with socket.socket() as found:
+            found.bind(("127.0.0.1", 0))
+            self.port = int(found.getsockname()[1])
+        self.url = f"http://127.0.0.1:{self.port}"
+        self.process: subprocess.Popen[bytes] | None = None
+        self.variables = {"HSLOC_MIN_FREE_BYTES": "1M", **variables}
+        if not real:
+            self.variables.setdefault("HSLOC_WORKER_COMMAND", f"{sys.executable},-P,{FAKE_WORKER}")
+
+    def start(self) -> Server:
+        command = [sys.executable, "-m", "hsloc.cli.main", "serve", "--data", str(self.data), "--port", str(self.port)]
+        with (self.data.parent / f"{self.data.name}.log").open("ab") as log:
+            self.process = subprocess.Popen(command, env=os.environ | self.variables, stdout=log, stderr=log)
+        self.wait_ready()
+        return self
+
+    def wait_ready(self, seconds: float = 30.0) -> None:
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            with contextlib.suppress(OSError), urllib.request.urlopen(f"{self.url}/healthz", timeout=2.0) as answer:
+                if answer.status == 200:
+                    return
+            if self.process is not None and self.process.poll() is not None:
+                raise RuntimeError("the server ended: see its log")
+            time.sleep(0.05)
+        raise RuntimeError("the server does not answer")
+
+    def end(self, which: int = signal.SIGTERM) -> int:
+        assert self.process is not None
+        self.process.send_signal(which)
+        return self.process.wait(30.0)
+
+    def memory_mib(self, peak: bool = False) -> float:
+        assert self.process is not None
+        name = "VmHWM" if peak else "VmRSS"
+        for line in Path(f"/proc/{self.process.pid}/status").read_text().splitlines():
+            if line.startswith(name):
+                return int(line.split()[1]) / 1024
+        return 0.0
+
+
+def jobs_processes(data: Path) -> list[int]:
+    """Processes of jobs that are alive."""
+    from service.processes import marked
+
+    return list(marked((data / "instance").read_text().strip() + ":"))

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _ASSET_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}\Z")
-_MEDIA_TYPES = {
+MEDIA_TYPES = {
     ".tum": "text/plain; charset=utf-8",
     ".json": "application/json",
     ".yaml": "application/yaml",
@@ -35,6 +35,7 @@ _MEDIA_TYPES = {
     ".ply": "application/octet-stream",
     ".csv": "text/csv; charset=utf-8",
 }
+"""What results may be; anything else is application/octet-stream."""
 BALLAST_BYTES = 4 << 20
 MAX_ASSETS = 1000
 
@@ -160,7 +161,7 @@ class Storage:
                 continue
             path.chmod(0o600)
             size, digest = hash_file(path, sync=True)
-            media = _MEDIA_TYPES.get(path.suffix.lower(), "application/octet-stream")
+            media = MEDIA_TYPES.get(path.suffix.lower(), "application/octet-stream")
             assets.append(Asset(path.name, size, digest, media))
         sync_folder(output)
         output.rename(self.results / name)

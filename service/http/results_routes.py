@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from fastapi import APIRouter, Header, Path, Query
 from fastapi.responses import FileResponse, Response, StreamingResponse
@@ -13,7 +13,7 @@ from service.errors import ServiceError, not_found
 from service.http.context import Context, Ctx, Reader, problems
 from service.http.jobs_routes import JobId
 from service.http.schemas import AssetView, Manifest
-from service.storage import safe_name
+from service.storage import MEDIA_TYPES, safe_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -27,7 +27,8 @@ SANDBOX = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 )
 """A report may run its own script, but in an origin of its own and without the network."""
-_BINARY = {"description": "the bytes", "content": {"application/octet-stream": {"schema": {"type": "string"}}}}
+_KINDS = sorted({kind.partition(";")[0] for kind in MEDIA_TYPES.values()} | {"application/octet-stream"})
+_BINARY: dict[str, Any] = {"description": "the bytes", "content": {kind: {"schema": {}} for kind in _KINDS}}
 
 
 @router.get("/{job_id}/results", responses=problems(404, 409))

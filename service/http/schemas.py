@@ -77,7 +77,7 @@ class JobRequest(Strict):
     matcher: Literal["hide", "harmony_search", "icp"] | None = None
     mapper: Literal["graph", "point"] | None = None
     preset: Literal["default", "paper", "paper-literal"] = "default"
-    seed: int = Field(default=0, ge=0, le=2**63 - 1)
+    seed: int = Field(default=0, ge=0, le=2**53 - 1, description="at most what a browser counts exactly")
     initial_pose: PoseList | None = Field(default=None, description="start: x, y (m), yaw (rad)")
     unknown_start: bool = Field(default=False, description="search the whole map, whatever the log says")
     no_odometry: bool = Field(default=False, description="do not look at the log's odometry (slam alone)")
@@ -98,7 +98,7 @@ class RerunRequest(Strict):
     matcher: Literal["hide", "harmony_search", "icp"] | None = None
     mapper: Literal["graph", "point"] | None = None
     preset: Literal["default", "paper", "paper-literal"] | None = None
-    seed: int | None = Field(default=None, ge=0, le=2**63 - 1)
+    seed: int | None = Field(default=None, ge=0, le=2**53 - 1)
     initial_pose: PoseList | None = None
     unknown_start: bool | None = None
     config: dict[str, Any] | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from fastapi import APIRouter
-from fastapi.responses import PlainTextResponse
+from fastapi.responses import Response
 from prometheus_client import generate_latest
 from sqlalchemy import func, select, text
 
@@ -19,6 +19,7 @@ from service.tables import DeliveryRow, JobRow
 from service.webhooks import secret_of
 
 router = APIRouter(tags=["system"])
+_TEXT = {"description": "the metrics", "content": {"text/plain": {"schema": {"type": "string"}}}}
 
 
 @router.get("/healthz")
@@ -39,12 +40,12 @@ def readyz(ctx: Ctx) -> Health:
     return Health(status="ok")
 
 
-@router.get("/metrics", response_class=PlainTextResponse, responses=problems())
-def prometheus(ctx: Ctx, who: Admin) -> PlainTextResponse:
+@router.get("/metrics", response_class=Response, responses={200: _TEXT, **problems()})
+def prometheus(ctx: Ctx, who: Admin) -> Response:
     """Metrics of all tenants in Prometheus' text format; needs the scope `admin`."""
     del who
     _measure(ctx)
-    return PlainTextResponse(generate_latest(metrics.REGISTRY), media_type="text/plain; version=0.0.4; charset=utf-8")
+    return Response(generate_latest(metrics.REGISTRY), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
 @router.get("/v1/info", responses=problems())

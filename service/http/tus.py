@@ -41,7 +41,7 @@ router = APIRouter(prefix="/v1/tus", tags=["tus"])
 _checked = [Depends(_version)]
 
 
-@router.options("", status_code=204, responses=problems())
+@router.options("", status_code=204, response_class=Response, responses=problems())
 @router.options("/{file_id}", status_code=204, responses=problems(), include_in_schema=False)
 def options(ctx: Ctx, who: Reader) -> Response:
     """What this server can do."""
@@ -61,6 +61,7 @@ def options(ctx: Ctx, who: Reader) -> Response:
 @router.post(
     "",
     status_code=201,
+    response_class=Response,
     dependencies=_checked,
     responses=problems(409, 412, 413, 415, 460, 507),
     openapi_extra={"requestBody": {"required": False, **_BODY}},
@@ -88,7 +89,7 @@ async def create(
     return Response(status_code=201, headers={**headers, "Location": f"/v1/tus/{row.id}"})
 
 
-@router.head("/{file_id}", dependencies=_checked, responses=problems(404, 412))
+@router.head("/{file_id}", response_class=Response, dependencies=_checked, responses=problems(404, 412))
 def head(ctx: Ctx, who: Reader, file_id: FileId) -> Response:
     """How much is safe."""
     row = ctx.files.get(who, file_id)
@@ -101,6 +102,7 @@ def head(ctx: Ctx, who: Reader, file_id: FileId) -> Response:
 @router.patch(
     "/{file_id}",
     status_code=204,
+    response_class=Response,
     dependencies=_checked,
     responses=problems(404, 409, 412, 413, 415, 423, 460, 507),
     openapi_extra={"requestBody": {"required": True, **_BODY}},

@@ -8,13 +8,21 @@ import time
 from typing import TYPE_CHECKING
 
 import httpx2 as httpx
+import pytest
+from conftest import Live
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from conftest import Live
+    from collections.abc import Iterator
 
 QUICK = {"HSLOC_HEADER_TIMEOUT_S": "1", "HSLOC_BODY_TIMEOUT_S": "1", "HSLOC_WRITE_TIMEOUT_S": "2"}
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
+    """One server for all of these, impatient."""
+    server = Live(tmp_path_factory.mktemp("protocol"), **QUICK).start()
+    yield server
+    assert server.end() == 0
 
 
 def closed(lines: list[socket.socket], seconds: float) -> int:
@@ -30,8 +38,7 @@ def closed(lines: list[socket.socket], seconds: float) -> int:
     return len(lines) - len(left)
 
 
-def test_half_open_requests_are_closed_and_others_served(make_live: Callable[..., Live]) -> None:
-    live = make_live(**QUICK)
+def test_half_open_requests_are_closed_and_others_served(live: Live) -> None:
     lines = [socket.create_connection(("127.0.0.1", live.port)) for _ in range(120)]
     host = f"Host: 127.0.0.1:{live.port}\r\n"
     begin = "GET /v1/jobs HTTP/1.1\r\n" + host
@@ -53,8 +60,7 @@ def test_half_open_requests_are_closed_and_others_served(make_live: Callable[...
     assert left == []
 
 
-def test_a_header_in_drops_does_not_win_time(make_live: Callable[..., Live]) -> None:
-    live = make_live(**QUICK)
+def test_a_header_in_drops_does_not_win_time(live: Live) -> None:
     with socket.create_connection(("127.0.0.1", live.port)) as line:
         begin = time.monotonic()
         try:
@@ -68,8 +74,7 @@ def test_a_header_in_drops_does_not_win_time(make_live: Callable[..., Live]) -> 
         assert time.monotonic() - begin < 4.0
 
 
-def test_a_second_request_on_a_connection_may_take_its_time_but_not_for_ever(make_live: Callable[..., Live]) -> None:
-    live = make_live(**QUICK)
+def test_a_second_request_on_a_connection_may_take_its_time_but_not_for_ever(live: Live) -> None:
     request = f"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1:{live.port}\r\n\r\n".encode()
     with socket.create_connection(("127.0.0.1", live.port)) as line:
         for _ in range(2):
@@ -83,8 +88,7 @@ def test_a_second_request_on_a_connection_may_take_its_time_but_not_for_ever(mak
         assert closed([line], 4.0) == 1
 
 
-def test_a_slow_but_steady_upload_passes(make_live: Callable[..., Live]) -> None:
-    live = make_live(**QUICK)
+def test_a_slow_but_steady_upload_passes(live: Live) -> None:
 
     def drops() -> object:
         for _ in range(8):
@@ -95,8 +99,7 @@ def test_a_slow_but_steady_upload_passes(make_live: Callable[..., Live]) -> None
     assert (answer.status_code, answer.json()["size"]) == (201, 800)
 
 
-def test_a_client_that_takes_nothing_is_cut_off(make_live: Callable[..., Live]) -> None:
-    live = make_live(**QUICK)
+def test_a_client_that_takes_nothing_is_cut_off(live: Live) -> None:
     with socket.socket() as line:
         line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         line.connect(("127.0.0.1", live.port))

@@ -109,6 +109,9 @@ def _tell(result: Result, arguments: argparse.Namespace) -> None:
         return
     for warning in result.warnings:
         print(f"hsloc: warning: {warning}", file=sys.stderr)
+    candidates = result.summary.reference_candidates
+    if result.reference is None and candidates:
+        print(f"hsloc: the log has poses to compare with: --truth-topic {' or '.join(candidates)}", file=sys.stderr)
     for line in result.losses.lines():
         print(f"hsloc: log: {line}", file=sys.stderr)
     if arguments.verbose:

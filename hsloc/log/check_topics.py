@@ -19,6 +19,8 @@ OTHER_CLOCK_NS = 3600 * NANOSECONDS
 GAP_NS = NANOSECONDS // 10
 """A gap is longer than this, and than 2.5 usual intervals (lidars turn at 5 to 15 Hz)."""
 GAP_FACTOR = 2.5
+LONGEST_SWEEP_S = 2.0
+"""Seconds; a lidar that turns more slowly is an error of the log."""
 MAX_SPEED = 15.0
 """m/s; odometry that moves faster has jumped."""
 _BEAMS_TOLERATED = 0.1
@@ -129,7 +131,15 @@ class ScanCheck(TopicCheck):
             )  # fmt: skip
         self.frame = message.frame_id
         # Drivers round: a twentieth of a turn is no trouble.
-        end = message.stamp_ns + round(0.95 * max(len(message.ranges) - 1, 0) * max(message.time_increment, 0.0) * 1e9)
+        sweep_s = 0.95 * max(len(message.ranges) - 1, 0) * message.time_increment
+        if not 0.0 <= sweep_s < LONGEST_SWEEP_S:
+            self._findings.add(
+                Severity.WARNING, "time_increment", place,
+                f"time_increment is {message.time_increment:g} s, a turn would take {sweep_s / 0.95:g} s",
+                "repair the driver; --deskew leaves such scans as they are",
+            )  # fmt: skip
+            sweep_s = 0.0
+        end = message.stamp_ns + round(sweep_s * 1e9)
         if self._previous_end_ns is not None and self._previous_ns <= message.stamp_ns < self._previous_end_ns:
             self._findings.add(
                 Severity.WARNING, "scans_overlap", place, "scans begin before the last beam of the one before",

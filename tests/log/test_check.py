@@ -125,6 +125,12 @@ def test_scans_that_overlap_in_time(run: Run) -> None:
     assert found(run.write())["scans_overlap"] == ("warning", "/scan", 99, 1)
 
 
+@pytest.mark.parametrize("increment", [-0.01, 1.0, float("nan"), float("inf")])
+def test_times_of_beams_that_cannot_be(run: Run, increment: float) -> None:
+    run.change(10, time_increment=increment)
+    assert found(run.write()) == {"time_increment": ("warning", "/scan", 1, 10)}
+
+
 def test_scans_that_repeat_or_see_nothing(run: Run) -> None:
     run.change(30, ranges=run.scans[29].ranges)
     for k in (50, 51):

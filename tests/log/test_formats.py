@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import sys
 import time
 from functools import cache, partial
@@ -15,6 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hsloc.cli.main import main
 from hsloc.errors import LogFormatError
 from hsloc.log import foxglove
 from hsloc.log.container import Channel
@@ -229,3 +231,18 @@ def test_without_protobuf_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setitem(sys.modules, "google.protobuf", None)
     with pytest.raises(LogFormatError, match=r"pip install 'hsloc\[foxglove\]'"):
         decoder_for(channel("foxglove.LaserScan"))
+
+
+def test_a_log_with_a_localisers_transforms_offers_them_as_reference(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert main(["replay", str(source), "--out", str(first), "-q"]) == 0
+    again = ["replay", str(first / "run.mcap"), "--initial-pose=2.6,8.1,1.5707963", "--out", str(second)]
+    assert main(again) == 0
+    assert "the log has poses to compare with: --truth-topic /pose or tf" in capsys.readouterr().err
+    assert not (second / "reference.tum").exists()
+    assert main([*again, "--overwrite", "--truth-topic", "tf", "--json"]) == 0
+    metrics = json.loads(capsys.readouterr().out)
+    assert metrics["matched"] > 100
+    assert metrics["ape"]["trans_part"]["rmse"] < 0.01

@@ -10,9 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_builders import scan_payloads, write_raw, write_run
+from log_formats import foxglove_mcap, ros1_mcap
 from mcap.writer import CompressionType
 
 from hsloc.errors import HslocError
+from hsloc.log.check import check_log
 from hsloc.log.reader import open_log
 from hsloc.log.summary import ReadOptions
 
@@ -38,6 +40,8 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     ):
         payloads = scan_payloads(6)
         files.append(write_raw(folder / f"{number}.mcap", payloads, **options))  # type: ignore[arg-type]
+    files += [foxglove_mcap(files[0], folder / f"{encoding}.mcap", encoding) for encoding in ("json", "protobuf")]
+    files.append(ros1_mcap(files[0], folder / "ros1.mcap"))
     return [file.read_bytes() for file in files]
 
 
@@ -48,6 +52,7 @@ def read_all(path: Path) -> int:
     try:
         log = open_log(path, ALL)
         count = sum(1 for _ in log.events())
+        check_log(log)
         log.map()
         log.initial_pose()
         log.verify()
@@ -98,7 +103,7 @@ def test_every_truncation_is_a_log_with_losses_or_an_error(tmp_path: Path, seeds
     path = tmp_path / "log.mcap"
     for content in seeds:
         counts = []
-        for size in range(0, len(content), max(len(content) // 60, 1)):
+        for size in range(0, len(content), max(len(content) // 30, 1)):
             path.write_bytes(content[:size])
             counts.append(read_all(path))
         # More of the file is never fewer events.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import LogFormatError, OutputError
-from hsloc.kernels.surfels import add_edges
+from hsloc.kernels.normal_equations import add_edges
 from hsloc.model.pose2 import wrap_angles
 from hsloc.slam.sparse import BlockSystem
 

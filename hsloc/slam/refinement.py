@@ -2,7 +2,7 @@
 
 Where a scan-to-map matcher holds the map fixed, here both sides of each pair may move, and all pairs are solved for
 at once (a bundle adjustment of planar scans). Each round associates anew, assembles the normal equations of all pairs
-(hsloc/kernels/surfels.py) and of the edges, the odometry among them, and solves them sparsely.
+(hsloc/kernels/normal_equations.py) and of the edges, the odometry among them, and solves them sparsely.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import ConfigError
-from hsloc.kernels.surfels import add_edges, assemble_pairs
+from hsloc.kernels.normal_equations import add_edges, assemble_pairs
 from hsloc.model.pose2 import wrap_angles
 from hsloc.slam.pose_graph import moved_by, solve_anchored
 from hsloc.slam.sparse import BlockSystem

@@ -1,0 +1,209 @@
+"""The normal equations of poses that pull at each other: pairs of scans, and edges of a pose graph.
+
+A term in the pose of one scan seen from another (`hsloc.kernels.surfels.pair_terms`, or what an edge measured) is moved
+onto the two poses in the map, and added to the 3x3 blocks of a sparse symmetric system.
+"""
+
+from __future__ import annotations
+
+from math import cos, pi, sin
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+from hsloc.kernels.surfels import pair_terms
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    F32 = NDArray[np.float32]
+    F64 = NDArray[np.float64]
+    I32 = NDArray[np.int32]
+    I64 = NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True)
+def relative(first: F64, second: F64, out: F64) -> None:
+    """`first^-1 @ second` of two poses (x, y, theta); theta is not wrapped."""
+    c = cos(first[2])
+    s = sin(first[2])
+    dx = second[0] - first[0]
+    dy = second[1] - first[1]
+    out[0] = c * dx + s * dy
+    out[1] = -s * dx + c * dy
+    out[2] = second[2] - first[2]
+
+
+@njit(cache=True, nogil=True)
+def add_relative_term(
+    pose_j: F64, rel: F64, information: F64, gradient: F64, hjj: F64, hji: F64, hii: F64, gj: F64, gi: F64, ha: F64
+) -> None:
+    """Move a term in the pose of i seen from j, `rel`, onto the two poses in the map, adding to the five blocks.
+
+    With rel = R_j^T (t_i - t_j), theta_i - theta_j: A = d rel / d pose_i, B = d rel / d pose_j.
+    `ha` (3, 3) is scratch; matrices this small are faster by hand than by BLAS.
+    """
+    c = cos(pose_j[2])
+    s = sin(pose_j[2])
+    # H A: A turns (x, y) by -theta_j.
+    for k in range(3):
+        hx = information[k, 0]
+        hy = information[k, 1]
+        ha[k, 0] = hx * c - hy * s
+        ha[k, 1] = hx * s + hy * c
+        ha[k, 2] = information[k, 2]
+    for k in range(3):
+        # A^T (H A), rows first
+        x = ha[0, k]
+        y = ha[1, k]
+        ax = c * x - s * y
+        ay = s * x + c * y
+        at = ha[2, k]
+        hii[0, k] += ax
+        hii[1, k] += ay
+        hii[2, k] += at
+        # B = -A but for its last column, (rel_y, -rel_x, -1).
+        hji[0, k] -= ax
+        hji[1, k] -= ay
+        hji[2, k] += rel[1] * x - rel[0] * y - at
+    # H_jj = B^T H B = B^T H (-A) but for the last column, which is B^T H b.
+    bx = rel[1] * information[0, 0] - rel[0] * information[0, 1] - information[0, 2]
+    by = rel[1] * information[1, 0] - rel[0] * information[1, 1] - information[1, 2]
+    bt = rel[1] * information[2, 0] - rel[0] * information[2, 1] - information[2, 2]
+    cross_x = -(c * bx - s * by)
+    cross_y = -(s * bx + c * by)
+    for k in range(2):
+        x = ha[0, k]
+        y = ha[1, k]
+        hjj[0, k] += c * x - s * y
+        hjj[1, k] += s * x + c * y
+    hjj[0, 2] += cross_x
+    hjj[1, 2] += cross_y
+    hjj[2, 0] += cross_x
+    hjj[2, 1] += cross_y
+    hjj[2, 2] += rel[1] * bx - rel[0] * by - bt
+    ax = c * gradient[0] - s * gradient[1]
+    ay = s * gradient[0] + c * gradient[1]
+    gi[0] += ax
+    gi[1] += ay
+    gi[2] += gradient[2]
+    gj[0] -= ax
+    gj[1] -= ay
+    gj[2] += rel[1] * gradient[0] - rel[0] * gradient[1] - gradient[2]
+
+
+@njit(cache=True, nogil=True)
+def assemble_pairs(
+    poses: F64,
+    pairs: I64,
+    pair_weights: F64,
+    points: F32,
+    normals: F32,
+    centroids: F32,
+    start: I64,
+    hit_of_beam: I32,
+    ranges: F32,
+    table_start: I64,
+    geometry: F64,
+    chosen_hits: I32,
+    chosen_start: I64,
+    gate: float,
+    scale: float,
+    diagonal: F64,
+    off_diagonal: F64,
+    right: F64,
+    counts: F64,
+) -> float:
+    """The equations of all pairs (m, 2) of scans, either scan against the other, at `poses` (n, 3).
+
+    Adds to `diagonal` (n, 3, 3) and `right` (n, 3); overwrites `off_diagonal` (m, 3, 3), the block of rows
+    pairs[:, 0] and columns pairs[:, 1], and `counts` (m, 5), the sum over both directions (see `pair_terms`). Returns
+    the sum of weighted squares.
+    """
+    information = np.empty((3, 3))
+    gradient = np.empty(3)
+    rel = np.empty(3)
+    tally = np.empty(5)
+    total = 0.0
+    transposed = np.empty((3, 3))
+    ha = np.empty((3, 3))
+    for m in range(len(pairs)):
+        off_diagonal[m] = 0.0
+        counts[m] = 0.0
+        weight = pair_weights[m]
+        for direction in range(2):
+            j = pairs[m, direction]
+            i = pairs[m, 1 - direction]
+            relative(poses[j], poses[i], rel)
+            pair_terms(
+                i, j, rel[0], rel[1], rel[2], points, normals, centroids, start, hit_of_beam, ranges, table_start,
+                geometry, chosen_hits, chosen_start, gate, scale, information, gradient, tally,
+            )  # fmt: skip
+            counts[m] += tally
+            total += weight * tally[3]
+            information *= weight
+            gradient *= weight
+            if direction == 0:
+                add_relative_term(
+                    poses[j],
+                    rel,
+                    information,
+                    gradient,
+                    diagonal[j],
+                    off_diagonal[m],
+                    diagonal[i],
+                    right[j],
+                    right[i],
+                    ha,
+                )
+            else:
+                transposed[:] = 0.0
+                add_relative_term(
+                    poses[j], rel, information, gradient, diagonal[j], transposed, diagonal[i], right[j], right[i], ha
+                )
+                off_diagonal[m] += transposed.T
+    return total
+
+
+@njit(cache=True, nogil=True)
+def add_edges(
+    poses: F64, edges: I64, measured: F64, information: F64, scale: F64, diagonal: F64, off_diagonal: F64, right: F64
+) -> float:
+    """The equations of edges (m, 2): pose `measured` (m, 3) of edges[:, 1] seen from edges[:, 0].
+
+    Adds to `diagonal` and `right`, overwrites `off_diagonal` (m, 3, 3) as in `assemble_pairs`. `scale` (m,)
+    weighs each edge down: w = scale^2 / (scale^2 + chi^2), Cauchy's weight; infinite: no robust weight. Returns the sum
+    of weighted chi^2.
+    """
+    rel = np.empty(3)
+    error = np.empty(3)
+    ha = np.empty((3, 3))
+    total = 0.0
+    for m in range(len(edges)):
+        off_diagonal[m] = 0.0
+        j = edges[m, 0]
+        i = edges[m, 1]
+        relative(poses[j], poses[i], rel)
+        for k in range(3):
+            error[k] = rel[k] - measured[m, k]
+        error[2] -= 2.0 * pi * np.round(error[2] / (2.0 * pi))
+        gradient = information[m] @ error
+        chi2 = error @ gradient
+        weight = 1.0
+        if scale[m] < np.inf:
+            weight = scale[m] ** 2 / (scale[m] ** 2 + chi2)
+        total += weight * chi2
+        add_relative_term(
+            poses[j],
+            rel,
+            weight * information[m],
+            weight * gradient,
+            diagonal[j],
+            off_diagonal[m],
+            diagonal[i],
+            right[j],
+            right[i],
+            ha,
+        )
+    return total

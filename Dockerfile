@@ -24,7 +24,7 @@ FROM ${BASE}
 RUN useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin hsloc && install -d -o 10001 -m 700 /data
 COPY --from=build /venv /venv
 COPY --from=build /opt/hsloc /opt/hsloc
-ENV PATH=/venv/bin:$PATH HSLOC_DATA=/data PORT=8000 PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 \
+ENV PATH=/venv/bin:$PATH HSLOC_SERVE_DATA=/data PORT=8000 PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 \
     NUMBA_CACHE_DIR=/tmp/hsloc/numba MPLCONFIGDIR=/tmp/hsloc/matplotlib
 USER 10001
 VOLUME /data

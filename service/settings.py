@@ -113,12 +113,12 @@ class Settings:
 def from_environment(environment: Mapping[str, str] = os.environ, **changes: Any) -> Settings:
     """Settings from `HSLOC_<NAME>` variables; `changes` (those that are not None) stand above them.
 
-    Raises SettingsError for a value that cannot be read.
+    The folder is `HSLOC_SERVE_DATA`: elsewhere `HSLOC_DATA` is where somebody keeps logs, no place to write to. Raises SettingsError for a value that cannot be read.
     """
     values: dict[str, Any] = {}
     hints = get_type_hints(Settings)
     for each in dataclasses.fields(Settings):
-        text = environment.get(f"HSLOC_{each.name.upper()}")
+        text = environment.get("HSLOC_SERVE_DATA" if each.name == "data" else f"HSLOC_{each.name.upper()}")
         if text is not None:
             values[each.name] = _parse(each.name, text, hints[each.name])
     values |= {name: value for name, value in changes.items() if value is not None}

@@ -17,7 +17,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Where to listen, where to keep, who may ask."""
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
     parser.add_argument("--port", type=int, default=8000, help="port to listen on (default: 8000)")
-    parser.add_argument("--data", type=Path, metavar="DIR", help="folder for everything (default: hsloc-data)")
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR", help="folder for everything (default: $HSLOC_SERVE_DATA, else hsloc-data)"
+    )
     parser.add_argument("--slots", type=int, metavar="N", help="jobs at the same time (default: 1)")
     parser.add_argument("--allowed-host", action="append", metavar="NAME", help="answer to this name, too; * for any")
     parser.add_argument("--retention-days", type=float, metavar="D", help="remove jobs that ended so long ago")

@@ -119,7 +119,7 @@ def test_what_goes_wrong_is_a_row(tmp_path, monkeypatch):
     assert "exists already" in outcomes[2].error
     assert (tmp_path / "out" / "hall-default-seed0" / "thesis.tex").exists()
 
-    def defect(spec):
+    def defect(spec, progress=None):
         raise ZeroDivisionError("a defect of ours")
 
     monkeypatch.setattr(sweeping, "run", defect)

@@ -194,7 +194,7 @@ def laser_scan(message: Any, get: Get) -> ScanMessage:
     intensities = _numbers(get(message, "intensities"))
     start, end = _number(get(message, "start_angle")), _number(get(message, "end_angle"))
     pose = _pose(message, get).normalised()
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         return ScanMessage(
             _stamp(message, get),
             _frame(message, get, "frame_id"),

@@ -30,7 +30,7 @@ from hsloc.model import Odometry, Pose2, Scan
 from hsloc.replay.run import Result, RunSpec, run
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from hsloc.model import Event
 
@@ -246,3 +246,17 @@ def test_a_log_with_a_localisers_transforms_offers_them_as_reference(
     metrics = json.loads(capsys.readouterr().out)
     assert metrics["matched"] > 100
     assert metrics["ape"]["trans_part"]["rmse"] < 0.01
+
+
+def test_foxgloves_transforms_are_found_under_any_name(source: Path, tmp_path: Path) -> None:
+    def renamed() -> Iterator[formats.Message]:
+        for schema, channel, log_time, data in formats.messages(path):
+            if channel.topic != "/odom":
+                channel.topic = channel.topic.replace("/tf", "/transforms").replace("/transforms_static", "/transforms")
+                yield schema, channel, log_time, data
+
+    path = formats.foxglove_mcap(source, tmp_path / "all.mcap", "protobuf")
+    log = open_log(formats.write(tmp_path / "renamed.mcap", renamed(), source))
+    assert (log.summary.odom_topic, log.summary.base_frame, log.summary.extrinsics) == ("/tf", "base_link", "/tf")
+    expected = open_log(source, ReadOptions(odom_topic="tf")).events()
+    assert [values(event) for event in log.events()] == [values(event) for event in expected]

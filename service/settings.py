@@ -113,7 +113,8 @@ class Settings:
 def from_environment(environment: Mapping[str, str] = os.environ, **changes: Any) -> Settings:
     """Settings from `HSLOC_<NAME>` variables; `changes` (those that are not None) stand above them.
 
-    The folder is `HSLOC_SERVE_DATA`: elsewhere `HSLOC_DATA` is where somebody keeps logs, no place to write to. Raises SettingsError for a value that cannot be read.
+    The folder is `HSLOC_SERVE_DATA`: elsewhere `HSLOC_DATA` is where somebody keeps logs, no place to write to.
+    Raises SettingsError for a value that cannot be read.
     """
     values: dict[str, Any] = {}
     hints = get_type_hints(Settings)

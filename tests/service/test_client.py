@@ -29,7 +29,7 @@ def log(tmp_path: Path) -> Path:
 
 
 def test_upload_submit_wait_download_through_faults(make_live: Callable[..., Live], log: Path, tmp_path: Path) -> None:
-    live = make_live(HSLOC_FAULT_DROP_UPLOADS="0.3", HSLOC_FAULT_FAIL_REQUESTS="0.3")
+    live = make_live(HSLOC_FAULT_DROP_UPLOADS="0.3", HSLOC_FAULT_FAIL_REQUESTS="0.15")
     client = Client(live.url, attempts=30, block=1_100_000)
     seen: list[int] = []
     ident = client.upload(log, lambda done, total: seen.append(done))

@@ -35,23 +35,26 @@ class Estimator(Protocol):
 
 
 def replay(
-    events: Iterable[Event], estimator: Estimator, *, deskew: bool = False
+    events: Iterable[Event], estimator: Estimator, *, deskew: bool = False, first: Pose2 | None = None
 ) -> Iterator[tuple[Odometry | PairedScan | Truth, Estimate | None]]:
     """Each event with what the estimator says to it (None for the truth, which it does not see)."""
-    for event in pair(events, deskew=deskew):
+    for event in pair(events, deskew=deskew, first=first):
         yield event, None if isinstance(event, Truth) else estimator.update(event)
 
 
-def pair(events: Iterable[Event], *, deskew: bool = False) -> Iterator[Odometry | PairedScan | Truth]:
+def pair(
+    events: Iterable[Event], *, deskew: bool = False, first: Pose2 | None = None
+) -> Iterator[Odometry | PairedScan | Truth]:
     """Pair the scans with odometry, and deskew them if asked for; other events pass through in their order.
 
-    A log without any odometry gives scans paired with the identity.
+    `first` is the first odometry to come, where it is known: scans long before it are paired with it, else with the
+    identity, as those of a log without any odometry are.
     """
-    paired = _pair(events)
+    paired = _pair(events, IDENTITY if first is None else first)
     return deskewed(paired) if deskew else paired
 
 
-def _pair(events: Iterable[Event]) -> Iterator[Odometry | PairedScan | Truth]:
+def _pair(events: Iterable[Event], first: Pose2) -> Iterator[Odometry | PairedScan | Truth]:
     recent: deque[Odometry] = deque(maxlen=_RECENT)
     waiting: deque[Scan] = deque()
     for event in events:
@@ -64,20 +67,25 @@ def _pair(events: Iterable[Event]) -> Iterator[Odometry | PairedScan | Truth]:
                 continue
             waiting.append(event)
             if len(waiting) > _WAITING:
-                yield _paired(waiting.popleft(), recent, None)
+                yield _paired(waiting.popleft(), recent, None, first)
         else:
-            while waiting and waiting[0].stamp_ns < event.stamp_ns:
-                yield _paired(waiting.popleft(), recent, event)
+            while waiting and _earliest(waiting) < event.stamp_ns:
+                yield _paired(waiting.popleft(), recent, event, first)
             recent.append(event)
             yield event
-            while waiting and waiting[0].stamp_ns <= event.stamp_ns:
-                yield _paired(waiting.popleft(), recent, None)
+            while waiting and _earliest(waiting) <= event.stamp_ns:
+                yield _paired(waiting.popleft(), recent, None, first)
     while waiting:
-        yield _paired(waiting.popleft(), recent, None)
+        yield _paired(waiting.popleft(), recent, None, first)
 
 
-def _paired(scan: Scan, recent: deque[Odometry], following: Odometry | None) -> PairedScan:
-    return PairedScan(scan, _at(scan.stamp_ns, recent, following))
+def _earliest(waiting: deque[Scan]) -> int:
+    """Scans keep their order: one with a stamp from the future may not hold up those behind it."""
+    return min(scan.stamp_ns for scan in waiting)
+
+
+def _paired(scan: Scan, recent: deque[Odometry], following: Odometry | None, first: Pose2) -> PairedScan:
+    return PairedScan(scan, _at(scan.stamp_ns, recent, following, first))
 
 
 def _exact(recent: deque[Odometry], stamp_ns: int) -> Pose2 | None:
@@ -87,8 +95,8 @@ def _exact(recent: deque[Odometry], stamp_ns: int) -> Pose2 | None:
     return None
 
 
-def _at(stamp_ns: int, recent: deque[Odometry], following: Odometry | None) -> Pose2:
-    """The odometry at a stamp: exact, else between neighbours in the log that enclose it, else the last."""
+def _at(stamp_ns: int, recent: deque[Odometry], following: Odometry | None, first: Pose2) -> Pose2:
+    """The odometry at a stamp: exact, else between neighbours in the log that enclose it, else the last one told."""
     exact = _exact(recent, stamp_ns)
     if exact is not None:
         return exact
@@ -98,6 +106,6 @@ def _at(stamp_ns: int, recent: deque[Odometry], following: Odometry | None) -> P
             fraction = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
             return before.T_odom_base.interpolate(after.T_odom_base, fraction)
         after = before
-    if recent:
+    if recent and (following is None or following.stamp_ns >= stamp_ns):
         return recent[-1].T_odom_base
-    return following.T_odom_base if following is not None else IDENTITY
+    return following.T_odom_base if following is not None else first

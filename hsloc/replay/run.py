@@ -21,6 +21,7 @@ from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
 from hsloc.replay.engine import replay
 from hsloc.replay.recording import Recording
+from hsloc.replay.start import find_start, first_odometry
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.point_mapper import PointMapper
 
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
     from hsloc.slam.result import MappingResult
 
 
+_LONGEST_S = 1e9
+"""No log takes so many seconds; in nanoseconds it fits 64 bits."""
 MODES = ("auto", "localise", "slam")
 
 
@@ -48,9 +51,9 @@ class RunSpec:
     """What to run. The same spec on the same files gives the same result, bit for bit.
 
     `mode` is "localise", "slam" or "auto": localise if there is a map, `map_path` or the log's own, else draw one.
-    With `no_odometry` the log's odometry is not looked at (slam alone). The start is `initial_pose`, else the one the
-    log states, else unknown; with `unknown_start` it is unknown whatever the log states. `labels` are the names of the
-    logs in reports, where the files' own names say nothing.
+    With `no_odometry` the log's odometry is not looked at (slam alone). The start is `initial_pose`, else the one
+    that the log states for the time of the first event, else unknown; with `unknown_start` it is unknown whatever the
+    log states. `labels` are the names of the logs in reports, where the files' own names say nothing.
     """
 
     logs: tuple[Path, ...]
@@ -75,6 +78,7 @@ class RunSpec:
 
         if self.no_odometry and self.read.deskew:
             raise ConfigError("scans are deskewed with odometry; leave out --no-odom or --deskew")
+        _check_window(self.read.start_s, self.read.end_s)
 
     def names(self) -> tuple[str, ...]:
         """What to call the logs in reports."""
@@ -134,11 +138,17 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
     opened = time.perf_counter()
     if progress is not None:
         progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
-    estimator = _localiser(spec, log, grid) if localise else _mapper(spec)
+    if localise:
+        start, doubts = find_start(spec, log, _must(grid))
+        warnings = (*warnings, *doubts)
+        estimator: Estimator = _localiser(spec, _must(grid), start)
+    else:
+        estimator = _mapper(spec)
+    first = None if spec.no_odometry else first_odometry(log.events())
     prepared = time.perf_counter()
     recording = Recording()
     for event, estimate in replay(
-        _reported(log, _events(spec, log), recording, progress), estimator, deskew=spec.read.deskew
+        _reported(log, _events(spec, log), recording, progress), estimator, deskew=spec.read.deskew, first=first
     ):
         recording.add(event, estimate)
     replayed = time.perf_counter()
@@ -146,6 +156,9 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
         where = "between --start and --end" if _cut(spec) else f"on {log.summary.scan_topic} that could be read"
         lost = f": {'; '.join(log.losses.lines())}" if log.losses.data_lost else ""
         raise LogError(f"{spec.logs[0]}: no scan {where}{lost}")
+    if first is None and not spec.no_odometry:
+        where = "between --start and --end" if _cut(spec) else f"on {log.summary.odom_topic} that could be read"
+        raise LogError(f"{spec.logs[0]}: no odometry {where}")
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
     mapping = None
     if isinstance(estimator, PointMapper):
@@ -228,16 +241,11 @@ def _mapper(spec: RunSpec) -> Mapper | PointMapper:
     return Mapper(parameters, np.random.default_rng(spec.seed))
 
 
-def _localiser(spec: RunSpec, log: Log, given: OccupancyGrid | None) -> Estimator:
+def _localiser(spec: RunSpec, grid: OccupancyGrid, start: Pose2 | None) -> Estimator:
     from hsloc.localisation.localiser import Localiser
 
-    grid = _must(given)
     config = spec.config
     likelihood = LikelihoodField.from_grid(grid, config.likelihood_field.sigma, config.likelihood_field.margin)
-    start = spec.initial_pose
-    if start is None and not spec.unknown_start:
-        stated = log.initial_pose()
-        start = None if stated is None else stated[1]
     rng = np.random.default_rng(spec.seed)
     _warm_up(config.make_matcher(), likelihood)
     return Localiser(grid, likelihood, config.make_matcher(), config.localiser, rng, start)
@@ -262,6 +270,15 @@ def _uninterrupted() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _check_window(start: float | None, end: float | None) -> None:
+    for name, value in (("--start", start), ("--end", end)):
+        if value is not None and not abs(value) <= _LONGEST_S:
+            raise ConfigError(f"{name} is {value}; it must be a number of seconds into the log")
+    if end is not None and end <= max(start or 0.0, 0.0):
+        begin = "the beginning of the log" if start is None else f"--start {start:g}"
+        raise ConfigError(f"--end is {end:g}; it must be later than {begin}")
 
 
 def _cut(spec: RunSpec) -> bool:

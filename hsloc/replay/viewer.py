@@ -34,11 +34,12 @@ def write_recording(result: Result, path: Path, progress: Callable[[float], None
     places = _Places(result)
     mountings: set[str] = set()
     start = int(result.trajectory.stamps_ns[0])
+    first = None if result.follows_scans else Pose2.from_array(result.odometry.poses[0])
     with LogWriter(path) as writer:
         writer.metadata("hsloc", {"version": __version__, "seed": str(result.spec.seed)})
         writer.attachment("config.yaml", config_text(result).encode(), "application/yaml")
         writer.occupancy_grid(result.grid, start)
-        for event in pair(log.events(), deskew=result.spec.read.deskew):
+        for event in pair(log.events(), deskew=result.spec.read.deskew, first=first):
             if isinstance(event, PairedScan):
                 scan = event.scan
                 if scan.frame_id not in mountings:

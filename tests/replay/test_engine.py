@@ -87,3 +87,19 @@ def test_the_truth_never_reaches_the_estimator():
     assert [(type(event), estimate is None) for event, estimate in out] == [
         (Odometry, False), (Truth, True), (PairedScan, False)
     ]  # fmt: skip
+
+
+def test_scans_long_before_the_odometry_wait_where_it_begins():
+    early = [scan(k) for k in range(100)]
+    paired = [e for e in pair([*early, odometry(200, 7)], first=Pose2(7.0, 0.0, 0.0)) if isinstance(e, PairedScan)]
+    assert [event.T_odom_base.x for event in paired] == [7.0] * 100
+
+
+def test_a_scan_from_the_future_does_not_hold_up_the_others():
+    """It used to: the 64 behind it came seconds late, and were paired with the odometry of that time."""
+    events = [event for k in range(200) for event in (odometry(20 * k, k), scan(20 * k + 10))]
+    events[41] = scan(10**12)
+    found = [entry for entry in told(events) if entry[0] == "S"]
+    assert found[:20] == [("S", 20 * k + 10, k + 0.5) for k in range(20)]
+    assert found[20] == ("S", 10**12, 22.0)
+    assert found[21:-1] == [("S", 20 * k + 10, k + 0.5) for k in range(21, 199)]

@@ -17,10 +17,10 @@ def default_folder(name: str) -> Path:
 def refuse_early(folder: Path, overwrite: bool) -> None:
     """A folder that cannot be written is told before the work, not after it: raises OutputError."""
     from hsloc.errors import OutputError
+    from hsloc.replay.results import refuse_folder
 
-    if folder.exists() and not overwrite and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError(f"{folder}: exists already; choose another --out, or pass --overwrite")
-    parent = folder.absolute().parent
+    refuse_folder(folder, overwrite)
+    parent = folder.resolve().parent
     while not parent.exists():
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK):

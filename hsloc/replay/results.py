@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 __all__ = ["metrics", "timings", "write_recording", "write_results"]
 
+_OF_RESULTS = (("metrics.json", "config.yaml"), ("results.json", "report.md"))
+"""What tells a folder of results, of a run or of the report's experiments, from anything else."""
+
 
 def write_results(
     result: Result,
@@ -41,8 +44,8 @@ def write_results(
 
     Raises OutputError if the folder is there already, or cannot be written.
     """
-    if folder.exists() and not overwrite and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError(f"{folder}: exists already; choose another --out, or pass --overwrite")
+    refuse_folder(folder, overwrite)
+    folder = folder.resolve()  # "." and ".." have no name of their own, and a link stays what it is
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
         partial.mkdir(parents=True)
@@ -55,6 +58,20 @@ def write_results(
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return values
+
+
+def refuse_folder(folder: Path, overwrite: bool) -> None:
+    """Raise OutputError for a folder in use; what is no folder of results is not replaced even if asked for."""
+    try:
+        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+            return
+        is_results = any(all((folder / name).is_file() for name in names) for names in _OF_RESULTS)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be read: {error.strerror or error}") from error
+    if not overwrite:
+        raise OutputError(f"{folder}: exists already; choose another --out, or pass --overwrite")
+    if not is_results:
+        raise OutputError(f"{folder}: holds no results of hsloc, so it is not overwritten; choose another --out")
 
 
 def _write(

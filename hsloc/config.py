@@ -26,6 +26,8 @@ T = TypeVar("T")
 
 MATCHERS = ("hide", "harmony_search", "icp")
 MAPPERS = ("graph", "point")
+_SMALLEST, _LARGEST = 1e-9, 1e9
+"""No length, angle, part or count of use is smaller or larger; squares and quotients of these fit a float."""
 PRESETS = ("default", "paper", "paper-literal")
 
 
@@ -130,9 +132,13 @@ def _convert(hint: Any, value: Any, base: Any, where: str) -> Any:
     if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
         if not isfinite(value):
             raise ConfigError(f"{where} is {value}; it must be finite")
+        if value != 0 and not _SMALLEST <= abs(value) <= _LARGEST:
+            raise ConfigError(f"{where} is {value:g}; it must be 0, or from {_SMALLEST:g} to {_LARGEST:g} in size")
         return float(value)
     if typing.get_origin(hint) is tuple and isinstance(value, list | tuple):
         return tuple(value)
+    if hint is int and type(value) is int and abs(value) > _LARGEST:
+        raise ConfigError(f"{where} is {value}; it must be at most {_LARGEST:g} in size")
     if hint in (int, str, bool) and type(value) is hint:
         return value
     raise ConfigError(f"{where} is {value!r}; it must be of type {getattr(hint, '__name__', hint)}")

@@ -65,7 +65,10 @@ class LocaliserParameters:
     relocaliser: RelocaliserParameters = field(default_factory=RelocaliserParameters)
 
     def __post_init__(self) -> None:
-        for name in ("update_min_d", "update_min_a", "min_fitness"):
+        for name in ("min_points", "lost_after"):
+            if not getattr(self, name) >= 1:
+                raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be at least 1")
+        for name in ("update_min_d", "update_min_a", "min_fitness", "usual_fraction", "convincing_fraction"):
             if not getattr(self, name) >= 0.0:
                 raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be 0 or more")
         for name in ("window_sigmas", "window_min", "window_min_angle", "initial_sigma", "initial_sigma_angle"):

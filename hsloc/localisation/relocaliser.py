@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.errors import ConfigError
 from hsloc.localisation.motion import fuse, predict_covariance
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.window import Window
@@ -69,6 +70,18 @@ class RelocaliserParameters:
     """A hypothesis that is behind by this sum is dropped."""
     restart_below: float = 0.3
     """If the best falls below this mean fitness, the search begins anew."""
+
+    def __post_init__(self) -> None:
+        for name in ("sectors", "budget", "search_points", "hypotheses", "seed_scans", "min_points", "min_scans"):
+            _check(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
+        _check(self.tile > 0.0, "tile", self.tile, "positive")
+        for name in ("step_min_d", "step_min_a", "min_fitness", "lead", "drop", "restart_below"):
+            _check(getattr(self, name) >= 0.0, name, getattr(self, name), "0 or more")
+
+
+def _check(ok: bool, name: str, value: object, rule: str) -> None:
+    if not ok:
+        raise ConfigError(f"relocaliser: {name} is {value}; it must be {rule}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -41,6 +41,7 @@ class Icp:
     def __post_init__(self) -> None:
         check(self.iterations >= 1, "iterations", self.iterations, "at least 1")
         check(self.max_distance > 0.0, "max_distance", self.max_distance, "positive")
+        check(self.tolerance >= 0.0, "tolerance", self.tolerance, "0 or more")
 
     def match(self, points: F64, field: LikelihoodField, window: Window, rng: Generator) -> Match:
         """See `Matcher`; `rng` is not used."""

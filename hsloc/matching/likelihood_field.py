@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     F32 = NDArray[np.float32]
     F64 = NDArray[np.float64]
 
+_MOST_CELLS = 2e8
+"""A field needs about 30 bytes a cell while it is made: 6 GB."""
+
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class LikelihoodField:
@@ -63,6 +66,13 @@ class LikelihoodField:
         if not occupied.any():
             raise MapError("the map has no occupied cell; check occupied_thresh and negate in its YAML")
         pad = max(int(np.ceil(margin / grid.resolution)), 1)
+        cells = (occupied.shape[0] + 2 * pad) * (occupied.shape[1] + 2 * pad)
+        if cells > _MOST_CELLS:
+            raise MapError(
+                f"the field of the map, with a margin of {margin:g} m in cells of {grid.resolution:g} m, has "
+                f"{cells:.2g} cells; at most {_MOST_CELLS:.0e} fit: "
+                "choose a smaller likelihood_field.margin or a coarser map"
+            )
         distance = distance_transform_edt(~np.pad(occupied, pad)) * grid.resolution
         scores = np.exp(-distance / sigma).astype(np.float32)
         corner = (0.5 - pad) * grid.resolution
@@ -113,7 +123,8 @@ class LikelihoodField:
 
     def scale(self, points: F64) -> F32:
         """Points in metres, shape (n, 2), in cells as the kernels want them: float32, contiguous."""
-        return np.ascontiguousarray(points / self.resolution, dtype=np.float32)
+        with np.errstate(over="ignore"):  # a point too far for float32 is outside the field as infinity is, too
+            return np.ascontiguousarray(points / self.resolution, dtype=np.float32)
 
     def fitness(self, points: F64, pose: Pose2) -> float:
         """Mean score of points (n, 2), in metres and seen from `pose`; 0 for no point."""

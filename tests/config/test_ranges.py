@@ -1,0 +1,52 @@
+"""Numbers that no algorithm can work with are refused by name, before any of them is tried."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hsloc.config import Config, from_dict, to_dict
+from hsloc.errors import ConfigError, MapError
+from hsloc.matching.likelihood_field import LikelihoodField
+from hsloc.model.occupancy_grid import OccupancyGrid
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        (
+            {"localiser": {"window_min": 1e-300}},
+            "config.localiser.window_min is 1e-300; it must be 0, or from 1e-09 to",
+        ),
+        ({"localiser": {"window_sigmas": 1e300}}, "window_sigmas is 1e"),
+        ({"likelihood_field": {"sigma": 1e-300}}, "sigma is 1e-300"),
+        ({"hide": {"budget": 10**30}}, "budget is 1000000000000000000000000000000; it must be at most"),
+        ({"localiser": {"relocaliser": {"sectors": 0}}}, "relocaliser: sectors is 0; it must be at least 1"),
+        ({"localiser": {"relocaliser": {"tile": -1.0}}}, "relocaliser: tile is -1.0; it must be positive"),
+        ({"localiser": {"lost_after": 0}}, "localiser: lost_after is 0; it must be at least 1"),
+        ({"localiser": {"usual_fraction": -1}}, "usual_fraction is -1"),
+        ({"icp": {"tolerance": -1.0}}, "tolerance is -1.0"),
+    ],
+)
+def test_a_number_out_of_all_range_is_refused(values, expected):
+    with pytest.raises(ConfigError) as told:
+        from_dict(Config, values)
+    assert expected in str(told.value)
+
+
+def test_the_defaults_are_within_the_ranges():
+    assert from_dict(Config, to_dict(Config())) == Config()
+
+
+def test_a_field_that_fits_no_memory_is_refused():
+    grid = OccupancyGrid(np.full((3, 3), 100, dtype=np.int8), 0.05)
+    with pytest.raises(MapError, match=r"choose a smaller likelihood_field\.margin or a coarser map"):
+        LikelihoodField.from_grid(grid, margin=1e9)
+
+
+def test_points_beyond_all_range_score_nothing():
+    field = LikelihoodField.from_grid(OccupancyGrid(np.full((3, 3), 100, dtype=np.int8), 0.05))
+    points = np.array(((1e38, 0.0), (3e38, 3e38)))
+    from hsloc.model import Pose2
+
+    assert field.fitness(points, Pose2(0.0, 0.0, 1.0)) == 0.0

@@ -132,7 +132,7 @@ def test_a_map_of_two_uploads(make_client: Callable[..., TestClient]) -> None:
     pixels = b"P5 100 100 255\n" + (b"\x00" * 100 + b"\xfe" * 100) * 50
     chart = {"yaml": upload(client, yaml, "map.yaml"), "image": upload(client, pixels, "other.pgm")}
     log = upload(client, (RECORDINGS / "paper.mcap").read_bytes(), "paper.mcap")
-    job = client.post("/v1/jobs", json={"log": log, "map": chart}).json()["id"]
+    job = client.post("/v1/jobs", json={"log": log, "map": chart, "read": {"end_s": 3.0}}).json()["id"]
     ended = wait(client, job, 30.0)
     assert ended["state"] == "succeeded", ended
     assert ended["summary"]["metrics"]["run"]["map"] == "map.yaml"

@@ -121,6 +121,7 @@ class Walk:
             opcode, length = records.PREFIX.unpack_from(head)
             following = at + records.PREFIX.size + length
             if opcode == 0 or opcode == records.MAGIC[0] or following > self.size:
+                self.index_is_whole = False  # The rest of the last chunk's index may be what is damaged.
                 resumed = self._resume(at)
                 if resumed is None:
                     break
@@ -134,6 +135,7 @@ class Walk:
             if opcode == Opcode.FOOTER:
                 finished = True
                 break
+        self.index_is_whole &= finished
         self._close_chunk()
         self._close_loose()
         if not finished:

@@ -94,6 +94,18 @@ def test_a_killed_recorder_leaves_chunks_without_index_behind_the_last(whole: Pa
     assert (losses.truncated_files, losses.damaged_chunks) == (1, 0)
 
 
+def test_a_cut_between_the_indexes_of_a_chunk_loses_none_of_its_channels(tmp_path: Path) -> None:
+    payloads = sorted(scan_payloads(20, "/front") + scan_payloads(20, "/rear"), key=lambda payload: payload[1])
+    path = write_raw(tmp_path / "log.mcap", payloads, chunk_size=10_000_000)
+    data = path.read_bytes()
+    ((at, length),) = chunks_of(data)
+    (first_index,) = struct.unpack_from("<Q", data, at + length + 1)
+    for cut in range(at + length, at + length + 9 + first_index + 40):
+        path.write_bytes(data[:cut])
+        times, losses = read(path)
+        assert (len(times), losses.truncated_files) == (40, 1), cut
+
+
 @pytest.mark.parametrize("compression", list(CompressionType))
 def test_one_damaged_chunk_is_skipped_and_counted(tmp_path: Path, compression: CompressionType) -> None:
     path = write_raw(tmp_path / "log.mcap", scan_payloads(COUNT), compression=compression)

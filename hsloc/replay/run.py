@@ -79,6 +79,8 @@ class RunSpec:
         if self.no_odometry and self.read.deskew:
             raise ConfigError("scans are deskewed with odometry; leave out --no-odom or --deskew")
         _check_window(self.read.start_s, self.read.end_s)
+        if len({path.resolve() for path in self.logs}) < len(self.logs):
+            raise ConfigError(f"{self.logs[0]}: a log is named twice; several logs must be parts of one run")
 
     def names(self) -> tuple[str, ...]:
         """What to call the logs in reports."""

@@ -101,3 +101,10 @@ def test_what_the_log_states_at_the_middle_is_known_by_its_stamp():
     stated = log.initial_pose()
     assert stated is not None
     assert stated[0] == log.summary.origin_ns
+
+
+def test_a_log_that_is_named_twice_is_refused(monkeypatch):
+    """It used to be read twice, message by message, as if each scan had been taken again."""
+    monkeypatch.chdir(OFFICE.parent)
+    with pytest.raises(ConfigError, match="a log is named twice"):
+        RunSpec(logs=(OFFICE, Path(OFFICE.name)))

@@ -114,7 +114,7 @@ class _Hypothesis:
 _NEAR = 0.5
 _NEAR_ANGLE = radians(15.0)
 _STEP_WINDOW = (0.25, radians(8.0))
-_REMEMBERED = 1000
+REMEMBERED = 1000
 """Scans of a search that are kept to retrace the way; older ones are forgotten, so that memory is bounded."""
 
 
@@ -138,7 +138,7 @@ class Relocaliser:
         self._tiles = _tiles(grid, self._parameters.tile)
         self._hypotheses: list[_Hypothesis] = []
         self._T_odom_last: Pose2 | None = None
-        self._seen: deque[tuple[int, F64, Pose2]] = deque(maxlen=_REMEMBERED)
+        self._seen: deque[tuple[int, F64, Pose2]] = deque(maxlen=REMEMBERED)
 
     def start(self) -> None:
         """Forget everything."""

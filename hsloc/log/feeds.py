@@ -69,6 +69,7 @@ class ScanFeed:
             not (isfinite(angle_min) and isfinite(increment) and range_max > 0.0)
             or abs(angle_min) > 1e3
             or abs(increment) > 1e3
+            or (increment == 0.0 and len(ranges) > 2)  # all beams in one direction: no scan of a place
         ):
             self._losses.invalid_messages[self.topic] += 1
             return ()

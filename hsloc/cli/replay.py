@@ -21,7 +21,15 @@ HELP = "localise the robot of a recorded log, or map while it goes"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Logs, map, start, output; reading; algorithms."""
     parser.add_argument("log", nargs="+", type=Path, help="MCAP, ROS 1 or ROS 2 bag, CARMEN log; several are one run")
-    parser.add_argument("--map", type=Path, metavar="YAML", help="map as nav2 writes it (default: /map in the log)")
+    parser.add_argument(
+        "--map",
+        type=Path,
+        metavar="MAP",
+        help="map as nav2 writes it, or folder or map.npz of a run that drew one (default: /map in the log)",
+    )
+    parser.add_argument(
+        "--resume", type=Path, metavar="MAP", help="extend the map of an earlier mapping run: its folder or map.npz"
+    )
     parser.add_argument(
         "--mode", choices=("auto", "localise", "slam"), default="auto", help="default: localise if there is a map"
     )
@@ -63,6 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
     spec = RunSpec(
         logs=tuple(arguments.log),
         map_path=arguments.map,
+        resume=arguments.resume,
         config=config(arguments),
         read=read_options(arguments),
         initial_pose=to_pose(arguments.initial_pose),

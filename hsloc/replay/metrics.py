@@ -84,7 +84,7 @@ def metrics(
 
 def _map_name(result: Result) -> str:
     if result.mode == "slam":
-        return "drawn"
+        return "drawn" if result.spec.resume is None else f"{result.spec.resume.name}, extended"
     return "log" if result.spec.map_path is None else result.spec.map_path.name
 
 

@@ -33,6 +33,7 @@ def command(spec: RunSpec) -> str:
     flags: tuple[tuple[str, object], ...] = (
         ("--mode", None if spec.mode == "auto" else spec.mode),
         ("--map", None if spec.map_path is None else spec.map_path.name),
+        ("--resume", None if spec.resume is None else spec.resume.name),
         ("--initial-pose", _pose(spec.initial_pose)),
         ("--scan-topic", read.scan_topic),
         ("--odom-topic", read.odom_topic),

@@ -18,6 +18,7 @@ from hsloc.maps import save_map
 from hsloc.replay.metrics import metrics, timings
 from hsloc.replay.provenance import config_text, provenance
 from hsloc.replay.viewer import write_recording
+from hsloc.slam.state import STATE_FILE, write_state
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -92,6 +93,8 @@ def _write(
         save_map(result.grid, folder)
     if result.mapping is not None:
         result.mapping.graph.write_g2o(folder / "graph.g2o")
+        if result.mapping.state is not None:
+            write_state(result.mapping.state, folder / STATE_FILE)
     write_json(folder / "metrics.json", values)
     write_json(folder / "timings.json", timings(result))
     (folder / "config.yaml").write_text(config_text(result), encoding="utf-8")

@@ -21,8 +21,9 @@ from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
 from hsloc.replay.engine import replay
 from hsloc.replay.recording import Recording
+from hsloc.replay.saved_maps import load_grid, load_state
 from hsloc.replay.start import find_start, first_odometry
-from hsloc.slam.mapper import Mapper
+from hsloc.slam.mapper import Mapper, Resume
 from hsloc.slam.point_mapper import PointMapper
 
 if TYPE_CHECKING:
@@ -38,7 +39,9 @@ if TYPE_CHECKING:
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.model.pose2 import Pose2
     from hsloc.replay.engine import Estimator
+    from hsloc.slam.mapper import GraphMapperParameters
     from hsloc.slam.result import MappingResult
+    from hsloc.slam.state import MapState
 
 
 _LONGEST_S = 1e9
@@ -50,7 +53,9 @@ MODES = ("auto", "localise", "slam")
 class RunSpec:
     """What to run. The same spec on the same files gives the same result, bit for bit.
 
-    `mode` is "localise", "slam" or "auto": localise if there is a map, `map_path` or the log's own, else draw one.
+    With `resume`, the results of an earlier mapping run, that run's map is extended: the new map and trajectory are in
+    its frame. `mode` is "localise", "slam" or "auto": localise if there is a map, `map_path` or the log's own, else
+    draw one.
     With `no_odometry` the log's odometry is not looked at (slam alone). The start is `initial_pose`, else the one
     that the log states for the time of the first event, else unknown; with `unknown_start` it is unknown whatever the
     log states. `labels` are the names of the logs in reports, where the files' own names say nothing.
@@ -58,6 +63,7 @@ class RunSpec:
 
     logs: tuple[Path, ...]
     map_path: Path | None = None
+    resume: Path | None = None
     config: Config = field(default_factory=Config)
     read: ReadOptions = field(default_factory=ReadOptions)
     initial_pose: Pose2 | None = None
@@ -75,12 +81,21 @@ class RunSpec:
             raise ConfigError(
                 "a robot on a given map is followed with odometry; leave out --no-odom or use --mode slam"
             )
-
+        if self.resume is not None and (self.mode == "localise" or self.map_path is not None):
+            raise ConfigError("a map is either localised in (--map) or extended (--resume); leave out one of them")
+        if self.resume is not None and self.config.mapper != "graph":
+            raise ConfigError(
+                f"a map is extended by the graph mapper; leave out --resume or --mapper {self.config.mapper}"
+            )
         if self.no_odometry and self.read.deskew:
             raise ConfigError("scans are deskewed with odometry; leave out --no-odom or --deskew")
         _check_window(self.read.start_s, self.read.end_s)
         if len({path.resolve() for path in self.logs}) < len(self.logs):
             raise ConfigError(f"{self.logs[0]}: a log is named twice; several logs must be parts of one run")
+
+    def mapping(self) -> GraphMapperParameters:
+        """The graph mapper's parameters as this run uses them."""
+        return replace(self.config.graph_mapper, use_odometry=not self.no_odometry)
 
     def names(self) -> tuple[str, ...]:
         """What to call the logs in reports."""
@@ -136,7 +151,10 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
     begin = time.perf_counter()
     log = open_log(spec.logs, replace(spec.read, require_odometry=not spec.no_odometry))
     grid, warnings = find_map(spec, log)
-    localise = spec.mode == "localise" or (spec.mode == "auto" and grid is not None and not spec.no_odometry)
+    state, remarks = load_state(spec)
+    warnings = (*warnings, *remarks)
+    draws = spec.mode == "slam" or spec.no_odometry or state is not None
+    localise = spec.mode == "localise" or (grid is not None and not draws)
     opened = time.perf_counter()
     if progress is not None:
         progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
@@ -145,7 +163,7 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
         warnings = (*warnings, *doubts)
         estimator: Estimator = _localiser(spec, _must(grid), start)
     else:
-        estimator = _mapper(spec)
+        estimator = _mapper(spec, state)
     first = None if spec.no_odometry else first_odometry(log.events())
     prepared = time.perf_counter()
     recording = Recording()
@@ -216,10 +234,7 @@ def _share(progress: Callable[[Progress], None] | None, total: float, scans: int
 def find_map(spec: RunSpec, log: Log) -> tuple[OccupancyGrid | None, tuple[str, ...]]:
     """The map that is given or that the log carries, and what there is to warn of."""
     if spec.map_path is not None:
-        from hsloc.maps import read_map
-
-        loaded = read_map(spec.map_path)
-        return loaded.grid, loaded.warnings
+        return load_grid(spec.map_path)
     grid = log.map()
     if grid is None and spec.mode == "localise":
         raise MapError(f"{spec.logs[0]}: the log has no /map; give one with --map map.yaml")
@@ -232,15 +247,15 @@ def _must(grid: OccupancyGrid | None) -> OccupancyGrid:
     return grid
 
 
-def _mapper(spec: RunSpec) -> Mapper | PointMapper:
+def _mapper(spec: RunSpec, state: MapState | None) -> Mapper | PointMapper:
     if spec.config.mapper == "point":
         if spec.no_odometry:
             raise ConfigError("the point mapper predicts with odometry; leave out --no-odom, or use --mapper graph")
         matcher = spec.config.make_matcher()
         start = IDENTITY if spec.initial_pose is None else spec.initial_pose
         return PointMapper(matcher, spec.config.point_mapper, np.random.default_rng(spec.seed), start)
-    parameters = replace(spec.config.graph_mapper, use_odometry=not spec.no_odometry)
-    return Mapper(parameters, np.random.default_rng(spec.seed))
+    resume = None if state is None else Resume(state, None if spec.unknown_start else spec.initial_pose)
+    return Mapper(spec.mapping(), np.random.default_rng(spec.seed), resume)
 
 
 def _localiser(spec: RunSpec, grid: OccupancyGrid, start: Pose2 | None) -> Estimator:

@@ -21,6 +21,7 @@ from hsloc.errors import HslocError
 from hsloc.log.reader import open_log
 from hsloc.replay.results import timings, write_results
 from hsloc.replay.run import RunSpec, run
+from hsloc.replay.saved_maps import map_file, state_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -192,13 +193,19 @@ def run_key(spec: RunSpec, hashes: dict[Path, str] | None = None) -> str:
         value = getattr(spec, item.name)
         values[item.name] = to_dict(value) if item.name != "logs" else [path.name for path in value]
     if spec.map_path is not None:
-        values["map_path"] = [spec.map_path.name, *(_digest(part, hashes) for part in _map_files(spec.map_path))]
+        values["map_path"] = [
+            spec.map_path.name,
+            *(_digest(part, hashes) for part in _map_files(spec.map_path)),
+        ]
+    if spec.resume is not None:
+        values["resume"] = [spec.resume.name, _digest(state_file(spec.resume), hashes)]
     values["input"] = [_log_digest(path, hashes) for path in spec.logs]
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def _map_files(path: Path) -> list[Path]:
     """The YAML, and the images beside it that it may mean."""
+    path = map_file(path)
     images = [part for part in path.parent.glob("*") if part.suffix.lower() in (".pgm", ".png", ".bmp")]
     try:
         text = path.read_text(encoding="utf-8", errors="replace")

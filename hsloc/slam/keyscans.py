@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.kernels.surfels import choose_hits, fit_surfels
+from hsloc.model.events import Scan
+from hsloc.model.pose2 import Pose2
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from hsloc.model.events import Scan
 
     F32 = NDArray[np.float32]
     F64 = NDArray[np.float64]
@@ -45,8 +45,14 @@ class KeyScan:
         ranges = np.where(hits | scan.no_returns(), scan.ranges, np.nan).astype(np.float32)
         laser = scan.T_base_laser
         geometry = np.array((laser.x, laser.y, laser.theta, scan.angle_min, scan.angle_increment))
+        return KeyScan.fitted(points, hit_of_beam, ranges, geometry)
+
+    @staticmethod
+    def fitted(points: F32, hit_of_beam: I32, ranges: F32, geometry: F64) -> KeyScan:
+        """A scan of which all is known but its surfels."""
+        beams = np.flatnonzero(hit_of_beam >= 0).astype(np.int32)
         normals, centroids = np.empty_like(points), np.empty_like(points)
-        fit_surfels(points, beams, abs(scan.angle_increment), _SURFEL_RADIUS, normals, centroids, geometry[:2])
+        fit_surfels(points, beams, abs(float(geometry[4])), _SURFEL_RADIUS, normals, centroids, geometry[:2])
         return KeyScan(points, normals, centroids, hit_of_beam, ranges, geometry)
 
 
@@ -77,8 +83,37 @@ class KeyScans:
             np.array([scan.geometry for scan in scans]),
         )
 
+    @staticmethod
+    def fitted(points: F32, start: I64, hit_of_beam: I32, ranges: F32, table_start: I64, geometry: F64) -> KeyScans:
+        """Scans of which all is known but their surfels, at least one."""
+        scans = []
+        for k in range(len(start) - 1):
+            hits, beams = slice(start[k], start[k + 1]), slice(table_start[k], table_start[k + 1])
+            scans.append(KeyScan.fitted(points[hits], hit_of_beam[beams], ranges[beams], geometry[k]))
+        return KeyScans.joined(scans)
+
+    @staticmethod
+    def together(first: KeyScans, second: KeyScans) -> KeyScans:
+        """Those of two logs."""
+        return KeyScans(
+            np.concatenate((first.points, second.points)),
+            np.concatenate((first.normals, second.normals)),
+            np.concatenate((first.centroids, second.centroids)),
+            np.concatenate((first.start, first.start[-1] + second.start[1:])),
+            np.concatenate((first.hit_of_beam, second.hit_of_beam)),
+            np.concatenate((first.ranges, second.ranges)),
+            np.concatenate((first.table_start, first.table_start[-1] + second.table_start[1:])),
+            np.concatenate((first.geometry, second.geometry)),
+        )
+
     def __len__(self) -> int:
         return len(self.start) - 1
+
+    def scan(self, index: int) -> Scan:
+        """The scan again, its hits where its beams ended; stamp, limits and corrections for motion are not kept."""
+        x, y, theta, angle_min, increment = (float(value) for value in self.geometry[index])
+        ranges = self.ranges[self.table_start[index] : self.table_start[index + 1]]
+        return Scan(0, ranges, angle_min, increment, 0.0, float("inf"), T_base_laser=Pose2(x, y, theta))
 
     def hits(self, index: int) -> F32:
         """Hits of a scan in the base's frame, shape (n, 2)."""

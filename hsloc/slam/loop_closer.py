@@ -108,6 +108,8 @@ _COMPARED = 90
 """Points of a scan that are looked up in another."""
 _VISITS = 3_000_000
 """Bounds computed for a window before it counts as ambiguous."""
+_CONNECTED_WAY = 12.0
+"""A place that was found on the whole map is known as well as after so many metres of the way."""
 _DISTINCT = (0.8, radians(12.0))
 """A pose farther from the match than this is another one (m, rad)."""
 
@@ -122,14 +124,18 @@ class LoopCloser:
         parameters: LoopParameters,
         rng: Generator,
         banned: frozenset[tuple[int, int]] = frozenset(),
+        known: tuple[Loop, ...] = (),
+        first: int = 0,
     ) -> None:
+        """`banned` pairs are let be, `known` loops believed, and places before `first` visited already."""
         self._places = places
         self._scans = scans
         self._parameters = parameters
         self._rng = rng
         self._banned = banned
         self.poses = places.poses[places.reference].copy()
-        self.loops: list[Loop] = []
+        self.loops = [loop for loop in known if (loop.first, loop.second) not in banned]
+        self._first = first
         self._chosen = scans.chosen(_COMPARED)
         self._fields: dict[int, tuple[LikelihoodField, NDArray[np.float32]]] = {}
 
@@ -140,13 +146,21 @@ class LoopCloser:
 
     def close(self, progress: Callable[[float], None] | None = None) -> None:
         """Visit all places in their order."""
-        for place in range(len(self._places)):
+        if self.loops:
+            self.solve()
+        for place in range(self._first, len(self._places)):
             found = [self._search(old, place, way) for old, way in self._candidates(place)]
             self.loops += found
             if any(loop.accepted for loop in found):
                 self.solve()
             if progress is not None:
                 progress((place + 1) / len(self._places))
+
+    def connections(self, place: int) -> list[Loop]:
+        """What is found between a place of this log and the nearest before `first`, its pose being nearly known."""
+        distance = np.hypot(*(self.poses[: self._first, :2] - self.poses[place, :2]).T)
+        near = [int(old) for old in np.argsort(distance, kind="stable") if distance[old] < self._parameters.reach]
+        return [self._search(old, place, _CONNECTED_WAY) for old in near[: self._parameters.most_candidates]]
 
     def edges(self) -> Edges:
         """The accepted loops as edges between the places."""
@@ -192,10 +206,12 @@ class LoopCloser:
         from scipy.sparse.csgraph import dijkstra
 
         loops = self.accepted
-        rows = [*range(place), *(loop.first for loop in loops)]
-        columns = [*range(1, place + 1), *(loop.second for loop in loops)]
+        # Where two logs are connected the way may lead over places that are still to be visited.
+        last = place if self._first == 0 else len(self._places) - 1
+        rows = [*range(last), *(loop.first for loop in loops)]
+        columns = [*range(1, last + 1), *(loop.second for loop in loops)]
         lengths = [
-            *np.maximum(np.diff(self._places.way[: place + 1]), 1e-3),
+            *np.maximum(np.diff(self._places.way[: last + 1]), 1e-3),
             *(max(hypot(loop.T_first_second.x, loop.T_first_second.y), 0.1) for loop in loops),
         ]
         graph = coo_array((lengths, (rows, columns)), shape=(len(self._places), len(self._places)))

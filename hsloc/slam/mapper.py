@@ -29,8 +29,10 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
+    from hsloc.model.pose2 import Pose2
     from hsloc.slam.local_matching import LocalMatch
     from hsloc.slam.result import MappingResult
+    from hsloc.slam.state import MapState
 
     F64 = NDArray[np.float64]
 
@@ -49,12 +51,21 @@ class GraphMapperParameters:
     """The whole log is gone over again at most so often, until nothing moves."""
 
 
+@dataclass(frozen=True, slots=True)
+class Resume:
+    """A saved map to go on from, and where in it the log begins, if that is known."""
+
+    state: MapState
+    T_map_first: Pose2 | None = None
+
+
 class Mapper:
     """An `Estimator` that draws its own map; `finish` tells what the whole log knows."""
 
-    def __init__(self, parameters: GraphMapperParameters, rng: Generator) -> None:
+    def __init__(self, parameters: GraphMapperParameters, rng: Generator, resume: Resume | None = None) -> None:
         self._parameters = parameters
         self._rng = rng
+        self._resume = resume
         self._matcher = LocalMatcher(parameters.local_matching, rng, parameters.use_odometry)
         self._track = Track(parameters.local_matching.turn_length)
         self._scans: list[KeyScan] = []
@@ -95,10 +106,13 @@ class Mapper:
         )
 
     def finish(self, progress: Callable[[float], None] | None = None) -> MappingResult:
-        """Close loops, refine, draw; `progress` is told parts from 0 to 1. May be called once, at the end."""
+        """Close loops, refine, draw; `progress` is told parts from 0 to 1. May be called once, at the end.
+
+        Raises MapError if no connection with the saved map is found.
+        """
         from hsloc.slam.second_pass import finish
 
         return finish(
             self._scans, np.array(self._stamps, dtype=np.int64), self._local, self._track, self._parameters,
-            self._rng, progress,
+            self._rng, progress, self._resume,
         )  # fmt: skip

@@ -23,6 +23,11 @@ if TYPE_CHECKING:
 REFUSED_WAY = 5.0
 """A refused match may hide a slip: loops are looked for as if so many metres more had been driven."""
 
+UNKNOWN_STEP = 1e6 * np.eye(3)
+"""Covariance of a step of which nothing is known (m^2, rad^2)."""
+_FAR = 1e4
+"""Two logs count as so many metres of the way apart, until a loop connects them."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
@@ -41,6 +46,8 @@ class Places:
     """Steps (m - 1,) on which a match was refused: odometry alone, which may have slipped."""
     way: F64
     """Metres driven until each reference, shape (m,), a refused match counting as `REFUSED_WAY` more."""
+    piece: I64
+    """Shape (m,): where one log ends and the next begins the number changes; nothing is rigid across that."""
 
     def __len__(self) -> int:
         return len(self.reference)
@@ -71,11 +78,30 @@ class Places:
             chained[k] = covariance
         count = np.cumsum(refused)
         doubted = np.diff(count[reference]) > 0
-        return Places(start, reference, poses, steps, chained, doubted, (way + REFUSED_WAY * count)[reference])
+        piece = np.zeros(len(reference), dtype=np.int64)
+        return Places(start, reference, poses, steps, chained, doubted, (way + REFUSED_WAY * count)[reference], piece)
+
+    @staticmethod
+    def together(first: Places, second: Places) -> Places:
+        """Those of two logs in one map; the step from the first's last to the second's first says nothing."""
+        scans = len(first.poses)
+        seam = relative_poses(first.poses[None, first.reference[-1]], second.poses[None, second.reference[0]])
+        return Places(
+            np.concatenate((first.start[:-1], scans + second.start)),
+            np.concatenate((first.reference, scans + second.reference)),
+            np.concatenate((first.poses, second.poses)),
+            np.concatenate((first.steps, seam, second.steps)),
+            np.concatenate((first.covariances, UNKNOWN_STEP[None], second.covariances)),
+            np.concatenate((first.doubted, [False], second.doubted)),
+            np.concatenate((first.way, first.way[-1] + _FAR + second.way)),
+            np.concatenate((first.piece, first.piece[-1] + 1 + second.piece)),
+        )
 
     def members(self, place: int, around: int) -> range:
         """Keyscans of a place and of `around` places before and after."""
-        return range(int(self.start[max(place - around, 0)]), int(self.start[min(place + around + 1, len(self))]))
+        same = np.flatnonzero(self.piece[max(place - around, 0) : place + around + 1] == self.piece[place])
+        low = max(place - around, 0)
+        return range(int(self.start[low + same[0]]), int(self.start[low + same[-1] + 1]))
 
     def cloud(self, place: int, around: int, scans: KeyScans, reach: float, cell: float) -> F64:
         """Hits of a place and its neighbours in its frame, one for each cell of side `cell` (m), shape (n, 2)."""

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from hsloc.slam.calibration import OdometryCalibration
     from hsloc.slam.loop_closer import Loop
     from hsloc.slam.pose_graph import PoseGraph
+    from hsloc.slam.state import MapState
 
     F64 = NDArray[np.float64]
 
@@ -72,3 +73,5 @@ class MappingResult:
     quality: MappingQuality
     calibration: OdometryCalibration
     """What the map says of the odometry."""
+    state: MapState | None
+    """What is saved to go on from; None if no scan had a return."""

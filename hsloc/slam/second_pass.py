@@ -7,17 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.model.estimate import Status
+from hsloc.errors import MapError
 from hsloc.model.occupancy_grid import OccupancyGrid
-from hsloc.model.pose2 import Pose2, relative_poses, wrap_angles
+from hsloc.model.pose2 import Pose2, wrap_angles
 from hsloc.slam.calibration import OdometryCalibration
+from hsloc.slam.connection import connect, unconnected
 from hsloc.slam.drawing import draw_grid
-from hsloc.slam.keyscans import KeyScans
+from hsloc.slam.gathered import gather
 from hsloc.slam.loop_closer import Loop, LoopCloser
-from hsloc.slam.places import Places
 from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
 from hsloc.slam.refinement import Refined, refine, stirred
 from hsloc.slam.result import MappingQuality, MappingResult
+from hsloc.slam.state import MapState, fingerprint
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,16 +26,16 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from hsloc.slam.keyscans import KeyScan
+    from hsloc.slam.gathered import Gathered
+    from hsloc.slam.keyscans import KeyScan, KeyScans
     from hsloc.slam.local_matching import LocalMatch
-    from hsloc.slam.mapper import GraphMapperParameters
+    from hsloc.slam.mapper import GraphMapperParameters, Resume
+    from hsloc.slam.places import Places
     from hsloc.slam.track import Track
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
-_ODOMETRY_FLOOR = np.diag((0.01**2, 0.01**2, 0.005**2))
-"""No step of the odometry is known better than this (m^2, rad^2)."""
 _TORN = 6.0
 """A loop whose chi is larger than this once the graph is solved was wrong."""
 _MOST_TORN = 5
@@ -51,59 +52,74 @@ def finish(
     parameters: GraphMapperParameters,
     rng: Generator,
     progress: Callable[[float], None] | None = None,
+    resume: Resume | None = None,
 ) -> MappingResult:
-    """Close loops, refine, draw."""
+    """Close loops, refine, draw; with `resume`, in and with a saved map.
+
+    Raises MapError if the log cannot be connected with the saved map.
+    """
     tell = progress if progress is not None else _silent
     if not scans:
+        if resume is not None:
+            raise MapError(unconnected(resume.state))
         return _empty(track)
-    joined = KeyScans.joined(scans)
-    poses = np.array([found.pose.to_array() for found in local])
-    chain = Edges.chain(
-        np.array([found.motion.to_array() for found in local[1:]]).reshape(-1, 3),
-        np.array([found.covariance for found in local[1:]]).reshape(-1, 3, 3),
-        _refused(local)[1:],
-    )
-    poses, loops, loop_edges = _close_loops(poses, chain, local, joined, parameters, rng, lambda part: tell(0.5 * part))
-    steps = _odometry_edges(local, track, parameters)
-    edges = Edges.joined([steps, loop_edges])
-    refined, passes = _refine(poses, joined, edges, parameters, lambda part: tell(0.5 + 0.4 * part))
-    grid = draw_grid(refined.poses, joined, parameters.drawing)
+    gathered = gather(scans, stamps_ns, local, track, parameters)
+    if resume is not None:
+        gathered = connect(resume.state, gathered, parameters, rng, resume.T_map_first)
+    poses, loops, loop_edges = _close_loops(gathered, parameters, rng, lambda part: tell(0.5 * part))
+    if resume is not None and not any(loop.accepted and _connects(loop, gathered) for loop in loops):
+        raise MapError(unconnected(resume.state))
+    edges = Edges.joined([gathered.steps, loop_edges])
+    refined, passes = _refine(poses, gathered.scans, edges, parameters, lambda part: tell(0.5 + 0.4 * part))
+    grid = draw_grid(refined.poses, gathered.scans, parameters.drawing)
     tell(1.0)
-    calibration = track.calibrated(refined.poses) if parameters.use_odometry else OdometryCalibration()
-    odometry_poses, scan_poses = track.corrected(refined.poses, calibration)
+    of_log = refined.poses[gathered.first :]
+    calibration = track.calibrated(of_log) if parameters.use_odometry else OdometryCalibration()
+    odometry_poses, scan_poses = track.corrected(of_log, calibration)
     return MappingResult(
         odometry_poses=odometry_poses,
         scan_poses=scan_poses,
         revision=_revision(odometry_poses, track) if parameters.use_odometry else (),
-        keyscan_stamps_ns=stamps_ns,
+        keyscan_stamps_ns=gathered.stamps_ns,
         keyscan_poses=refined.poses,
         grid=grid,
-        graph=PoseGraph(stamps_ns, refined.poses, edges),
+        graph=PoseGraph(gathered.stamps_ns, refined.poses, edges),
         loops=tuple(loops),
-        quality=_quality(refined, passes, loops, loop_edges, grid, joined),
+        quality=_quality(refined, passes, loops, loop_edges, grid, gathered.scans),
         calibration=calibration,
+        state=_state(gathered, refined.poses, loop_edges, grid, parameters),
+    )
+
+
+def _connects(loop: Loop, gathered: Gathered) -> bool:
+    return loop.first < gathered.first_place <= loop.second
+
+
+def _state(
+    gathered: Gathered, poses: F64, loops: Edges, grid: OccupancyGrid, parameters: GraphMapperParameters
+) -> MapState:
+    return MapState(
+        scans=gathered.scans,
+        stamps_ns=gathered.stamps_ns,
+        poses=poses,
+        covariances=gathered.covariances,
+        refused=gathered.refused,
+        steps=gathered.steps,
+        loops=loops,
+        grid=grid,
+        fingerprint=fingerprint(parameters),
     )
 
 
 def _close_loops(
-    poses: F64,
-    chain: Edges,
-    local: list[LocalMatch],
-    scans: KeyScans,
-    parameters: GraphMapperParameters,
-    rng: Generator,
-    progress: Callable[[float], None],
+    gathered: Gathered, parameters: GraphMapperParameters, rng: Generator, progress: Callable[[float], None]
 ) -> tuple[F64, list[Loop], Edges]:
     """Poses of the keyscans with all loops closed, the loops, and those accepted as edges between keyscans."""
-    motions = np.array([found.motion.to_array() for found in local])
-    covariances = np.array([found.covariance for found in local])
-    p = parameters.loops
-    turn_length = parameters.local_matching.turn_length
-    places = Places.along(poses, motions, covariances, p.place_length, turn_length, _refused(local))
+    p, places, chain = parameters.loops, gathered.places, gathered.chain
     torn: list[Loop] = []
     while True:
         banned = frozenset((loop.first, loop.second) for loop in torn)
-        closer = LoopCloser(places, scans, p, rng, banned)
+        closer = LoopCloser(places, gathered.scans, p, rng, banned, gathered.known, gathered.first_place)
         closer.close(progress)
         solved, edges, worst = _solved(closer, places, chain, p.robust)
         if worst is None or len(torn) >= _MOST_TORN:
@@ -140,26 +156,6 @@ def _between_keyscans(loops: list[Loop], places: Places, robust: float) -> Edges
         np.array([np.linalg.inv(loop.covariance) for loop in accepted]),
         np.full(len(accepted), robust),
     )
-
-
-def _odometry_edges(local: list[LocalMatch], track: Track, parameters: GraphMapperParameters) -> Edges:
-    """Steps from keyscan to keyscan by odometry alone, the scans being compared anew; without it, the matches'."""
-    if not parameters.use_odometry:
-        return Edges.chain(
-            np.array([found.motion.to_array() for found in local[1:]]).reshape(-1, 3),
-            np.array([found.covariance + _ODOMETRY_FLOOR for found in local[1:]]).reshape(-1, 3, 3),
-            _refused(local)[1:],
-        )
-    odometry = track.key_odometry()
-    steps = relative_poses(odometry[:-1], odometry[1:])
-    noise = parameters.local_matching.odometry_noise
-    covariances = [noise.covariance(Pose2.from_array(step)) + _ODOMETRY_FLOOR for step in steps]
-    return Edges.chain(steps, np.array(covariances).reshape(-1, 3, 3), _refused(local)[1:])
-
-
-def _refused(local: list[LocalMatch]) -> NDArray[np.bool_]:
-    """Keyscans whose match was refused: odometry alone led to them."""
-    return np.array([found.status is Status.REJECTED for found in local], dtype=bool)
 
 
 def _refine(
@@ -244,6 +240,7 @@ def _empty(track: Track) -> MappingResult:
         loops=(),
         quality=MappingQuality(nan, nan, nan, nan, 0, 0, nan, nan, nan, nan, 0, 0, 0.0),
         calibration=OdometryCalibration(),
+        state=None,
     )
 
 

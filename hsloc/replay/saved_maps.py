@@ -1,0 +1,53 @@
+"""Maps as users name them: a results folder, a map.yaml, or the map.npz of a mapping run."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hsloc.errors import MapError
+from hsloc.maps import read_map
+from hsloc.slam.state import STATE_FILE, fingerprint, read_state
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hsloc.model.occupancy_grid import OccupancyGrid
+    from hsloc.replay.run import RunSpec
+    from hsloc.slam.state import MapState
+
+
+def map_file(path: Path) -> Path:
+    """The file meant by --map: in a folder of results its map.yaml."""
+    return path / "map.yaml" if path.is_dir() else path
+
+
+def state_file(path: Path) -> Path:
+    """The file meant by --resume: beside map.yaml, or in a folder of results."""
+    if path.is_dir():
+        return path / STATE_FILE
+    return path.with_name(STATE_FILE) if path.suffix == ".yaml" else path
+
+
+def load_grid(path: Path) -> tuple[OccupancyGrid, tuple[str, ...]]:
+    """The grid to localise in, and what there is to warn of. Raises MapError."""
+    file = map_file(path)
+    if file.suffix == ".npz":
+        return read_state(file).grid, ()
+    if path.is_dir() and not file.exists():
+        raise MapError(f"{path}: a folder without a map.yaml; name a map, or the folder of a mapping run")
+    loaded = read_map(file)
+    return loaded.grid, loaded.warnings
+
+
+def load_state(spec: RunSpec) -> tuple[MapState | None, tuple[str, ...]]:
+    """The saved map that is to be extended, if one is, and what there is to warn of. Raises MapError."""
+    path = spec.resume
+    if path is None:
+        return None, ()
+    file = state_file(path)
+    if not file.exists():
+        raise MapError(f"{path}: no {STATE_FILE} there; --resume wants the results of a run that drew its map")
+    state = read_state(file)
+    if state.fingerprint != fingerprint(spec.mapping()):
+        return state, (f"{file}: drawn with other parameters of the mapper; those of this run are used from here on",)
+    return state, ()

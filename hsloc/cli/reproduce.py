@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 HELP = "run the experiments of the papers again"
 
-_EXPERIMENTS = ("E1", "E2", "E3", "M1")
+_EXPERIMENTS = ("E1", "E2", "E3", "E4", "M1")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Experiments, data, seeds, output."""
     parser.add_argument(
         "experiments", nargs="*", type=_experiment, metavar="EXPERIMENT",
-        help="E1: match a scan; E2: fitness over iterations; E3: localisation; M1: windows (default: all)",
+        help="E1: match a scan; E2: fitness over iterations; E3: localisation; E4: SLAM; M1: windows (default: all)",
     )  # fmt: skip
     parser.add_argument(
         "--data", type=Path, metavar="DIR",
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--own", action="store_true", help="our own set-up alone, even where the report's data is")
     parser.add_argument(
         "--seeds", type=_count, metavar="N",
-        help="repetitions of each experiment (default: E1 200, E2 50, E3 20, M1 200 windows)",
+        help="repetitions of each experiment (default: E1 200, E2 50, E3 20, E4 20, M1 200 windows)",
     )  # fmt: skip
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="exactly this folder (default: results/reproduce-<time>)"
@@ -80,7 +80,7 @@ def _materials(data: Path | None, own: bool) -> tuple[list[Material], list[str]]
         return [report_material(folder), own_material()], []
     return [own_material()], [
         (
-            f"the report's data is not at hand ({folder} does not exist; name it with --data DIR): E1 to E3 are run on "
+            f"the report's data is not at hand ({folder} does not exist; name it with --data DIR): E1 to E4 are run on "
             "our own set-up alone, and the published figures beside them belong to another scan and another map."
         )
     ]

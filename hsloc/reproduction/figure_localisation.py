@@ -13,11 +13,14 @@ from hsloc.reproduction import published
 from hsloc.reproduction.figure_style import COLOURS, head, quiet
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
     from hsloc.reproduction.localisation import Drive
+    from hsloc.reproduction.mapping import Mapped
     from hsloc.reproduction.run import MaterialResults
 
     F64 = NDArray[np.float64]
@@ -98,27 +101,45 @@ def _connect(figure: Figure, whole: Axes, part: Axes, centre: F64) -> None:
 
 def draw_errors(figure: Figure, results: MaterialResults) -> None:
     """x, y and theta below each other, a column for each of two presets, HIDE and HS in each."""
-    drives = {(d.matcher, d.preset): d for d in results.drives if d.seed == 0}
     head(
         figure,
         "Figure 6: the errors over the time",
         f"E3 on {results.material.title}, seed 0; the same scale in both columns; theta is wrapped",
     )
-    for row, (name, factor, unit) in enumerate((("x", 100.0, "cm"), ("y", 100.0, "cm"), ("theta", 180 / np.pi, "deg"))):
+    drives = {(d.matcher, d.preset): d for d in results.drives if d.seed == 0}
+    draw_columns(figure, drives, published.E3_RMSE)
+
+
+def draw_columns(
+    figure: Figure,
+    drives: Mapping[tuple[str, str], Drive | Mapped],
+    printed: Mapping[str, tuple[float, float, float]],
+    *,
+    metres: bool = False,
+) -> None:
+    """A column for each of `PRESETS`, with x, y and theta below each other; `printed` RMSE are put beside ours.
+
+    In centimetres and with one scale for both columns, or in `metres` and each column with its own.
+    """
+    length = (1.0, "m", 3) if metres else (100.0, "cm", 2)
+    rows = (("x", *length), ("y", *length), ("theta", 180 / np.pi, "deg", 2))
+    for row, (name, factor, unit, digits) in enumerate(rows):
         top = max(
             float(np.abs(_errors(drives[matcher, preset])[1][:, row]).max())
             for matcher in COLOURS
             for preset in PRESETS
         )
         for column, preset in enumerate(PRESETS):
+            if metres:
+                top = max(float(np.abs(_errors(drives[matcher, preset])[1][:, row]).max()) for matcher in COLOURS)
             axes = figure.add_axes((0.06 + 0.48 * column, 0.63 - 0.283 * row, 0.45, 0.205))
             for matcher in ("HS", "HIDE"):
                 seconds, errors = _errors(drives[matcher, preset])
                 rmse = drives[matcher, preset].rmse[row]
                 axes.plot(
                     seconds, errors[:, row] * factor, color=COLOURS[matcher], linewidth=0.9,
-                    label=f"{matcher}: RMSE {rmse * factor:.2f} {unit} "
-                    f"(published {published.E3_RMSE[matcher][row] * factor:.2f})",
+                    label=f"{matcher}: RMSE {rmse * factor:.{digits}f} {unit}"
+                    + (f" (published {printed[matcher][row] * factor:.{digits}f})" if matcher in printed else ""),
                 )  # fmt: skip
             axes.axhline(0.0, color=style.INK, linewidth=0.7)
             axes.set_ylim(-1.05 * top * factor, 1.05 * top * factor)
@@ -133,10 +154,10 @@ def draw_errors(figure: Figure, results: MaterialResults) -> None:
                 axes.set_xlabel("time [s]", labelpad=1)
 
 
-def _errors(drive: Drive) -> tuple[F64, F64]:
+def _errors(drive: Drive | Mapped) -> tuple[F64, F64]:
     """Seconds (n,) and estimate minus truth (n, 3)."""
     path = drive.path
     assert path is not None
-    errors = path.estimate.poses - path.truth.poses
+    errors = path.estimate.poses - path.truth.interpolated(path.estimate.stamps_ns)
     errors[:, 2] = wrap_angles(errors[:, 2])
-    return (path.truth.stamps_ns - path.truth.stamps_ns[0]) * 1e-9, errors
+    return (path.estimate.stamps_ns - path.truth.stamps_ns[0]) * 1e-9, errors

@@ -1,4 +1,4 @@
-"""The report's figures 2 to 6, drawn from our own results. Colours and type as in report.png."""
+"""The report's figures 2 to 8, drawn from our own results. Colours and type as in report.png."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hsloc.evaluation import report_style as style
 from hsloc.evaluation.files import write_atomically
 from hsloc.reproduction.figure_convergence import draw_convergence
 from hsloc.reproduction.figure_localisation import draw_errors, draw_path
+from hsloc.reproduction.figure_mapping import draw_map, draw_map_errors
 from hsloc.reproduction.figure_match import draw_match
 
 if TYPE_CHECKING:
@@ -41,6 +42,9 @@ def draw_figures(results: MaterialResults, folder: Path) -> list[Path]:
     if results.drives:
         jobs.append(("fig5", (16.0, 8.2), lambda f: draw_path(f, results)))
         jobs.append(("fig6", (14.0, 9.0), lambda f: draw_errors(f, results)))
+    if results.mapped:
+        jobs.append(("fig7", (16.0, 8.2), lambda f: draw_map(f, results)))
+        jobs.append(("fig8", (14.0, 9.0), lambda f: draw_map_errors(f, results)))
     return [_save(folder / f"{name}_{results.material.name}.png", size, draw) for name, size, draw in jobs]
 
 

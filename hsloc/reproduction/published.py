@@ -17,6 +17,11 @@ E3_SECONDS = {"HS": 141.0, "HIDE": 576.0}
 E3_PATH = (359.0, 119.8)
 """Metres and seconds."""
 
+E4_RMSE = (0.223, 0.333, 0.0356)
+"""[P] V, Fig. 8, by HS: x, y in m, theta in rad."""
+E4_MAP = "complete but for a corner never seen"
+"""[P] Fig. 7."""
+
 M1_SUCCESS = {"HS": (0.97, 0.96), "HIDE": (0.96, 0.95)}
 """[M] Table 1: at 20 cm and at 30 cm."""
 M1_ERROR = (0.0144, 0.11)

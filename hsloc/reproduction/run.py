@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from hsloc.reproduction import published
 from hsloc.reproduction.convergence import run_convergence
 from hsloc.reproduction.localisation import run_localisation
+from hsloc.reproduction.mapping import run_mapping
 from hsloc.reproduction.scan_match import run_scan_match
 from hsloc.reproduction.windows import run_windows
 
@@ -16,14 +17,15 @@ if TYPE_CHECKING:
 
     from hsloc.reproduction.convergence import Convergence
     from hsloc.reproduction.localisation import Drive
+    from hsloc.reproduction.mapping import Mapped
     from hsloc.reproduction.material import Material
     from hsloc.reproduction.scan_match import ScanMatch
     from hsloc.reproduction.windows import Windows
 
     Progress = Callable[[str, float], None]
 
-EXPERIMENTS = ("E1", "E2", "E3", "M1")
-SEEDS = {"E1": 200, "E2": 50, "E3": 20, "M1": 200}
+EXPERIMENTS = ("E1", "E2", "E3", "E4", "M1")
+SEEDS = {"E1": 200, "E2": 50, "E3": 20, "E4": 20, "M1": 200}
 """Repetitions; of M1 it is the number of windows."""
 
 
@@ -37,12 +39,13 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaterialResults:
-    """E1 to E3 on one material; empty or None where they were not asked for."""
+    """E1 to E4 on one material; empty or None where they were not asked for."""
 
     material: Material
     scan_match: tuple[ScanMatch, ...] = ()
     convergence: Convergence | None = None
     drives: tuple[Drive, ...] = ()
+    mapped: tuple[Mapped, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +66,7 @@ class Reproduction:
                     **({"E1": [row.to_dict() for row in results.scan_match]} if results.scan_match else {}),
                     **({"E2": results.convergence.to_dict()} if results.convergence else {}),
                     **({"E3": [drive.to_dict() for drive in results.drives]} if results.drives else {}),
+                    **({"E4": [drive.to_dict() for drive in results.mapped]} if results.mapped else {}),
                 }
                 for results in self.materials
             ],
@@ -99,6 +103,7 @@ def reproduce(
                 run_scan_match(material.scan, run_for("E1"), tell("E1")) if "E1" in experiments else (),
                 run_convergence(material.scan, run_for("E2"), tell("E2")) if "E2" in experiments else None,
                 run_localisation(material.world, run_for("E3"), tell("E3")) if "E3" in experiments else (),
+                run_mapping(material.world, run_for("E4"), tell("E4")) if "E4" in experiments else (),
             )
         )
     windows = run_windows(run_for("M1"), lambda share: progress("M1", share)) if "M1" in experiments else ()
@@ -122,7 +127,21 @@ def _verdicts(results: Sequence[MaterialResults]) -> list[Verdict]:
                 f"seed: worst {worst[0]:.4f}, {worst[1]:.4f}, {worst[2]:.4f}"
             )
             verdicts.append(Verdict(text, all(w < limit for w, limit in zip(worst, limits, strict=True))))
+        verdicts += _mapping_verdicts(result)
     return verdicts
+
+
+def _mapping_verdicts(result: MaterialResults) -> list[Verdict]:
+    ours = [drive for drive in result.mapped if (drive.matcher, drive.preset) == ("HIDE", "default")]
+    if not ours:
+        return []
+    limits = published.E4_RMSE
+    worst = tuple(max(drive.rmse[axis] for drive in ours) for axis in range(3))
+    text = (
+        f"E4 ({result.material.name}): RMSE of the point mapper with HIDE below {limits[0]} m, {limits[1]} m, "
+        f"{limits[2]} rad on each axis in every seed: worst {worst[0]:.4f}, {worst[1]:.4f}, {worst[2]:.4f}"
+    )
+    return [Verdict(text, all(value < limit for value, limit in zip(worst, limits, strict=True)))]
 
 
 def _window_verdicts(windows: Sequence[Windows]) -> list[Verdict]:

@@ -10,6 +10,7 @@ from hsloc.evaluation.markdown import DASH, table
 from hsloc.reproduction import published
 from hsloc.reproduction.convergence import COUNTS
 from hsloc.reproduction.localisation import INITIAL
+from hsloc.reproduction.mapping import NEAR, NOISE, RANGE
 from hsloc.reproduction.scan_match import SUCCESS as E1_SUCCESS
 from hsloc.reproduction.windows import SUCCESS as M1_SUCCESS
 from hsloc.reproduction.windows import UNCERTAINTIES
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
     from hsloc.reproduction.convergence import Convergence
     from hsloc.reproduction.localisation import Drive
+    from hsloc.reproduction.mapping import Mapped
     from hsloc.reproduction.run import MaterialResults, Reproduction
     from hsloc.reproduction.scan_match import ScanMatch
     from hsloc.reproduction.windows import Windows
@@ -60,6 +62,8 @@ def _of_material(results: MaterialResults) -> list[str]:
         lines += _e2(results.convergence, results.material.title)
     if results.drives:
         lines += _e3(results.drives, results.material.title)
+    if results.mapped:
+        lines += _e4(results.mapped, results.material.title)
     return lines
 
 
@@ -181,6 +185,45 @@ def _e3(drives: Sequence[Drive], title: str) -> list[str]:
         by_seed.append(row)
     lines += table(("seed", "HIDE, default", "HS, default", "HIDE, paper-literal", "HS, paper-literal"), by_seed)
     return lines
+
+
+def _e4(mapped: Sequence[Mapped], title: str) -> list[str]:
+    first = mapped[0]
+    seeds = len({drive.seed for drive in mapped})
+    lines = [
+        f"## E4: SLAM along the waypoints, on {title}",
+        "",
+        (
+            f"{seeds} seeds, {first.scans} scans; the point mapper, which knows no map and the start alone; range "
+            f"{RANGE:g} m, noise {NOISE.speed:g} m/s and {np.degrees(NOISE.steering):g} deg. RMSE over all stamps, "
+            "each with the pose that is known once the scan that bears it is taken in: median and, in brackets, worst "
+            "of the seeds. Most of theta's RMSE is the odometry's between two scans. Complete: the part of the world's "
+            f"points with a point of the map within {NEAR:g} m (the report: {published.E4_MAP})."
+        ),
+        "",
+    ]
+    cells = []
+    for preset in dict.fromkeys(drive.preset for drive in mapped):
+        for matcher in ("HIDE", "HS"):
+            chosen = [drive for drive in mapped if (drive.matcher, drive.preset) == (matcher, preset)]
+            rmse = np.array([drive.rmse for drive in chosen])
+            median, worst = np.median(rmse, axis=0), rmse.max(axis=0)
+            cells.append(
+                (
+                    f"{matcher}, {preset}",
+                    " / ".join(f"{value:g}" for value in published.E4_RMSE) if matcher == "HS" else DASH,
+                    *(f"{median[axis]:.4f} ({worst[axis]:.4f})" for axis in range(3)),
+                    f"{np.median([drive.points for drive in chosen]):.0f}",
+                    f"{100 * np.median([drive.complete for drive in chosen]):.0f} %",
+                    f"{np.median([drive.distance for drive in chosen]):.3f}",
+                    f"{np.median([drive.seconds for drive in chosen]):.2f}",
+                )
+            )
+    head = (
+        "matcher, preset", "published x / y / theta", "x m", "y m", "theta rad", "points", "complete", "points off m",
+        "seconds",
+    )  # fmt: skip
+    return [*lines, *table(head, cells)]
 
 
 def _m1(rows: Sequence[Windows]) -> list[str]:

@@ -10,6 +10,7 @@ from hsloc.matching import HarmonySearch, Hide, LikelihoodField, Window
 from hsloc.reproduction import published, reproduce
 from hsloc.reproduction.convergence import ITERATIONS, run_convergence
 from hsloc.reproduction.localisation import run_localisation
+from hsloc.reproduction.mapping import run_mapping
 from hsloc.reproduction.material import SEEN_FROM
 from hsloc.reproduction.scan_match import HALF, START, run_scan_match, scan_seen
 
@@ -103,6 +104,20 @@ def test_localisation_beats_what_is_published(small: Reproduction, short_materia
     assert [drive.rmse for drive in again] == [drive.rmse for drive in drives if drive.seed == 0]
 
 
+def test_slam_beats_what_is_published(small: Reproduction, short_material: Material) -> None:
+    mapped = small.materials[0].mapped
+    assert len(mapped) == 2 * 6
+    for drive in mapped:
+        assert (drive.path is not None) == (drive.map_points is not None) == (drive.seed == 0)
+        if drive.preset == "default":
+            assert all(ours < theirs for ours, theirs in zip(drive.rmse, published.E4_RMSE, strict=True))
+            assert drive.matched == drive.scans > 20
+            assert drive.distance < 0.2
+            assert drive.points > 50
+    again = run_mapping(short_material.world, 1, silent)
+    assert [drive.rmse for drive in again] == [drive.rmse for drive in mapped if drive.seed == 0]
+
+
 def test_windows_are_matched_to_a_centimetre_or_so(small: Reproduction) -> None:
     rows = [row for row in small.windows if row.sensor == "office lidar" and row.variant.preset == "default"]
     assert len(rows) == 4
@@ -112,7 +127,7 @@ def test_windows_are_matched_to_a_centimetre_or_so(small: Reproduction) -> None:
 
 
 def test_verdicts_cover_what_was_run(small: Reproduction, short_material: Material) -> None:
-    assert [verdict.text[:2] for verdict in small.verdicts] == ["E1", "E3", "M1", "M1"]
+    assert [verdict.text[:2] for verdict in small.verdicts] == ["E1", "E3", "E4", "M1", "M1"]
     assert all(verdict.met for verdict in small.verdicts)
     only = reproduce([short_material], ["E1"], seeds=1)
     assert [verdict.text[:2] for verdict in only.verdicts] == ["E1"]

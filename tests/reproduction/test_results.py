@@ -27,27 +27,29 @@ def written(small: Reproduction, tmp_path_factory: pytest.TempPathFactory) -> tu
 def test_folder_holds_report_results_and_figures(written: tuple[Path, str]) -> None:
     folder, text = written
     names = {path.name for path in folder.iterdir()}
-    assert names == {"report.md", "results.json", *(f"fig{n}_own.png" for n in range(2, 7))}
+    assert names == {"report.md", "results.json", *(f"fig{n}_own.png" for n in range(2, 9))}
     values = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     assert values["notes"] == ["a note"]
     assert len(values["materials"][0]["E1"]) == 7
     assert len(values["materials"][0]["E3"]) == 12
+    assert len(values["materials"][0]["E4"]) == 12
     assert all(verdict["met"] for verdict in values["verdicts"])
     for word in ("a note", "0.0447 / 0.0623 / 0.0351", "0.572 / 0.886 / 0.0386", "0.467", "19000", "0.96"):
         assert word in text
+    assert "0.223 / 0.333 / 0.0356" in text
     report = (folder / "report.md").read_text(encoding="utf-8")
     assert report.startswith(text)
-    assert report.count("![fig") == 5
+    assert report.count("![fig") == 7
 
 
-@pytest.mark.parametrize("number", range(2, 7))
+@pytest.mark.parametrize("number", range(2, 9))
 def test_figures_are_drawn(written: tuple[Path, str], number: int) -> None:
     with Image.open(written[0] / f"fig{number}_own.png") as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
     assert pixels.shape[1] >= 1400
     # Blue of HIDE or vermillion of HS in every third of the width: no panel is empty.
     colours = [(0, 114, 178)] if number == 3 else [(213, 94, 0)] if number == 2 else [(0, 114, 178), (213, 94, 0)]
-    for third in np.array_split(pixels, 2 if number in (4, 5, 6) else 3, axis=1):
+    for third in np.array_split(pixels, 2 if number > 3 else 3, axis=1):
         found = [(np.abs(third - colour).sum(axis=2) < 30).sum() for colour in colours]
         assert max(found) > 100
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 class LocaliserParameters:
     """When a scan is matched, in which window, and what is believed. Names as in AMCL where the meaning is the same."""
 
-    update_min_d: float = 0.25
+    update_min_d: float = 0.2
     """A scan is matched after so many metres (m)."""
     update_min_a: float = 0.2
     """Or after so much turning (rad)."""

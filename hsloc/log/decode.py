@@ -78,11 +78,12 @@ class GridMessage(NamedTuple):
 
 
 class PoseMessage(NamedTuple):
-    """geometry_msgs/PoseStamped and PoseWithCovarianceStamped in the plane."""
+    """geometry_msgs/PoseStamped and PoseWithCovarianceStamped in the plane; a covariance is not read."""
 
     stamp_ns: int
     frame_id: str
     pose: Pose2
+    covariance: None = None
 
 
 _STAMP_AND_SIZE = Struct("<iII")

@@ -109,7 +109,7 @@ class OdometryFeed:
         self._is_truth = is_truth
         self._T_child_base = T_child_base
 
-    def events(self, message: OdometryMessage, log_time_ns: int) -> Iterable[Stamped]:
+    def events(self, message: OdometryMessage | PoseMessage, log_time_ns: int) -> Iterable[Stamped]:
         """One pose."""
         stamp = self._clock.stamp(message.stamp_ns, log_time_ns)
         if stamp is None:
@@ -123,31 +123,15 @@ class OdometryFeed:
         return ((self._clock, Odometry(stamp, pose, message.covariance)),)
 
 
-class PoseFeed:
-    """geometry_msgs/PoseStamped and PoseWithCovarianceStamped to Truth, or to Odometry."""
+class PoseFeed(OdometryFeed):
+    """geometry_msgs/PoseStamped and PoseWithCovarianceStamped to Truth, or to Odometry, whose covariance is unknown."""
 
     def __init__(
         self, clock: TopicClock, losses: Losses, typename: str, is_truth: bool, T_child_base: Pose2 | None = None
     ) -> None:
         """As `OdometryFeed`."""
+        super().__init__(clock, losses, is_truth, T_child_base)
         self.typename = typename
-        self.topic = clock.topic
-        self.clocks = (clock,)
-        self._clock = clock
-        self._losses = losses
-        self._is_truth = is_truth
-        self._T_child_base = T_child_base
-
-    def events(self, message: PoseMessage, log_time_ns: int) -> Iterable[Stamped]:
-        """One pose."""
-        stamp = self._clock.stamp(message.stamp_ns, log_time_ns)
-        if stamp is None:
-            return ()
-        if not is_usable(message.pose):
-            self._losses.invalid_messages[self.topic] += 1
-            return ()
-        pose = message.pose if self._T_child_base is None else message.pose @ self._T_child_base
-        return ((self._clock, Truth(stamp, pose) if self._is_truth else Odometry(stamp, pose)),)
 
 
 class TransformFeed:

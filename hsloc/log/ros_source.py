@@ -156,7 +156,7 @@ def _routed(
 
 def _pose_feed(
     clock: TopicClock, losses: Losses, typename: str, is_truth: bool, T_child_base: Pose2 | None
-) -> OdometryFeed | PoseFeed:
+) -> OdometryFeed:
     if typename == definitions.ODOMETRY:
         return OdometryFeed(clock, losses, is_truth, T_child_base)
     return PoseFeed(clock, losses, typename, is_truth, T_child_base)

@@ -180,15 +180,13 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
         where = "between --start and --end" if _cut(spec) else f"on {log.summary.odom_topic} that could be read"
         raise LogError(f"{spec.logs[0]}: no odometry {where}")
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
-    mapping = None
-    if isinstance(estimator, PointMapper):
-        grid, true_grid = estimator.grid(), grid
-    else:
-        true_grid = None
+    mapping, true_grid = None, None if localise else grid
     if isinstance(estimator, Mapper):
-        true_grid = grid
         mapping = estimator.finish(_share(progress, log.summary.duration_s, recording.scans))
+        grid = mapping.grid
         seconds["finish"] = time.perf_counter() - replayed
+    elif isinstance(estimator, PointMapper):
+        grid = estimator.grid()
     trajectory, localised = recording.trajectory() if mapping is None else _mapped(recording, mapping)
     return Result(
         spec=spec,
@@ -198,7 +196,7 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
         localised=localised,
         odometry=recording.odometry(),
         reference=recording.reference(),
-        grid=mapping.grid if mapping is not None else _must(grid),
+        grid=_must(grid),
         diagnostics=recording.diagnostics(),
         losses=log.losses,
         warnings=(*log.summary.warnings, *warnings),

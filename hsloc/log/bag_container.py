@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from hsloc.errors import HslocError, LogFormatError
@@ -21,6 +22,10 @@ if TYPE_CHECKING:
         def __enter__(self) -> _Reader: ...
         def __exit__(self, *error: object) -> object: ...
         def messages(self, connections: Collection[Any]) -> Iterator[tuple[Any, int, bytes]]: ...
+
+
+_RUN = 1024
+"""Messages in one run."""
 
 
 class BagContainer:
@@ -44,6 +49,12 @@ class BagContainer:
             for number, connection in enumerate(reader.connections):
                 self.channels[number] = self._channel(number, connection)
             self._count(reader)
+
+    def runs(self, wanted: Collection[int], losses: Losses) -> Iterator[list[RawMessage]]:
+        """As `Container.runs`."""
+        messages = self.messages(wanted, losses)
+        while run := list(islice(messages, _RUN)):
+            yield run
 
     def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
         """As `Container.messages`; rosbags yields in the order of time."""

@@ -34,7 +34,7 @@ class Channel:
 class Container(Protocol):
     """A file, or a folder that is one recording.
 
-    Law: `messages` yields every readable message of the wanted channels exactly once, in the order of
+    Law: `runs` yields every readable message of the wanted channels exactly once, in the order of
     (log time, position) as far as a bounded memory allows; what it cannot read it counts in `losses`. It raises
     nothing but LogError. `losses_at_opening` holds what was already lost when the file was opened.
     """
@@ -56,8 +56,12 @@ class Container(Protocol):
     @property
     def warnings(self) -> list[str]: ...  # noqa: D102
 
+    def runs(self, wanted: Collection[int], losses: Losses) -> Iterator[list[RawMessage]]:
+        """Messages of the wanted channels, in lists as they come out of the file."""
+        ...
+
     def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
-        """Messages of the wanted channels."""
+        """The same one by one."""
         ...
 
     def verify(self) -> Losses:

@@ -90,10 +90,11 @@ _STAMP_AND_SIZE = Struct("<iII")
 _SIZE = Struct("<I")
 _SCAN = Struct("<7fI")
 _POSE = Struct("<7d")
+POSE_BYTES = _POSE.size
 _MAP_INFO = Struct("<fII")
-_COVARIANCE_BYTES = 36 * 8
-_ZEROS = bytes(_COVARIANCE_BYTES)
-_PLANE = np.array((0, 1, 5, 6, 7, 11, 30, 31, 35))
+COVARIANCE_BYTES = 36 * 8
+_ZEROS = bytes(COVARIANCE_BYTES)
+PLANE = np.array((0, 1, 5, 6, 7, 11, 30, 31, 35))
 _BODY = 4
 """Offsets of CDR count from behind the encapsulation."""
 _MAX_NAME = 4096
@@ -161,29 +162,39 @@ def laser_scan(data: Payload) -> ScanMessage:
 
 
 @lru_cache(maxsize=64)
-def _plane_covariance(raw: bytes) -> NDArray[np.float64] | None:
+def plane_covariance(raw: bytes) -> NDArray[np.float64] | None:
     """3 x 3 of (x, y, yaw) from the 36 doubles; None where all of them are zero. Most logs repeat a few."""
     if raw == _ZEROS:
         return None
-    values: NDArray[np.float64] = np.frombuffer(raw, dtype="<f8")[_PLANE].reshape(3, 3)
+    values: NDArray[np.float64] = np.frombuffer(raw, dtype="<f8")[PLANE].reshape(3, 3)
     if not values.any():
         return None
     values.setflags(write=False)
     return values
 
 
-def odometry(data: Payload) -> OdometryMessage:
-    """nav_msgs/Odometry from CDR."""
+def _odometry_head(data: Payload) -> tuple[int, str, str, int]:
+    """(stamp, frame, child frame, offset of the pose) of a nav_msgs/Odometry."""
     _check_encapsulation(data)
     stamp, frame, at = _header(data, 4)
     child, at = _string(data, at)
-    at = _aligned(at, 8)
+    return stamp, frame, child, _aligned(at, 8)
+
+
+def odometry_pose_at(data: Payload) -> int:
+    """The offset of the pose in a nav_msgs/Odometry, that of the covariance being behind it."""
+    return _odometry_head(data)[3]
+
+
+def odometry(data: Payload) -> OdometryMessage:
+    """nav_msgs/Odometry from CDR."""
+    stamp, frame, child, at = _odometry_head(data)
     values = _POSE.unpack_from(data, at)
     at += _POSE.size
-    raw = bytes(data[at : at + _COVARIANCE_BYTES])
-    if len(raw) < _COVARIANCE_BYTES:
+    raw = bytes(data[at : at + COVARIANCE_BYTES])
+    if len(raw) < COVARIANCE_BYTES:
         raise ValueError("the covariance is cut off")
-    return OdometryMessage(stamp, frame, child, _pose2(values), _plane_covariance(raw), values[3:])
+    return OdometryMessage(stamp, frame, child, _pose2(values), plane_covariance(raw), values[3:])
 
 
 def transforms(data: Payload) -> list[LinkMessage]:
@@ -229,11 +240,22 @@ def _grid(cells: NDArray[np.int8], width: int, height: int, resolution: float, o
     return OccupancyGrid(cells.reshape(height, width), float(str(np.float32(resolution))), origin)
 
 
-def pose_stamped(data: Payload) -> PoseMessage:
-    """geometry_msgs/PoseStamped or PoseWithCovarianceStamped from CDR."""
+def _stamped_head(data: Payload) -> tuple[int, str, int]:
+    """(stamp, frame, offset of the pose) of a geometry_msgs/PoseStamped."""
     _check_encapsulation(data)
     stamp, frame, at = _header(data, 4)
-    return PoseMessage(stamp, frame, _pose2(_POSE.unpack_from(data, _aligned(at, 8))))
+    return stamp, frame, _aligned(at, 8)
+
+
+def stamped_pose_at(data: Payload) -> int:
+    """The offset of the pose in a geometry_msgs/PoseStamped or PoseWithCovarianceStamped."""
+    return _stamped_head(data)[2]
+
+
+def pose_stamped(data: Payload) -> PoseMessage:
+    """geometry_msgs/PoseStamped or PoseWithCovarianceStamped from CDR."""
+    stamp, frame, at = _stamped_head(data)
+    return PoseMessage(stamp, frame, _pose2(_POSE.unpack_from(data, at)))
 
 
 # The same from message objects of rosbags.
@@ -271,7 +293,7 @@ def object_odometry(message: Any) -> OdometryMessage:
     child = str(message.child_frame_id).lstrip("/")
     pose, q = _object_pose(message.pose.pose), message.pose.pose.orientation
     quaternion = (float(q.x), float(q.y), float(q.z), float(q.w))
-    return OdometryMessage(*_object_header(message), child, pose, _plane_covariance(raw), quaternion)
+    return OdometryMessage(*_object_header(message), child, pose, plane_covariance(raw), quaternion)
 
 
 def object_transforms(message: Any) -> list[LinkMessage]:

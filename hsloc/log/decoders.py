@@ -5,16 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import LogFormatError
-from hsloc.log import decode, definitions, foxglove, schema
+from hsloc.log import columns, decode, definitions, foxglove, schema
 from hsloc.log.definitions import long_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
+    from hsloc.log.columns import PoseColumns
     from hsloc.log.container import Channel
     from hsloc.log.decode import Payload
 
     Decoder = Callable[[Payload], Any]
+    ColumnDecoder = Callable[[Sequence[Payload]], PoseColumns | None]
 
 _ALIASES = {"tf/msg/tfMessage": definitions.TF_MESSAGE} | foxglove.TYPES
 """ROS 1's old name of a type that is otherwise the same, and Foxglove's types."""
@@ -48,6 +50,14 @@ def decoder_for(channel: Channel) -> Decoder:
     if channel.message_encoding == "cdr" and _is_known(channel, typename):
         return _by_hand(channel, typename)
     return _by_rosbags(channel, typename)
+
+
+def column_decoder_for(channel: Channel) -> ColumnDecoder | None:
+    """A decoder of many messages with poses at once; None where the channel's are decoded one by one."""
+    typename = canonical_type(channel.typename)
+    if channel.message_encoding != "cdr" or foxglove.is_foxglove(channel) or not _is_known(channel, typename):
+        return None
+    return columns.BY_HAND.get(typename)
 
 
 def _is_known(channel: Channel, typename: str) -> bool:

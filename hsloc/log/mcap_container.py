@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 from bisect import bisect_left
+from itertools import chain
 from operator import itemgetter
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -61,7 +62,11 @@ class McapContainer:
             self.warnings.append(f"{path}: messages on {len(unknown)} channels without definition are ignored")
 
     def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
-        """As `Container.messages`: segments are merged exactly, unless more than 256 MB would be held back."""
+        """As `Container.messages`."""
+        return chain.from_iterable(self.runs(wanted, losses))
+
+    def runs(self, wanted: Collection[int], losses: Losses) -> Iterator[list[RawMessage]]:
+        """As `Container.runs`: segments are merged exactly, unless more than 256 MB would be held back."""
         chosen = frozenset(wanted)
         segments = [s for s in self._directory.segments if s.channels is None or s.channels & chosen]
         heap: list[RawMessage] = []
@@ -79,7 +84,7 @@ class McapContainer:
                         if split:
                             losses.late_messages += bisect_left(found, last, hi=split, key=itemgetter(0))
                             last = max(last, found[split - 1][0])
-                        yield from found[:split]
+                        yield found[:split]
                         # Copies, so that not the whole chunk stays in memory for a few messages.
                         heap = [(*message[:3], bytes(message[3])) for message in found[split:]]
                         held = sum(len(message[3]) for message in heap)
@@ -87,19 +92,22 @@ class McapContainer:
                         for message in found:
                             heapq.heappush(heap, (*message[:3], bytes(message[3])))
                             held += len(message[3])
+                    ready: list[RawMessage] = []
                     while heap and (heap[0][0] < horizon or held > MAX_HELD_BYTES):
                         message = heapq.heappop(heap)
                         held -= len(message[3])
                         losses.late_messages += message[0] < last
                         last = max(last, message[0])
-                        yield message
+                        ready.append(message)
+                    if ready:
+                        yield ready
         except OSError as error:
             raise LogError(f"{self.path}: cannot be read ({error.strerror or error})") from error
 
     def verify(self) -> Losses:
         """Read every segment and count what is damaged."""
         losses = self.losses_at_opening.copy()
-        for _ in self.messages(self.channels, losses):
+        for _ in self.runs(self.channels, losses):
             pass
         return losses
 

@@ -11,11 +11,13 @@ where *raised* are those whose own stamp had run backwards: they keep their orde
 
 from __future__ import annotations
 
-from operator import itemgetter
-from typing import TYPE_CHECKING
+from bisect import bisect_left
+from itertools import repeat
+from operator import sub
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from hsloc.log.summary import Losses
     from hsloc.model import Event
@@ -28,7 +30,6 @@ JUMP_NS = 10_000_000_000
 """A stamp further than this from the topic's last one (beyond what the log time advanced) is not trusted, unless
 the next one agrees with it."""
 MAX_PENDING = 20_000
-_BATCH = 64
 
 
 class TopicClock:
@@ -85,12 +86,46 @@ class TopicClock:
         self._suspect = True
         return last, True
 
+    def runs_on(self, stamps: Sequence[int]) -> bool:
+        """Whether the topic's next messages are what they should be: `effective` would leave all of them alone."""
+        before = stamps[0] if self.last_ns is None else max(self.last_ns, self._last_own_ns)
+        steps: list[int] = list(map(sub, stamps, (before, *stamps[:-1])))
+        return min(steps) >= 0 and max(steps) <= JUMP_NS
 
-Keyed = tuple[int, int, int, int, int, "Event"]
-"""(effective stamp, raised, kind, number, log time, event); the number makes keys unique."""
+    def run_on(self, stamps: Sequence[int], log_times: Sequence[int]) -> None:
+        """Take messages of which `runs_on` is true."""
+        self.last_ns = self._last_own_ns = stamps[-1]
+        self._last_log_ns = log_times[-1]
+        self._suspect = False
 
 
-_KEY = itemgetter(0, 1, 2, 3)
+class Arrivals(NamedTuple):
+    """Events of one topic out of a batch of messages, in the order of the log.
+
+    `places` are the messages' places in the batch, of all topics together; `stamps` the events' own.
+    """
+
+    clock: TopicClock
+    places: Sequence[int]
+    log_times: Sequence[int]
+    stamps: Sequence[int]
+    events: Sequence[Event]
+
+
+def one_by_one(arrivals: Iterable[Arrivals]) -> list[tuple[int, TopicClock, int, Event]]:
+    """(place, clock, log time, event) of all topics of a batch, in the order of the log."""
+    found = [
+        (place, run.clock, log_time, event)
+        for run in arrivals
+        for place, log_time, event in zip(run.places, run.log_times, run.events, strict=True)
+    ]
+    found.sort(key=lambda item: item[0])
+    return found
+
+
+Keyed = tuple[int, bool, int, int, int, int, "Event"]
+"""(effective stamp, raised, kind, number of the message, index in its batch, log time, event): no two are alike before
+the event, so that they sort as they are."""
 
 
 class Reorder:
@@ -104,22 +139,37 @@ class Reorder:
         self._number = 0
         self._released_ns: int | None = None
 
-    def push(self, clock: TopicClock, event: Event, log_time_ns: int) -> bool:
-        """Take an event; true when it is time to ask for `ready`."""
+    def take(self, arrivals: Sequence[Arrivals], size: int) -> None:
+        """Take the events of a batch of `size` messages; topic by topic where all their stamps run on quietly."""
+        calm = len({id(run.clock) for run in arrivals}) == len(arrivals)
+        if not (calm and all(run.clock.runs_on(run.stamps) for run in arrivals)):
+            for _, clock, log_time, event in one_by_one(arrivals):
+                self.push(clock, event, log_time)
+            return
+        for clock, places, log_times, stamps, events in arrivals:
+            clock.run_on(stamps, log_times)
+            numbers = [self._number + place for place in places]
+            count = range(len(events))
+            self._pending += zip(
+                stamps, repeat(False), repeat(clock.kind), numbers, count, log_times, events, strict=False
+            )
+        self._number += size
+
+    def push(self, clock: TopicClock, event: Event, log_time_ns: int) -> None:
+        """Take one event, whatever its stamp."""
         last = clock.last_ns
         effective, raised = clock.effective(event.stamp_ns, log_time_ns)
         if last is not None and effective < last:  # The clock was set back: what waits is of the time before.
-            self._before_reset += sorted(self._pending, key=_KEY)
+            self._before_reset += sorted(self._pending)
             self._pending = []
-        self._number += 1
         kind = 0 if raised else clock.kind
-        self._pending.append((effective, raised, kind, self._number, log_time_ns, event))
-        return len(self._pending) % _BATCH == 0
+        self._pending.append((effective, raised, kind, self._number, 0, log_time_ns, event))
+        self._number += 1
 
     def ready(self) -> Iterator[tuple[int, Event]]:
         """Events that nothing can come before any more, or that waited long enough, with effective stamps."""
         pending = self._pending
-        pending.sort(key=_KEY)
+        pending.sort()
         cut = self._cut(pending)
         released, self._pending = pending[:cut], pending[cut:]
         yield from self._reset()
@@ -127,7 +177,7 @@ class Reorder:
 
     def rest(self) -> Iterator[tuple[int, Event]]:
         """Everything that still waits, at the end of the log."""
-        released, self._pending = sorted(self._pending, key=_KEY), []
+        released, self._pending = sorted(self._pending), []
         yield from self._reset()
         yield from self._released(released)
 
@@ -139,21 +189,25 @@ class Reorder:
             self._released_ns = None
 
     def _cut(self, pending: list[Keyed]) -> int:
+        """How many of the sorted events are ready."""
         stamps = [clock.last_ns for clock in self._clocks]
         known = [stamp for stamp in stamps if stamp is not None]
-        floor = min(known) if len(known) == len(stamps) else None
-        newest = max(item[4] for item in pending) if pending else 0
-        aged = newest - WINDOW_NS
-        cut = 0
-        for index, item in enumerate(pending):
-            if (floor is not None and item[0] < floor) or item[4] < aged:
+        cut = bisect_left(pending, (min(known),)) if known and len(known) == len(stamps) else 0
+        aged = max((item[5] for item in pending), default=0) - WINDOW_NS
+        for index in range(len(pending) - 1, cut - 1, -1):
+            if pending[index][5] < aged:
                 cut = index + 1
+                break
         return max(cut, len(pending) // 2) if len(pending) > MAX_PENDING else cut
 
     def _released(self, items: list[Keyed]) -> Iterator[tuple[int, Event]]:
-        for effective, *_, event in items:
-            if self._released_ns is not None and effective < self._released_ns:
-                self._losses.late_messages += 1
-            else:
-                self._released_ns = effective
-            yield effective, event
+        """Sorted events on their way; those with stamps before what is already gone are late."""
+        if not items:
+            return
+        newest = items[-1][0]
+        if self._released_ns is not None:
+            self._losses.late_messages += bisect_left(items, (self._released_ns,))
+            newest = max(newest, self._released_ns)
+        self._released_ns = newest
+        for item in items:
+            yield item[0], item[6]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import heapq
+from collections import defaultdict
+from itertools import islice
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
@@ -10,8 +12,9 @@ from hsloc.log import definitions
 from hsloc.log.decoders import Undecodable, canonical_type, is_decodable
 from hsloc.log.feeds import OdometryFeed, PoseFeed, ScanFeed, TransformFeed
 from hsloc.log.frames import BASE_FRAMES
-from hsloc.log.ordering import KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH, Reorder, TopicClock
+from hsloc.log.ordering import KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH, Reorder, TopicClock, one_by_one
 from hsloc.log.ros_survey import First, Survey
+from hsloc.log.route import Route
 from hsloc.log.source import Observation
 from hsloc.log.summary import Losses
 from hsloc.log.topics import TF, of_type
@@ -20,11 +23,16 @@ from hsloc.model import Pose2
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from hsloc.log.container import Container
-    from hsloc.log.decoders import Decoder
+    from hsloc.log.container import Container, RawMessage
     from hsloc.log.feeds import Feed
     from hsloc.log.summary import ReadOptions
     from hsloc.model import Event, OccupancyGrid
+
+_CHANNELS = 1 << 32
+"""More channels than a file can have."""
+_FIRST_BATCH = 16
+_BATCH = 1024
+"""Messages that are decoded together."""
 
 INITIAL_POSE = "hsloc.initial_pose"
 """Metadata record with x, y, theta (m, m, rad) and, if it is not the first stamp, stamp_ns."""
@@ -45,21 +53,21 @@ class RosSource:
     def events(self, losses: Losses) -> Iterator[tuple[int, Event]]:
         """As `Source.events`."""
         feeds = self._feeds(losses)
-        by_log = self.summary.order == "log"
         reorder = Reorder([clock for feed in feeds for clock in feed.clocks], losses)
-        for log_time, (feed, decoder), data in self._stream(feeds, losses):
-            try:
-                message = decoder(data)
-            except Undecodable as error:
-                losses.undecodable_messages[feed.topic] += 1
-                losses.note(f"{feed.topic}: a message cannot be decoded ({error})")
-                continue
-            for clock, event in feed.events(message, log_time):
-                if by_log:
+        routes = self._routes(feeds)
+        for batch in _batches(self._stream(routes, losses)):
+            arrivals = [
+                found
+                for key, places in _by_channel(batch)
+                for found in routes[key].read([batch[place] for place in places], places, losses)
+            ]
+            if self.summary.order == "log":
+                for _, clock, log_time, event in one_by_one(arrivals):
                     clock.effective(event.stamp_ns, log_time)  # counts stamps that run backwards
                     yield log_time, event
-                elif reorder.push(clock, event, log_time):
-                    yield from reorder.ready()
+            else:
+                reorder.take(arrivals, len(batch))
+                yield from reorder.ready()
         yield from reorder.rest()
 
     def observations(self, losses: Losses) -> Iterator[Observation]:
@@ -102,20 +110,24 @@ class RosSource:
             feeds.append(TransformFeed(TF, frames, tf_odometry, tf_truth, losses, survey.T_child_base))
         return feeds
 
-    def _stream(
-        self, feeds: Sequence[Feed], losses: Losses
-    ) -> Iterator[tuple[int, tuple[Feed, Decoder], memoryview | bytes]]:
-        """Raw messages of all files in the order of the log, each with its feed and decoder."""
-        routes: list[dict[int, tuple[Feed, Decoder]]] = [{} for _ in self._containers]
-        for feed in feeds:
-            for number, channel in self._survey.channels(feed.topic, feed.typename):
-                routes[number][channel.id] = (feed, self._survey.decoder(number, channel))
-        streams = [
-            _routed(container, routes[number], losses)
-            for number, container in enumerate(self._containers)
-            if routes[number]
-        ]
-        return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=itemgetter(0))
+    def _routes(self, feeds: Sequence[Feed]) -> dict[int, Route]:
+        """The route of each channel that is read, by its key in `_stream`."""
+        return {
+            _key(number, channel.id): Route(feed, self._survey.decoder(number, channel), channel)
+            for feed in feeds
+            for number, channel in self._survey.channels(feed.topic, feed.typename)
+        }
+
+    def _stream(self, routes: Iterable[int], losses: Losses) -> Iterator[list[RawMessage]]:
+        """Raw messages of all files in the order of the log, their channels told by keys."""
+        wanted: dict[int, list[int]] = {}
+        for key in routes:
+            number, channel = divmod(key, _CHANNELS)
+            wanted.setdefault(number, []).append(channel)
+        if [*wanted] == [0]:
+            return self._containers[0].runs(wanted[0], losses)
+        streams = [_keyed(self._containers[number], number, channels, losses) for number, channels in wanted.items()]
+        return _runs(heapq.merge(*streams, key=itemgetter(0)))
 
     def map(self) -> OccupancyGrid | None:
         """The last map of /map, or of the only topic with maps."""
@@ -147,11 +159,37 @@ class RosSource:
         return _added(container.verify() for container in self._containers)
 
 
-def _routed(
-    container: Container, routes: dict[int, tuple[Feed, Decoder]], losses: Losses
-) -> Iterator[tuple[int, tuple[Feed, Decoder], memoryview | bytes]]:
-    for log_time, _, channel, data in container.messages(routes.keys(), losses):
-        yield log_time, routes[channel], data
+def _key(number: int, channel: int) -> int:
+    return number * _CHANNELS + channel
+
+
+def _keyed(container: Container, number: int, channels: Sequence[int], losses: Losses) -> Iterator[RawMessage]:
+    for log_time, position, channel, data in container.messages(channels, losses):
+        yield log_time, position, _key(number, channel), data
+
+
+def _runs(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
+    while run := list(islice(messages, _BATCH)):
+        yield run
+
+
+def _batches(runs: Iterator[list[RawMessage]]) -> Iterator[list[RawMessage]]:
+    """Messages in short lists; a very short one first, for those who want to see the beginning alone."""
+    size = _FIRST_BATCH
+    for run in runs:
+        at = 0
+        while at < len(run):
+            yield run[at : at + size]
+            at += size
+            size = _BATCH
+
+
+def _by_channel(batch: list[RawMessage]) -> Iterable[tuple[int, list[int]]]:
+    """The places in a batch of the messages of each channel."""
+    found: defaultdict[int, list[int]] = defaultdict(list)
+    for place, message in enumerate(batch):
+        found[message[2]].append(place)
+    return found.items()
 
 
 def _pose_feed(

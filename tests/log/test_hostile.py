@@ -47,7 +47,7 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
 
 def read_all(path: Path) -> int:
     """Everything that a log can be asked for; only errors of ours may come out."""
-    begin = time.perf_counter()
+    begin = time.process_time()
     count = 0
     try:
         log = open_log(path, ALL)
@@ -59,7 +59,7 @@ def read_all(path: Path) -> int:
         assert isinstance(log.losses.lines(), list)
     except HslocError as error:
         assert "\n" not in str(error)  # noqa: PT017
-    assert time.perf_counter() - begin < LIMIT_S
+    assert time.process_time() - begin < LIMIT_S
     return count
 
 

@@ -9,18 +9,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_builders import SECOND, START, describe, make_scan
 
-from hsloc.log.ordering import KIND_ODOMETRY, KIND_SCAN, WINDOW_NS, Reorder, TopicClock
+from hsloc.log.ordering import KIND_ODOMETRY, KIND_SCAN, WINDOW_NS, Arrivals, Reorder, TopicClock
 from hsloc.log.summary import Losses
 from hsloc.model import Odometry, Pose2
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from hsloc.model import Event
 
 MS = SECOND // 1000
 
 
-def order(arrivals: list[tuple[str, int, int]]) -> tuple[list[tuple[str, int]], Losses]:
-    """Send (kind, stamp, log time) in the order of arrival; returns (kind, stamp) as they come out."""
+def batched(items: list[tuple[str, int, int]], size: int) -> Iterator[list[tuple[str, int, int]]]:
+    for at in range(0, len(items), size):
+        yield items[at : at + size]
+
+
+def order(arrivals: list[tuple[str, int, int]], size: int = 64) -> tuple[list[tuple[str, int]], Losses]:
+    """Send (kind, stamp, log time) in the order of arrival, in batches; returns (kind, stamp) as they come out."""
     losses = Losses()
     clocks = {
         "odometry": TopicClock("/odom", KIND_ODOMETRY, losses),
@@ -28,10 +35,13 @@ def order(arrivals: list[tuple[str, int, int]]) -> tuple[list[tuple[str, int]], 
     }
     reorder = Reorder(list(clocks.values()), losses)
     out: list[Event] = []
-    for kind, stamp, log_time in arrivals:
-        event: Event = make_scan(stamp) if kind == "scan" else Odometry(stamp, Pose2())
-        if reorder.push(clocks[kind], event, log_time):
-            out += [found for _, found in reorder.ready()]
+    for batch in batched(arrivals, size):
+        rows: dict[str, list[tuple[int, int, int, Event]]] = {}
+        for place, (kind, stamp, log_time) in enumerate(batch):
+            event: Event = make_scan(stamp) if kind == "scan" else Odometry(stamp, Pose2())
+            rows.setdefault(kind, []).append((place, log_time, stamp, event))
+        reorder.take([Arrivals(clocks[kind], *zip(*found, strict=True)) for kind, found in rows.items()], len(batch))
+        out += [found for _, found in reorder.ready()]
     out += [found for _, found in reorder.rest()]
     return [describe(event)[:2] for event in out], losses
 
@@ -103,7 +113,8 @@ def test_a_topic_that_fell_silent_holds_nothing_up_for_longer_than_the_window() 
     held = 0
     for number in range(2000):
         stamp = START + number * 20 * MS
-        if reorder.push(odometry, Odometry(stamp, Pose2()), stamp):
+        reorder.push(odometry, Odometry(stamp, Pose2()), stamp)
+        if number % 64 == 0:
             list(reorder.ready())
         held = max(held, len(reorder._pending))
     assert held < WINDOW_NS / (20 * MS) + 100

@@ -8,7 +8,7 @@ to the last bit, what `hsloc.log.decode` makes of them one by one, and where mes
 from __future__ import annotations
 
 from math import atan2
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -21,6 +21,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.log.decode import Payload
+
+    class ColumnDecoder(Protocol):
+        """Many messages' poses; None where they are to be decoded one by one."""
+
+        def __call__(self, payloads: Sequence[Payload], *, covariances: bool) -> PoseColumns | None:
+            """Covariances are None where they are not asked for."""
+            ...
+
 
 _STAMP = slice(4, 12)
 """Where the stamp is, the one field before the pose that differs from message to message."""
@@ -39,57 +47,68 @@ class PoseColumns(NamedTuple):
     covariances: Sequence[NDArray[np.float64] | None]
 
 
-def odometry(payloads: Sequence[Payload]) -> PoseColumns | None:
-    """nav_msgs/Odometry from CDR; None where the messages are not laid out alike."""
-    return _decoded(payloads, decode.odometry_pose_at, has_covariance=True)
+def odometry(payloads: Sequence[Payload], *, covariances: bool = True) -> PoseColumns | None:
+    """nav_msgs/Odometry from CDR; None where the messages are not laid out alike. Covariances are read if asked for."""
+    found = _rows(payloads, decode.odometry_pose_at, {"pose": "7<f8", "covariance": "36<f8"})
+    if found is None:
+        return None
+    return _poses(found, _covariances(found["covariance"]) if covariances else (None,) * len(found))
 
 
-def pose_stamped(payloads: Sequence[Payload]) -> PoseColumns | None:
+def pose_stamped(payloads: Sequence[Payload], *, covariances: bool = False) -> PoseColumns | None:
     """geometry_msgs/PoseStamped or PoseWithCovarianceStamped from CDR; None where they are not laid out alike."""
-    return _decoded(payloads, decode.stamped_pose_at, has_covariance=False)
+    del covariances  # not read one by one either
+    found = _rows(payloads, decode.stamped_pose_at, {"pose": "7<f8"})
+    return None if found is None else _poses(found, (None,) * len(found))
 
 
-def _decoded(
-    payloads: Sequence[Payload], pose_at: Callable[[Payload], int], has_covariance: bool
-) -> PoseColumns | None:
+def _rows(
+    payloads: Sequence[Payload], pose_at: Callable[[Payload], int], fields: dict[str, str]
+) -> NDArray[np.void] | None:
+    """The stamps of the messages, and the fields from the pose on; None where the messages are not laid out alike."""
     length = len(payloads[0])
     try:
         at = pose_at(payloads[0])
     except decode.BAD_PAYLOAD:
         return None
-    end = at + decode.POSE_BYTES + (decode.COVARIANCE_BYTES if has_covariance else 0)
-    if end > length or set(map(len, payloads)) != {length}:
+    formats = ["<i4", "<u4", *fields.values()]
+    offsets = [4, 8, at, at + decode.POSE_BYTES][: len(formats)]
+    if offsets[-1] + np.dtype(formats[-1]).itemsize > length or set(map(len, payloads)) != {length}:
         return None
-    joined = np.frombuffer(b"".join(payloads), dtype=np.uint8).reshape(len(payloads), length)
-    head = joined[:, :at]
+    joined = b"".join(payloads)
+    head = np.frombuffer(joined, np.uint8).reshape(len(payloads), length)[:, :at]
     alike = head == head[0]
     alike[:, _STAMP] = True
     if not alike.all():
         return None
-    stamps = joined[:, _STAMP].copy()
-    seconds, nanoseconds = stamps.view("<i4")[:, 0], stamps.view("<u4")[:, 1]
-    x, y, _, qx, qy, qz, qw = joined[:, at : at + decode.POSE_BYTES].copy().view("<f8").T
+    names = ["seconds", "nanoseconds", *fields]
+    layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": length})
+    return np.frombuffer(joined, layout)
+
+
+def _poses(rows: NDArray[np.void], covariances: Sequence[NDArray[np.float64] | None]) -> PoseColumns:
+    x, y, _, qx, qy, qz, qw = np.ascontiguousarray(rows["pose"].T)
     with np.errstate(all="ignore"):  # Damaged numbers overflow; the feed refuses them.
         sines, cosines = 2.0 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz
     # Not numpy's arctan2, whose last bit depends on the processor.
     theta = list(map(atan2, sines.tolist(), cosines.tolist()))
-    covariances: Sequence[NDArray[np.float64] | None] = (None,) * len(payloads)
-    if has_covariance:
-        covariances = _covariances(joined[:, at + decode.POSE_BYTES : end])
-    return PoseColumns(seconds.astype(np.int64) * NANOSECONDS + nanoseconds, x, y, theta, covariances)
+    stamps = rows["seconds"].astype(np.int64) * NANOSECONDS + rows["nanoseconds"]
+    return PoseColumns(stamps, x, y, theta, covariances)
 
 
-def _covariances(raw: NDArray[np.uint8]) -> Sequence[NDArray[np.float64] | None]:
-    """Of each row of 36 doubles the part in the plane. Where all rows are the same, one for all."""
-    if (raw == raw[0]).all():
-        return (decode.plane_covariance(raw[0].tobytes()),) * len(raw)
-    plane = raw.copy().view("<f8")[:, decode.PLANE].reshape(-1, 3, 3)
+def _covariances(full: NDArray[np.float64]) -> Sequence[NDArray[np.float64] | None]:
+    """Of each row of 36 the part in the plane. Where the first is that of all, one for all."""
+    first = full[0].tobytes()
+    if full[-1].tobytes() == first and full.tobytes() == first * len(full):
+        return (decode.plane_covariance(first),) * len(full)
+    plane = full[:, decode.PLANE].reshape(-1, 3, 3)
     plane.setflags(write=False)
-    stated = np.any(plane, axis=(1, 2))
-    return [row if stated[k] else None for k, row in enumerate(plane)]
+    if (plane[:, 0, 0] > 0.0).all():
+        return list(plane)
+    return [row if row.any() else None for row in plane]
 
 
-BY_HAND: dict[str, Callable[[Sequence[Payload]], PoseColumns | None]] = {
+BY_HAND: dict[str, ColumnDecoder] = {
     definitions.ODOMETRY: odometry,
     definitions.POSE_STAMPED: pose_stamped,
     definitions.POSE_WITH_COVARIANCE_STAMPED: pose_stamped,

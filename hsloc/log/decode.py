@@ -91,6 +91,7 @@ _SIZE = Struct("<I")
 _SCAN = Struct("<7fI")
 _POSE = Struct("<7d")
 POSE_BYTES = _POSE.size
+_F4 = np.dtype("<f4")
 _MAP_INFO = Struct("<fII")
 COVARIANCE_BYTES = 36 * 8
 _ZEROS = bytes(COVARIANCE_BYTES)
@@ -140,7 +141,7 @@ def _pose2(values: tuple[float, ...]) -> Pose2:
 
 def _floats(data: Payload, at: int, count: int) -> NDArray[np.float32]:
     # A copy: a view would keep the whole chunk in memory for as long as the scan lives.
-    return np.frombuffer(data, dtype="<f4", count=count, offset=at).copy()
+    return np.frombuffer(data, _F4, count, at).copy()
 
 
 def laser_scan(data: Payload) -> ScanMessage:

@@ -9,14 +9,13 @@ from hsloc.log import columns, decode, definitions, foxglove, schema
 from hsloc.log.definitions import long_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
-    from hsloc.log.columns import PoseColumns
+    from hsloc.log.columns import ColumnDecoder
     from hsloc.log.container import Channel
     from hsloc.log.decode import Payload
 
     Decoder = Callable[[Payload], Any]
-    ColumnDecoder = Callable[[Sequence[Payload]], PoseColumns | None]
 
 _ALIASES = {"tf/msg/tfMessage": definitions.TF_MESSAGE} | foxglove.TYPES
 """ROS 1's old name of a type that is otherwise the same, and Foxglove's types."""

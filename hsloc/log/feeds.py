@@ -110,7 +110,7 @@ class OdometryFeed:
         self.clocks = (clock,)
         self._clock = clock
         self._losses = losses
-        self._is_truth = is_truth
+        self.is_truth = is_truth
         self._T_child_base = T_child_base
 
     def events(self, message: OdometryMessage | PoseMessage, log_time_ns: int) -> Iterable[Stamped]:
@@ -122,7 +122,7 @@ class OdometryFeed:
             self._losses.invalid_messages[self.topic] += 1
             return ()
         pose = message.pose if self._T_child_base is None else message.pose @ self._T_child_base
-        if self._is_truth:
+        if self.is_truth:
             return ((self._clock, Truth(stamp, pose)),)
         return ((self._clock, Odometry(stamp, pose, message.covariance)),)
 
@@ -138,7 +138,7 @@ class OdometryFeed:
         T_child_base = self._T_child_base
         if T_child_base is not None:
             poses = [pose @ T_child_base for pose in poses]
-        if self._is_truth:
+        if self.is_truth:
             return Arrivals(self._clock, places, log_times, stamps, list(map(Truth, stamps, poses)))
         events = list(map(Odometry, stamps, poses, columns.covariances))
         return Arrivals(self._clock, places, log_times, stamps, events)

@@ -144,23 +144,28 @@ class McapContainer:
     def _split(self, data: bytes, segment: Segment, wanted: frozenset[int] | None, losses: Losses) -> list[RawMessage]:
         found: list[RawMessage] = []
         append = found.append
-        unpack = records.MESSAGE.unpack_from
+        unpack = records.MESSAGE_HEAD.unpack_from
         view = memoryview(data)
         # Unique and in the order of the file, as an uncompressed chunk may be larger than its place in it.
         base = segment.at << 32
         at, end = 0, len(data)
         head_size, prefix_size = records.MESSAGE.size, records.PREFIX.size
+        last_head = end - head_size
         while end - at >= prefix_size:
-            if end - at >= head_size:
-                opcode, length, channel, _, log_time, _ = unpack(data, at)
+            if at <= last_head:
+                opcode, length, channel, log_time = unpack(data, at)
             else:
                 opcode, length = records.PREFIX.unpack_from(data, at)
             following = at + prefix_size + length
-            if following > end or opcode == 0 or (opcode == 5 and length < records.MESSAGE_FIELDS):
+            if following > end:
                 break
             if opcode == 5:
+                if length < records.MESSAGE_FIELDS:
+                    break
                 if wanted is None or channel in wanted:
                     append((log_time, base + at, channel, view[at + head_size : following]))
+            elif opcode == 0:
+                break
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and not self._directory.knows(opcode, data, at):
                 self._directory.define(opcode, view[at + prefix_size : following], segment.at, losses)
             at = following

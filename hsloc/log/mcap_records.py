@@ -51,6 +51,8 @@ PREFIX = Struct("<BQ")
 """Opcode and length of what follows."""
 MESSAGE = Struct("<BQHIQQ")
 """Prefix, channel, sequence, log time, publish time: what stands before a message's payload."""
+MESSAGE_HEAD = Struct("<BQH4xQ8x")
+"""The same without sequence and publish time."""
 MESSAGE_FIELDS = MESSAGE.size - PREFIX.size
 _CHUNK = Struct("<QQQII")
 NUMBER = Struct("<H")

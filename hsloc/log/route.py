@@ -33,7 +33,8 @@ class Route:
     def read(self, messages: Sequence[RawMessage], places: Sequence[int], losses: Losses) -> Sequence[Arrivals]:
         """The events of messages, which have these places in their batch; what cannot be decoded is counted."""
         if self._columns is not None and isinstance(self._feed, OdometryFeed) and len(messages) > _FEW:
-            columns = self._columns([message[3] for message in messages])
+            payloads = [message[3] for message in messages]
+            columns = self._columns(payloads, covariances=not self._feed.is_truth)
             if columns is not None:
                 arrivals = self._feed.arrivals(columns, places, [message[0] for message in messages])
                 if arrivals is not None:

@@ -62,7 +62,7 @@ def test_columns_are_the_messages_to_the_last_bit(data: st.DataObject, name: str
         at = decode.odometry_pose_at(payload) if name == definitions.ODOMETRY else decode.stamped_pose_at(payload)
         numbers(data, payload, at, 7)
         payloads.append(bytes(payload))
-    found = columns.BY_HAND[name](payloads)
+    found = columns.BY_HAND[name](payloads, covariances=True)
     assert found is not None
     assert repr(as_rows(found)) == repr(one_by_one(name, payloads))  # nan is not nan
 

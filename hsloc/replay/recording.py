@@ -94,6 +94,8 @@ class Recording:
     def trajectory(self) -> tuple[Trajectory, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
         """One pose for each odometry message, revised where the estimator knew better later; and which are believed."""
         estimated = _trajectory(self._odometry_stamps, self._poses)
+        if not self._revisions:
+            return estimated, np.array(self._localised, dtype=np.bool_)
         odometry = self.odometry().poses
         poses = estimated.poses.copy()
         localised = np.array(self._localised, dtype=np.bool_)
@@ -117,4 +119,5 @@ class Recording:
 
 
 def _trajectory(stamps: array[int], poses: array[float]) -> Trajectory:
-    return Trajectory(np.array(stamps, dtype=np.int64), np.array(poses, dtype=np.float64).reshape(-1, 3))
+    """A view of the columns, which can grow no more while it lives: an hour's would be large to copy."""
+    return Trajectory(np.frombuffer(stamps, dtype=np.int64), np.frombuffer(poses, dtype=np.float64).reshape(-1, 3))

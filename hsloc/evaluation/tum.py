@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import EvaluationError
-from hsloc.evaluation.files import write_text_atomically
+from hsloc.evaluation.files import write_atomically
 from hsloc.model import Pose2, Trajectory
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 NS_PER_S = 1_000_000_000
 MAX_NS = 2**63 - 1
+_BLOCK = 4096
 QUATERNION_TOLERANCE = 0.01
 """How far a quaternion's norm may be from 1: files with four decimals are common, all-zero ones are broken."""
 
@@ -58,6 +59,16 @@ def parse_stamp(text: str) -> int:
 
 def format_tum(trajectory: Trajectory) -> str:
     """A trajectory as the text of a TUM file: single spaces, no header, a picometre and a picoradian exact."""
+    return "".join(_blocks(trajectory))
+
+
+def _blocks(trajectory: Trajectory) -> Iterator[str]:
+    """The text in blocks of a few thousand lines: an hour's poses are not all in memory as text."""
+    for at in range(0, len(trajectory), _BLOCK):
+        yield _lines(Trajectory(trajectory.stamps_ns[at : at + _BLOCK], trajectory.poses[at : at + _BLOCK]))
+
+
+def _lines(trajectory: Trajectory) -> str:
     half = trajectory.poses[:, 2] / 2.0
     # Adding 0.0 turns -0.0 into 0.0: the same pose always gives the same text.
     columns = np.round(np.column_stack((trajectory.poses[:, :2], np.sin(half), np.cos(half))), 12) + 0.0
@@ -70,7 +81,7 @@ def format_tum(trajectory: Trajectory) -> str:
 
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     """Write a trajectory as a TUM file, whole or not at all; raises `OutputError`."""
-    write_text_atomically(Path(path), format_tum(trajectory))
+    write_atomically(Path(path), lambda stream: stream.writelines(text.encode() for text in _blocks(trajectory)))
 
 
 def read_tum(path: str | Path) -> Trajectory:

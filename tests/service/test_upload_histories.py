@@ -159,7 +159,7 @@ def checksum(algorithm: str, body: bytes) -> str:
 
 
 Histories.TestCase.settings = settings(
-    max_examples=20,
+    max_examples=12,
     stateful_step_count=20,
     deadline=None,
     derandomize=True,

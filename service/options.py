@@ -18,6 +18,9 @@ from typing import Any
 from service.errors import ServiceError
 
 _KINDS = {float: "number", int: "integer", bool: "boolean", str: "string"}
+_LARGEST: dict[str, float] = {"number": 1e300, "integer": (1 << 63) - 1}
+"""What the schema allows; the ranges that make sense are the job's to check."""
+_ITEMS = 1000
 
 
 @functools.cache
@@ -28,34 +31,41 @@ def options() -> dict[str, Any]:
     return typing.cast("dict[str, Any]", json.loads(done.stdout))
 
 
-def check(config: dict[str, Any]) -> None:
-    """Raises ServiceError 422 for an unknown key or a value of the wrong type; ranges are checked by the job."""
-    _check(config, options()["config_schema"], "config")
+def check(config: dict[str, Any]) -> dict[str, Any]:
+    """The parameters, whole numbers as such (to JSON Schema, 30.0 is an integer); ranges are checked by the job.
+
+    Raises ServiceError 422 for an unknown key or a value of the wrong type.
+    """
+    return typing.cast("dict[str, Any]", _check(config, options()["config_schema"], "config"))
 
 
-def _check(value: Any, schema: dict[str, Any], where: str) -> None:
+def whole(value: object) -> object:
+    """A number without a fraction as an integer; anything else as it is."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _check(value: Any, schema: dict[str, Any], where: str) -> Any:
     if "anyOf" in schema:
         if value is None:
-            return
+            return None
         schema = next(each for each in schema["anyOf"] if each != {"type": "null"})
     kind = schema["type"]
     if kind == "object":
         if not isinstance(value, dict):
             raise _wrong(where, "must be an object")
-        for key, item in value.items():
+        for key in value:
             if key not in schema["properties"]:
                 raise _wrong(f"{where}.{key[:60]}", f"is unknown; known are {', '.join(schema['properties'])}")
-            _check(item, schema["properties"][key], f"{where}.{key}")
-        return
+        return {key: _check(item, schema["properties"][key], f"{where}.{key}") for key, item in value.items()}
     if kind == "array":
-        if not isinstance(value, list) or len(value) > 1000:
-            raise _wrong(where, "must be a list")
-        for item in value:
-            _check(item, schema["items"], where)
-        return
+        if not isinstance(value, list) or len(value) > _ITEMS:
+            raise _wrong(where, f"must be a list of at most {_ITEMS}")
+        return [_check(item, schema["items"], where) for item in value]
+    if kind == "integer":
+        value = whole(value)
     fits = {
-        "number": isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300,
-        "integer": isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1 << 63,
+        "number": isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST["number"],
+        "integer": isinstance(value, int) and not isinstance(value, bool) and abs(value) <= _LARGEST["integer"],
         "boolean": isinstance(value, bool),
         "string": isinstance(value, str),
     }
@@ -63,6 +73,7 @@ def _check(value: Any, schema: dict[str, Any], where: str) -> None:
         raise _wrong(where, f"must be of type {kind}")
     if "enum" in schema and value not in schema["enum"]:
         raise _wrong(where, f"must be one of {', '.join(schema['enum'])}")
+    return value
 
 
 def _wrong(where: str, what: str) -> ServiceError:
@@ -91,14 +102,20 @@ def _schema(hint: Any, default: Any) -> dict[str, Any]:
         return {"anyOf": [_schema(inner, default), {"type": "null"}]}
     if typing.get_origin(hint) is tuple:
         inner = typing.get_args(hint)[0]
-        items = {"type": _KINDS.get(inner, "number")}
-        return {"type": "array", "items": items, "default": list(default or ())}
-    found: dict[str, Any] = {"type": _KINDS.get(typing.get_origin(hint) or hint, "string")}
+        items = _bounded(_KINDS.get(inner, "number"))
+        return {"type": "array", "items": items, "maxItems": _ITEMS, "default": list(default or ())}
+    found = _bounded(_KINDS.get(typing.get_origin(hint) or hint, "string"))
     if typing.get_origin(hint) is typing.Literal:
         found = {"type": "string", "enum": list(typing.get_args(hint))}
     if default is not None:
         found["default"] = default
     return found
+
+
+def _bounded(kind: str) -> dict[str, Any]:
+    if kind not in _LARGEST:
+        return {"type": kind}
+    return {"type": kind, "minimum": -_LARGEST[kind], "maximum": _LARGEST[kind]}
 
 
 if __name__ == "__main__":

@@ -14,8 +14,10 @@ from fastapi.staticfiles import StaticFiles
 from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.routing import Match
 
 from hsloc import __version__
+from service import options
 from service.database import Database
 from service.dispatcher import LocalDispatcher
 from service.errors import ServiceError
@@ -33,6 +35,7 @@ from service.http import (
 )
 from service.http.context import Context
 from service.http.guard import PUBLIC, PUBLIC_PREFIX, Guard, problem
+from service.http.schemas import RunRequest
 from service.jobs import Jobs
 from service.leases import Leases
 from service.logs import log
@@ -46,6 +49,7 @@ if TYPE_CHECKING:
 
     from service.settings import Settings
 
+ROUTES = (files_routes, tus, jobs_routes, events_routes, results_routes, run_routes, system_routes)
 WEB = Path(__file__).parent.parent / "web"
 _CODES = {404: "not_found", 405: "method", 413: "too_large", 400: "bad_request", 416: "range"}
 
@@ -100,11 +104,11 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.context = context
     app.add_middleware(Guard, settings=settings, tokens=Tokens(database))
-    for module in (files_routes, tus, jobs_routes, events_routes, results_routes, run_routes, system_routes):
+    for module in ROUTES:
         app.include_router(module.router)
     _add_page(app)
     _add_errors(app, storage)
-    _describe_tokens(app)
+    _describe(app)
     return app
 
 
@@ -135,6 +139,8 @@ def _add_errors(app: FastAPI, storage: Storage) -> None:
     @app.exception_handler(HTTPException)
     async def other(request: Request, error: HTTPException) -> Response:
         headers = _closing(request, dict(error.headers or {}))
+        if error.status_code == 405 and (methods := _methods(request)):
+            headers["Allow"] = ", ".join(methods)
         return _answer(error.status_code, _CODES.get(error.status_code, "error"), str(error.detail), headers)
 
     @app.exception_handler(ClientDisconnect)
@@ -150,6 +156,13 @@ def _add_errors(app: FastAPI, storage: Storage) -> None:
         return _answer(503, "database", "the database is busy", {"Retry-After": "1"})
 
 
+def _methods(request: Request) -> list[str]:
+    """Methods of all routes at this address; the router names those of the first alone, RFC 9110 wants them all."""
+    routes = [route for module in ROUTES for route in module.router.routes]
+    found = [route for route in routes if route.matches(request.scope)[0] is not Match.NONE]
+    return sorted({method for route in found for method in getattr(route, "methods", ())})
+
+
 def _closing(request: Request, headers: dict[str, str]) -> dict[str, str]:
     """After a refusal nobody reads what is left of a large body."""
     if request.method in ("POST", "PUT", "PATCH"):
@@ -161,18 +174,36 @@ def _answer(status: int, code: str, message: str, headers: dict[str, str], detai
     return Response(problem(code, message, details), status, headers, "application/json")
 
 
-def _describe_tokens(app: FastAPI) -> None:
-    """The OpenAPI says which routes need a token: all that the guard does not let pass."""
+def _describe(app: FastAPI) -> None:
+    """What FastAPI cannot know: the routes that need a token, the schema of parameters, that no parameter is null."""
 
     def openapi() -> dict[str, Any]:
         if app.openapi_schema is None:
             schema = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
-            schema.setdefault("components", {})["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
+            parts = schema.setdefault("components", {})
+            parts["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
+            models = parts["schemas"]
+            models["Config"] = options.options()["config_schema"]
+            models["RunRequest"] = RunRequest.model_json_schema(ref_template="#/components/schemas/{model}")
+            models["RunRequest"].pop("$defs")  # FastAPI has put them among the others
+            for name in ("RunRequest", "JobRequest", "RerunRequest"):
+                models[name]["properties"]["config"]["anyOf"][0] = {"$ref": "#/components/schemas/Config"}
             for path, operations in schema["paths"].items():
                 if path not in PUBLIC and not path.startswith(PUBLIC_PREFIX):
                     for operation in operations.values():
                         operation["security"] = [{"token": []}]
+                for operation in operations.values():
+                    for parameter in operation.get("parameters", ()):
+                        _not_null(parameter["schema"])
             app.openapi_schema = schema
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]
+
+
+def _not_null(schema: dict[str, Any]) -> None:
+    """A parameter that is left out is None to us; on the wire, `null` would be a word like any other."""
+    kinds = [kind for kind in schema.get("anyOf", ()) if kind != {"type": "null"}]
+    if len(kinds) == 1:
+        del schema["anyOf"]
+        schema |= kinds[0]

@@ -29,7 +29,7 @@ Digest = Annotated[
 ]
 _BODY = {
     "requestBody": {
-        "required": True,
+        "required": False,  # on the wire, no body and a body of no bytes are one thing: an empty file
         "description": "the bytes of the file; any size, streamed to the disk",
         "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
     }

@@ -36,7 +36,7 @@ Key = Annotated[
 def submit(ctx: Ctx, who: Writer, response: Response, request: JobRequest, idempotency_key: Key = None) -> JobView:
     """Queue a job. The answer comes when the job is safe on the disk; 200 if it was there already (Idempotency-Key)."""
     if request.config is not None:
-        options.check(request.config)
+        request.config = options.check(request.config)
     job, created = ctx.jobs.submit(who, request.model_dump(), idempotency_key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     if created:
@@ -84,7 +84,7 @@ def rerun(
     """The same job again, with the same seed, but for what the body changes."""
     changed: dict[str, Any] = {} if changes is None else changes.model_dump(exclude_unset=True)
     if changed.get("config") is not None:
-        options.check(changed["config"])
+        changed["config"] = options.check(changed["config"])
     for name in ("mode", "preset", "seed", "unknown_start"):
         if changed.get(name, ...) is None:
             del changed[name]

@@ -14,7 +14,7 @@ from starlette.concurrency import run_in_threadpool
 from service import options
 from service.errors import ServiceError
 from service.http.context import Context, Ctx, Writer, problems
-from service.http.schemas import JobRequest, JobView
+from service.http.schemas import JobRequest, JobView, RunRequest
 from service.http.views import job_view
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ router = APIRouter(prefix="/v1", tags=["jobs"])
 FILES = ("log", "map", "map_image")
 FIELD_BYTES = 64 << 10
 HEADER_BYTES = 8 << 10
-_FILE = {"type": "string", "format": "binary"}
+_FILE = {"type": "string", "contentMediaType": "application/octet-stream"}
 _BODY = {
     "requestBody": {
         "required": True,
@@ -40,8 +40,10 @@ _BODY = {
                         "log": {**_FILE, "description": "the log"},
                         "map": {**_FILE, "description": "the map's YAML"},
                         "map_image": {**_FILE, "description": "the map's image"},
-                        "request": {"type": "string", "description": "the rest of a job's request, as JSON"},
+                        "request": {"$ref": "#/components/schemas/RunRequest"},
                     },
+                    "additionalProperties": False,
+                    "dependentRequired": {"map": ["map_image"], "map_image": ["map"]},
                 }
             }
         },
@@ -67,7 +69,7 @@ async def run(request: Request, response: Response, ctx: Ctx, who: Writer) -> Jo
                 raise ServiceError(422, "invalid", f"unknown or repeated field {name[:60]!r}")
         wanted = _request(text, files)
         if wanted.config is not None:
-            await run_in_threadpool(options.check, wanted.config)
+            wanted.config = await run_in_threadpool(options.check, wanted.config)
         job, _ = await to_thread.run_sync(ctx.jobs.submit, who, wanted.model_dump())
     except BaseException:
         for file_id in files.values():
@@ -91,13 +93,9 @@ def _request(text: bytes, files: dict[str, str]) -> JobRequest:
     if ("map" in files) != ("map_image" in files):
         raise ServiceError(422, "invalid", "a map is two files: `map` (YAML) and `map_image`")
     try:
-        values = json.loads(text)
-        if not isinstance(values, dict) or "log" in values or "map" in values:
-            raise ServiceError(422, "invalid", "`request` must be an object without `log` and `map`")
-        values["log"] = files["log"]
-        if "map" in files:
-            values["map"] = {"yaml": files["map"], "image": files["map_image"]}
-        return JobRequest.model_validate(values)
+        how = RunRequest.model_validate(json.loads(text))
+        chart = {"yaml": files["map"], "image": files["map_image"]} if "map" in files else None
+        return JobRequest.model_validate({**how.model_dump(), "log": files["log"], "map": chart})
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])

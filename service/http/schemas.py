@@ -5,12 +5,17 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
+
+from service.options import whole
 
 UUID_PATTERN = r"^[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}$"
 Ident = Annotated[str, Field(pattern=UUID_PATTERN, examples=["3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f"])]
 PoseList = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3, examples=[[1.0, 2.0, 0.0]])]
 Label = Annotated[str, Field(max_length=255)]
+Seed = Annotated[int, Field(ge=0, le=2**53 - 1), BeforeValidator(whole)]
+Config = dict[str, Any]
+"""Parameters; `service.options` knows their schema, which the application puts into the OpenAPI."""
 
 
 class Strict(BaseModel):
@@ -66,18 +71,16 @@ class ReadRequest(Strict):
     deskew: bool = False
 
 
-class JobRequest(Strict):
-    """What to run: the same as the options of `hsloc replay`."""
+class RunRequest(Strict):
+    """How to run: the same as the options of `hsloc replay`."""
 
-    log: Ident = Field(description="id of the uploaded log")
-    map: MapFiles | None = Field(default=None, description="map; default: the one in the log")
     mode: Literal["auto", "localise", "slam"] = Field(
         default="auto", description="auto: localise if there is a map, else draw one"
     )
     matcher: Literal["hide", "harmony_search", "icp"] | None = None
     mapper: Literal["graph", "point"] | None = None
     preset: Literal["default", "paper", "paper-literal"] = "default"
-    seed: int = Field(default=0, ge=0, le=2**53 - 1, description="at most what a browser counts exactly")
+    seed: Seed = Field(default=0, description="at most what a browser counts exactly")
     initial_pose: PoseList | None = Field(default=None, description="start: x, y (m), yaw (rad)")
     unknown_start: bool = Field(default=False, description="search the whole map, whatever the log says")
     no_odometry: bool = Field(default=False, description="do not look at the log's odometry (slam alone)")
@@ -85,10 +88,17 @@ class JobRequest(Strict):
         default=None, description="of the trajectory with the truth; default: none on a given map, se2 on a drawn one"
     )
     read: ReadRequest | None = None
-    config: dict[str, Any] | None = Field(default=None, description="parameters, on top of the preset; see /v1/options")
+    config: Config | None = Field(default=None, description="parameters, on top of the preset; see /v1/options")
     webhook: Annotated[str, Field(max_length=2000, pattern=r"^https?://[^\s]+$")] | None = Field(
         default=None, description="URL that is told when the job has ended"
     )
+
+
+class JobRequest(RunRequest):
+    """What to run, and how."""
+
+    log: Ident = Field(description="id of the uploaded log")
+    map: MapFiles | None = Field(default=None, description="map; default: the one in the log")
 
 
 class RerunRequest(Strict):
@@ -98,10 +108,10 @@ class RerunRequest(Strict):
     matcher: Literal["hide", "harmony_search", "icp"] | None = None
     mapper: Literal["graph", "point"] | None = None
     preset: Literal["default", "paper", "paper-literal"] | None = None
-    seed: int | None = Field(default=None, ge=0, le=2**53 - 1)
+    seed: Seed | None = None
     initial_pose: PoseList | None = None
     unknown_start: bool | None = None
-    config: dict[str, Any] | None = None
+    config: Config | None = None
 
 
 State = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]

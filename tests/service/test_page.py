@@ -5,6 +5,7 @@ Needs Playwright and a Chromium; `HSLOC_SCREENSHOTS=DIR` keeps pictures.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import shutil
@@ -21,9 +22,11 @@ if TYPE_CHECKING:
 
     from conftest import Live
 
-sync_api = pytest.importorskip("playwright.sync_api")
+sync_api = pytest.importorskip("playwright.sync_api", reason="THE PAGE IS NOT TESTED: playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="THE PAGE IS NOT TESTED: no chromium (apt-get install chromium)"
+)
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 REAL = ",".join(Settings().worker_command)
@@ -110,19 +113,89 @@ def test_upload_watch_look_download(
         assert job["log"] == NASTY
         content = client.get(f"/v1/jobs/{job['id']}/results/trajectory.tum").content
     assert Path(download.value.path()).read_bytes() == content
-    before = page.text_content("#time-text")
-    page.focus("#view")
-    for key in ("+", "+", "ArrowLeft", ",", ","):
-        page.keyboard.press(key)
-    assert page.text_content("#time-text") != before
-    page.mouse.move(700, 400)
-    page.mouse.wheel(0, -400)
-    page.uncheck("#legend input >> nth=1")
+    look_around_by_keyboard(page)
+    look_around_by_mouse(page)
     picture(page, "4-zoomed")
-    page.click("text=Run again")
+    look_on_a_phone_in_the_dark(page)
+    press(page, "#job-buttons button >> text=Run again")
     page.wait_for_function("() => document.querySelectorAll('#jobs li').length === 2")
     page.wait_for_selector("#result:not([hidden])")
     assert page.text_content("#job-state") == "succeeded"
+
+
+def drawn(page: Any, selector: str = "#view") -> str:
+    """What a canvas shows."""
+    return str(page.evaluate("(s) => document.querySelector(s).toDataURL()", selector))
+
+
+def press(page: Any, selector: str) -> None:
+    """Come to a control by Tab alone, and press Enter."""
+    target = page.locator(selector).first
+    for _ in range(80):
+        page.keyboard.press("Tab")
+        if target.evaluate("(e) => e === document.activeElement"):
+            break
+    assert target.evaluate("(e) => e === document.activeElement && e.matches(':focus-visible')")
+    page.keyboard.press("Enter")
+
+
+def look_around_by_keyboard(page: Any) -> None:
+    page.focus("#view")
+    page.keyboard.press("0")
+    whole = seen = drawn(page)
+    for key in ("+", "ArrowLeft", "ArrowDown", "-"):
+        page.keyboard.press(key)
+        assert drawn(page) != seen, key
+        seen = drawn(page)
+    page.keyboard.press("0")
+    assert drawn(page) == whole
+    time, plot = page.text_content("#time-text"), drawn(page, "#plot")
+    page.keyboard.press(",")
+    assert page.text_content("#time-text") != time
+    assert drawn(page) != whole
+    assert drawn(page, "#plot") != plot  # the moment is marked among the errors
+    page.focus("#time")
+    page.keyboard.press("Home")
+    assert (page.text_content("#time-text") or "").startswith("0.0 s")
+    page.keyboard.press("End")
+    assert page.text_content("#time-text") == time
+    with page.expect_download() as download:
+        press(page, "#assets button >> text=metrics.json")
+    assert download.value.suggested_filename == "metrics.json"
+
+
+def look_around_by_mouse(page: Any) -> None:
+    page.click("#zoom-all")
+    whole = drawn(page)
+    box = page.locator("#view").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.wheel(0, -400)
+    page.wait_for_function("(seen) => document.querySelector('#view').toDataURL() !== seen", arg=whole)
+    zoomed = drawn(page)
+    page.mouse.down()
+    page.mouse.move(x + 80, y + 40)
+    page.mouse.up()
+    moved = drawn(page)
+    assert moved != zoomed
+    page.uncheck("#legend input >> nth=1")
+    assert drawn(page) != moved
+    page.locator("#time").fill("300")
+    assert not (page.text_content("#time-text") or "").startswith("112")
+
+
+def look_on_a_phone_in_the_dark(page: Any) -> None:
+    ground = "getComputedStyle(document.documentElement).backgroundColor"
+    light, map_in_light = page.evaluate(ground), drawn(page)
+    page.emulate_media(color_scheme="dark")
+    assert page.evaluate(ground) != light
+    page.wait_for_function("(seen) => document.querySelector('#view').toDataURL() !== seen", arg=map_in_light)
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert page.locator("#view").bounding_box()["width"] > 300
+    picture(page, "7-phone-result")
+    page.emulate_media(color_scheme="light")
+    page.set_viewport_size({"width": 1280, "height": 900})
 
 
 def test_on_a_phone_in_the_dark_by_keyboard_and_cancel(
@@ -142,9 +215,11 @@ def test_on_a_phone_in_the_dark_by_keyboard_and_cancel(
     page.keyboard.press("Enter")
     page.wait_for_selector("#job-state .running")
     page.wait_for_function("() => document.querySelector('#job-state').textContent.includes('replay')")
+    far = page.evaluate("document.querySelector('#job-bar').value")
+    page.wait_for_function("(far) => document.querySelector('#job-bar').value > far", arg=far)  # without a reload
     picture(page, "5-phone")
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")  # nothing sticks out
-    page.click("text=Cancel")
+    press(page, "#job-buttons button >> text=Cancel")
     page.wait_for_selector("#job-state .cancelled")
     picture(page, "6-phone-cancelled")
 
@@ -174,7 +249,47 @@ def test_an_upload_survives_a_server_that_drops_it(
     page.wait_for_selector("#job-state .succeeded", timeout=60_000)
     with live.client() as client:
         file = client.get("/v1/files").json()["files"][0]
-    import hashlib
+    assert file["sha256"] == hashlib.sha256(log.read_bytes()).hexdigest()
+    context.close()
 
+
+def test_an_upload_goes_on_after_a_broken_line_and_after_a_reload(
+    make_live: Callable[..., Live], tmp_path: Path, browser: Any
+) -> None:
+    live = make_live()
+    log = tmp_path / "large.log"
+    log.write_bytes(b"ok " + os.urandom(40_000_000))
+    context = browser.new_context()
+    page = context.new_page()  # the broken line is in the console, as it should be
+    offsets: list[int] = []
+
+    def line(route: Any, request: Any) -> None:
+        if request.method != "PATCH":
+            route.continue_()
+            return
+        offsets.append(int(request.headers["upload-offset"]))
+        if len(offsets) == 2:
+            route.abort("connectionreset")
+        elif len(offsets) == 4:
+            page.evaluate("document.querySelector('#stop').click()")  # pauses
+            route.abort("aborted")
+        else:
+            route.continue_()
+
+    page.route("**/v1/tus/*", line)
+    page.goto(live.url)
+    page.set_input_files("#log", str(log))
+    page.click("#go")
+    page.wait_for_function("() => document.querySelector('#upload-text').textContent.includes('the line broke')")
+    page.wait_for_function("() => document.querySelector('#upload-text').textContent.includes('paused')")
+    assert 0.0 < page.evaluate("document.querySelector('#upload-bar').value") < 1.0
+    page.reload()
+    page.set_input_files("#log", str(log))
+    page.click("#go")
+    page.wait_for_selector("#job-state .succeeded", timeout=60_000)
+    block = 8 << 20
+    assert offsets == [0, block, block, 2 * block, 2 * block, 3 * block, 4 * block]
+    with live.client() as client:
+        (file,) = client.get("/v1/files").json()["files"]
     assert file["sha256"] == hashlib.sha256(log.read_bytes()).hexdigest()
     context.close()

@@ -136,6 +136,24 @@ def test_tus_checks_what_it_is_told(client: TestClient) -> None:
     assert set(options.headers["tus-extension"].split(",")) >= {"creation", "checksum", "termination", "expiration"}
 
 
+def test_metadata_that_is_not_a_text_does_not_matter_but_its_form_does(client: TestClient) -> None:
+    for value in ("filename cnVuLm1jYXA=,key /w==", "empty,filename cnVuLm1jYXA=", "filename cnVuLm1jYXA=, key"):
+        answer = client.post("/v1/tus", headers={**TUS, "Upload-Length": "1", "Upload-Metadata": value})
+        assert answer.status_code == 201, value
+        assert client.get(answer.headers["location"].replace("tus", "files")).json()["name"] == "run.mcap"
+    for value in (",", "filename  cnVu", "filename cnV"):
+        answer = client.post("/v1/tus", headers={**TUS, "Upload-Length": "1", "Upload-Metadata": value})
+        assert (answer.status_code, answer.json()["code"]) == (400, "tus_metadata"), value
+
+
+def test_a_refused_method_is_told_all_that_there_are(client: TestClient) -> None:
+    some = f"{uuid.uuid4()}"
+    expected = {"/v1/files": "GET, POST", f"/v1/files/{some}": "DELETE, GET, PUT", f"/v1/jobs/{some}": "DELETE, GET"}
+    for path, methods in {**expected, f"/v1/tus/{some}": "DELETE, HEAD, OPTIONS, PATCH", "/": "GET"}.items():
+        answer = client.request("TRACE", path)
+        assert (answer.status_code, answer.headers["allow"]) == (405, methods), path
+
+
 def test_a_body_with_a_wrong_checksum_is_not_taken(client: TestClient) -> None:
     content = os.urandom(1_500_000)
     path = begin(client, len(content))

@@ -38,6 +38,8 @@ class RefinementParameters:
     """Scans taken so near to each other are compared (m)."""
     partners: int = 8
     """Each scan chooses so many of them, of different places and headings."""
+    crowd: int = 16
+    """Of more scans of one place and heading, so many stand for all: a room crossed all day is known by then."""
     temporal: int = 3
     """And is compared with so many scans before it."""
     gates: tuple[float, ...] = (0.3, 0.2, 0.15)
@@ -61,8 +63,8 @@ class RefinementParameters:
                 raise ConfigError(f"refinement: {name} is {getattr(self, name)}; it must be positive")
         if not self.gates or min(self.gates) <= 0.0:
             raise ConfigError(f"refinement: gates is {self.gates}; it must hold at least one positive length")
-        if self.points_per_scan < 1 or self.rounds < 1:
-            raise ConfigError("refinement: points_per_scan and rounds must be at least 1")
+        if min(self.points_per_scan, self.rounds, self.crowd) < 1:
+            raise ConfigError("refinement: points_per_scan, rounds and crowd must be at least 1")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,7 +100,7 @@ def refine(
 ) -> Refined:
     """Move `poses` (n, 3) until all pairs of scans and all edges agree best; the first pose stays."""
     p = parameters
-    pairs = neighbour_pairs(poses, p.radius, p.partners, p.temporal)
+    pairs = neighbour_pairs(poses, p.radius, p.partners, p.temporal, p.crowd)
     system = BlockSystem(
         len(poses), np.concatenate((pairs[:, 0], edges.pairs[:, 0])), np.concatenate((pairs[:, 1], edges.pairs[:, 1]))
     )
@@ -135,33 +137,49 @@ def stirred(step: F64) -> float:
 
 
 _HEADINGS = 8
+_AT_ONCE = 512
+"""Scans whose neighbours are listed together: of all at once the lists would fill the memory."""
 
 
-def neighbour_pairs(poses: F64, radius: float, most: int, temporal: int) -> I64:
+def neighbour_pairs(poses: F64, radius: float, most: int, temporal: int, crowd: int) -> I64:
     """Pairs of scans that should see the same walls: those just before, and the near ones in space.
 
     Among the scans within `radius` metres the nearest of each of `most` sorts is taken, the sorts being
-    places (a grid) and headings: a hundred scans from one spot say less than ten from ten.
+    places (a grid) and headings: a hundred scans from one spot say less than ten from ten. Of a sort with more than
+    `crowd` scans only so many, even in time, are taken as partners, so that the equations stay sparse.
     Returns (m, 2), the earlier first, sorted.
     """
     from scipy.spatial import cKDTree
 
     n = len(poses)
-    lists = cKDTree(poses[:, :2]).query_ball_point(poses[:, :2], radius, return_sorted=True)
     sector = np.floor(poses[:, 2] / (2.0 * np.pi) * _HEADINGS).astype(np.int64) % _HEADINGS
     cell = np.floor(poses[:, :2] / (0.5 * radius)).astype(np.int64)
     sort = (cell[:, 0] * 1000003 + cell[:, 1]) * _HEADINGS + sector
+    known = _standing_for_all(sort, crowd)
+    tree = cKDTree(poses[known, :2])
     keys = [np.arange(n - gap) * n + np.arange(gap, n) for gap in range(1, temporal + 1)]
-    for k in range(n):
-        near = np.array(lists[k], dtype=np.int64)
-        near = near[near != k]
-        if len(near) == 0:
-            continue
-        offset = poses[near] - poses[k]
-        distance = np.hypot(offset[:, 0], offset[:, 1]) + 0.5 * np.abs(wrap_angles(offset[:, 2]))
-        order = np.argsort(distance, kind="stable")
-        _, first = np.unique(sort[near[order]], return_index=True)
-        chosen = near[order[np.sort(first)[:most]]]
-        keys.append(np.minimum(chosen, k) * n + np.maximum(chosen, k))
+    for begin in range(0, n, _AT_ONCE):
+        lists = tree.query_ball_point(poses[begin : begin + _AT_ONCE, :2], radius, return_sorted=True)
+        for k, found in enumerate(lists, start=begin):
+            near = known[np.array(found, dtype=np.int64)]
+            near = near[near != k]
+            if len(near) == 0:
+                continue
+            offset = poses[near] - poses[k]
+            distance = np.hypot(offset[:, 0], offset[:, 1]) + 0.5 * np.abs(wrap_angles(offset[:, 2]))
+            order = np.argsort(distance, kind="stable")
+            _, first = np.unique(sort[near[order]], return_index=True)
+            chosen = near[order[np.sort(first)[:most]]]
+            keys.append(np.minimum(chosen, k) * n + np.maximum(chosen, k))
     unique = np.unique(np.concatenate(keys)) if keys else np.zeros(0, dtype=np.int64)
     return np.column_stack((unique // n, unique % n)).astype(np.int64)
+
+
+def _standing_for_all(sort: I64, crowd: int) -> I64:
+    """Of each sort all scans, or `crowd` of them, even in time; ascending."""
+    order = np.argsort(sort, kind="stable")
+    _, start, count = np.unique(sort[order], return_index=True, return_counts=True)
+    rank, of = np.arange(len(sort)) - np.repeat(start, count), np.repeat(count, count)
+    # Bresenham: of `of` in a row, `crowd` at even distances.
+    stands = (of <= crowd) | ((rank + 1) * crowd // of > rank * crowd // of)
+    return np.sort(order[stands])

@@ -52,6 +52,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-reference", action="store_true", help="with --relations: all files are estimates, none the reference"
     )
+    parser.add_argument(
+        "--save-results", type=Path, metavar="DIR", help="write evo's result files there, for evo_res: a zip a measure"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -86,6 +89,11 @@ def run(arguments: argparse.Namespace) -> int:
         )
         for path in files[0 if alone or own else 1 :]
     }
+    if arguments.save_results is not None:
+        if alone:
+            print("hsloc eval: error: --save-results needs a reference to take errors from", file=sys.stderr)
+            return 2
+        _save(arguments, list(results), None if own else files[0], delta)
     if arguments.json:
         document = {
             "reference": None if alone or own else files[0],
@@ -139,6 +147,37 @@ def _evaluate(
         return evaluation, None if relations is None else evaluate_relations(estimate, relations)
     except EvaluationError as error:
         raise EvaluationError(f"{path}: {error}") from error
+
+
+def _save(arguments: argparse.Namespace, paths: list[str], reference: str | None, delta: Delta) -> None:
+    """Write the result files of each estimate, named after it, into the folder of --save-results."""
+    from hsloc.errors import OutputError
+    from hsloc.evaluation.alignment import parse_alignment
+    from hsloc.evaluation.evo_results import write_evo_results
+    from hsloc.evaluation.metrics import compare
+    from hsloc.evaluation.tum import read_tum
+
+    folder: Path = arguments.save_results
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be made ({error.strerror or error}); choose another folder") from error
+    short = [Path(path).resolve().with_suffix("").name for path in paths]
+    unique = len(set(short)) == len(short)
+    for path, name in zip(paths, short, strict=True):
+        truth = _inside(path, "reference.tum") if reference is None else reference
+        comparison = compare(
+            read_tum(_inside(path, "trajectory.tum")),
+            read_tum(truth),
+            alignment=arguments.alignment,
+            max_difference_s=arguments.t_max_diff,
+            association=arguments.association,
+            offset_s=arguments.t_offset,
+        )
+        whole = "_".join(part for part in Path(path).with_suffix("").parts if part not in ("/", "..", "."))
+        write_evo_results(
+            folder, name if unique else whole, comparison, parse_alignment(arguments.alignment), delta, (truth, path)
+        )
 
 
 def _report(results: dict[str, Result], delta: Delta) -> list[str]:

@@ -104,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     if arguments.out is None:
         link_latest(folder)
-    _tell(result, arguments)
+    _tell(result, metrics["warnings"], arguments)
     if arguments.json:
         print(format_json({**metrics, "timings": timings(result), "results": str(folder)}), end="")
     elif not arguments.quiet:
@@ -112,11 +112,11 @@ def run(arguments: argparse.Namespace) -> int:
     return EXIT_DATA_LOST if result.losses.data_lost else EXIT_OK
 
 
-def _tell(result: Result, arguments: argparse.Namespace) -> None:
+def _tell(result: Result, warnings: object, arguments: argparse.Namespace) -> None:
     """Warnings and losses, on stderr."""
     if arguments.quiet:
         return
-    for warning in result.warnings:
+    for warning in warnings if isinstance(warnings, list) else ():
         print(f"hsloc: warning: {warning}", file=sys.stderr)
     candidates = result.summary.reference_candidates
     if result.reference is None and candidates:

@@ -15,6 +15,7 @@ from hsloc.evaluation.metrics import compare
 from hsloc.model.trajectory import Trajectory
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -24,12 +25,16 @@ if TYPE_CHECKING:
 
 
 def metrics(
-    result: Result, residuals: Residuals, alignment: str | None = None, relations: Path | None = None
+    result: Result,
+    residuals: Residuals,
+    alignment: str | None = None,
+    relations: Path | None = None,
+    doubts: Sequence[str] = (),
 ) -> dict[str, object]:
     """The content of metrics.json: the same for the same run, wall times left out.
 
     `alignment` of the trajectory with the truth: by default none on a given map, and se2 on one that was drawn, whose
-    frame is its own. `relations` is a file for the metric [K].
+    frame is its own. `relations` is a file for the metric [K], `doubts` are warnings besides the result's own.
     """
     diagnostics = result.diagnostics
     status = Counter(diagnostics.status)
@@ -67,7 +72,7 @@ def metrics(
         "map": _map_quality(result, residuals),
         "localised": {"share_of_poses": float(result.localised.mean()) if len(result.localised) else 0.0},
         "losses": {"data_lost": result.losses.data_lost, "notes": result.losses.lines()},
-        "warnings": list(result.warnings),
+        "warnings": [*result.warnings, *doubts],
     }
     if result.reference is not None and len(result.reference) > 1:
         chosen = alignment or ("se2" if result.mode == "slam" else "none")

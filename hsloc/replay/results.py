@@ -82,8 +82,8 @@ def _write(
     relations: Path | None,
     progress: Callable[[float], None] | None,
 ) -> dict[str, object]:
-    residuals = write_recording(result, folder / "run.mcap", progress)
-    values = metrics(result, residuals, alignment, relations)
+    residuals, doubts = write_recording(result, folder / "run.mcap", progress)
+    values = metrics(result, residuals, alignment, relations, doubts)
     write_tum(folder / "trajectory.tum", result.trajectory)
     if len(result.odometry):
         write_tum(folder / "odometry.tum", result.odometry)

@@ -11,6 +11,7 @@ from hsloc.model.events import Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.model.trajectory import Trajectory
 from hsloc.replay.engine import pair
+from hsloc.replay.mountings import MountingCheck
 from hsloc.replay.provenance import config_text
 from hsloc.replay.residuals import Residuals
 
@@ -24,13 +25,16 @@ _PATH_POSES = 2000
 """A path to look at needs no more poses; viewers slow down."""
 
 
-def write_recording(result: Result, path: Path, progress: Callable[[float], None] | None = None) -> Residuals:
-    """Write map, scans, transforms, poses and the path; returns how well the scans fit the map.
+def write_recording(
+    result: Result, path: Path, progress: Callable[[float], None] | None = None
+) -> tuple[Residuals, list[str]]:
+    """Write map, scans, transforms, poses and the path; returns how well the scans fit the map, and doubts of lasers.
 
     The scans come from the log, read once more, so that memory does not grow with it. The map is that of the result.
     """
     log = open_log(result.spec.logs, result.spec.read)
     residuals = Residuals(result.grid)
+    check = MountingCheck(result.grid, len(result.diagnostics), len(result.summary.lasers))
     places = _Places(result)
     mountings: set[str] = set()
     start = int(result.trajectory.stamps_ns[0])
@@ -51,6 +55,7 @@ def write_recording(result: Result, path: Path, progress: Callable[[float], None
                 writer.scan(scan)
                 if believed:
                     residuals.add(scan, T_map_base)
+                    check.add(scan, T_map_base)
             elif isinstance(event, Odometry) and not result.follows_scans:
                 T_map_odom, T_map_base = places.of_odometry()
                 _write_pose(writer, event.stamp_ns, T_map_odom, event.T_odom_base, T_map_base)
@@ -58,7 +63,7 @@ def write_recording(result: Result, path: Path, progress: Callable[[float], None
                 progress(places.row / len(result.trajectory))
         every = max(len(result.trajectory) // _PATH_POSES, 1)
         writer.path(start, Trajectory(result.trajectory.stamps_ns[::every], result.trajectory.poses[::every]))
-    return residuals
+    return residuals, [*residuals.doubts(), *check.doubts()]
 
 
 class _Places:

@@ -1,6 +1,7 @@
 """Compare trajectories with a reference (APE, RPE, per axis) or with checked relations; figures as evo's.
 
-Files are TUM (`t x y z qx qy qz qw`), or folders of results: where the first is one, each brings its own reference.
+Files are TUM (`t x y z qx qy qz qw`), also as CSV; logs (LOG, LOG:TOPIC, LOG:/tf:map.base_link); or folders of results:
+where the first is one, each brings its own reference.
 With --relations a single file is an estimate of its own and needs no reference.
 """
 
@@ -27,7 +28,7 @@ COLUMNS = ("rmse", "mean", "median", "std", "min", "max", "sse")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Files, how to pair and align them, and what to print."""
-    parser.add_argument("files", nargs="+", metavar="TUM", help="REFERENCE ESTIMATE ..., or RESULTS ...")
+    parser.add_argument("files", nargs="+", metavar="POSES", help="REFERENCE ESTIMATE ..., or RESULTS ...")
     parser.add_argument(
         "--alignment", "-a", choices=("none", "origin", "se2", "se3"), default="none",
         help="move the estimate onto the reference first: by its first pose, or by least squares (default: none)",
@@ -63,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.evaluation.metrics import format_json
     from hsloc.evaluation.relations import read_relations
     from hsloc.evaluation.rpe import Delta
-    from hsloc.evaluation.tum import read_tum
+    from hsloc.replay.references import read_reference
 
     files: list[str] = arguments.files
     # The results of a run bring their own reference.
@@ -77,12 +78,12 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     delta = Delta(arguments.delta, arguments.delta_unit, arguments.all_pairs)
     relations = None if arguments.relations is None else read_relations(arguments.relations)
-    reference = None if alone or own else read_tum(files[0])
+    reference = None if alone or own else read_reference(files[0])
     results = {
         path: _evaluate(
             path,
-            read_tum(_inside(path, "trajectory.tum")),
-            read_tum(_inside(path, "reference.tum")) if own else reference,
+            read_reference(_inside(path, "trajectory.tum")),
+            read_reference(_inside(path, "reference.tum")) if own else reference,
             relations,
             delta,
             arguments,
@@ -155,7 +156,7 @@ def _save(arguments: argparse.Namespace, paths: list[str], reference: str | None
     from hsloc.evaluation.alignment import parse_alignment
     from hsloc.evaluation.evo_results import write_evo_results
     from hsloc.evaluation.metrics import compare
-    from hsloc.evaluation.tum import read_tum
+    from hsloc.replay.references import read_reference
 
     folder: Path = arguments.save_results
     try:
@@ -167,8 +168,8 @@ def _save(arguments: argparse.Namespace, paths: list[str], reference: str | None
     for path, name in zip(paths, short, strict=True):
         truth = _inside(path, "reference.tum") if reference is None else reference
         comparison = compare(
-            read_tum(_inside(path, "trajectory.tum")),
-            read_tum(truth),
+            read_reference(_inside(path, "trajectory.tum")),
+            read_reference(truth),
             alignment=arguments.alignment,
             max_difference_s=arguments.t_max_diff,
             association=arguments.association,

@@ -50,6 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="move the estimate onto the truth first (default: none on a given map, se2 on a drawn one)",
     )
     parser.add_argument(
+        "--reference", metavar="POSES",
+        help="compare with a TUM or CSV file, LOG, LOG:TOPIC, TOPIC or /tf:map.base_link (default: truth in the log)",
+    )  # fmt: skip
+    parser.add_argument(
         "--relations", type=Path, metavar="FILE", help="score by relations: `t1 t2 x y z roll pitch yaw`"
     )
     parser.add_argument("--json", action="store_true", help="print the metrics as JSON on stdout")
@@ -80,6 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
         preset=arguments.preset,
         mode=arguments.mode,
         no_odometry=arguments.no_odom,
+        reference=arguments.reference,
     )
     folder = arguments.out or default_folder(arguments.log[0].name.split(".")[0] or "run")
     refuse_early(folder, arguments.overwrite)

@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
 from hsloc import __version__
 from hsloc.errors import EvaluationError
 from hsloc.evaluation import evaluate, evaluate_relations, read_relations
+from hsloc.evaluation.association import AssociationMethod, associate
 from hsloc.evaluation.map_quality import compare_maps, crispness
 from hsloc.evaluation.metrics import compare
 from hsloc.model.trajectory import Trajectory
+
+_MOST = 0.5
+"""Of the sparser trajectory's poses, the part that must have a partner nearby."""
+
+
+class Pairing(TypedDict, total=False):
+    """Arguments of `hsloc.evaluation.evaluate`."""
+
+    association: AssociationMethod
+    max_difference_s: float
+
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -103,7 +115,8 @@ def _map_quality(result: Result, residuals: Residuals) -> dict[str, object]:
         values["mapping"] = result.mapping.quality.to_dict()
     if result.true_grid is not None and result.reference is not None:
         try:
-            moved = compare(result.trajectory, result.reference, alignment="se2").T_reference_estimate
+            options = pairing(result.trajectory, result.reference)
+            moved = compare(result.trajectory, result.reference, alignment="se2", **options).T_reference_estimate
             values["comparison"] = compare_maps(result.grid, result.true_grid, T_truth_map=moved).to_dict()
         except EvaluationError as error:
             values["comparison_error"] = str(error)
@@ -126,9 +139,26 @@ def duration(result: Result) -> float:
     return float(stamps.max() - stamps.min()) / 1e9 if len(stamps) else 0.0
 
 
+def pairing(trajectory: Trajectory, reference: Trajectory) -> Pairing:
+    """How to pair the poses: the nearest within 10 ms, as evo does, if most of the sparser trajectory finds one.
+
+    Else the denser one is interpolated, across gaps of up to a second: a reference at 1 Hz has no pose within 10 ms of
+    one of a robot's that was seen at 7 Hz.
+    """
+    try:
+        found = associate(reference, trajectory)
+        if len(found) >= _MOST * min(len(reference), len(trajectory)):
+            return {}
+    except EvaluationError:
+        pass
+    denser = max(trajectory, reference, key=len)
+    usual = float(np.median(np.diff(np.sort(denser.stamps_ns)))) / 1e9 if len(denser) > 1 else 0.0
+    return {"association": "interpolation", "max_difference_s": min(max(0.75 * usual, 0.01), 1.0)}
+
+
 def _against(trajectory: Trajectory, reference: Trajectory, alignment: str) -> dict[str, object]:
     try:
-        return evaluate(trajectory, reference, alignment=alignment).to_dict()
+        return evaluate(trajectory, reference, alignment=alignment, **pairing(trajectory, reference)).to_dict()
     except EvaluationError as error:
         return {"evaluation_error": str(error)}
 

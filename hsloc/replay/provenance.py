@@ -38,6 +38,7 @@ def command(spec: RunSpec) -> str:
         ("--scan-topic", read.scan_topic),
         ("--odom-topic", read.odom_topic),
         ("--truth-topic", read.truth_topic),
+        ("--reference", spec.reference),
         ("--base-frame", read.base_frame),
         ("--laser-pose", _pose(read.laser_pose)),
         ("--start", read.start_s),

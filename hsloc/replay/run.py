@@ -22,7 +22,7 @@ from hsloc.model.trajectory import Trajectory
 from hsloc.replay.engine import replay
 from hsloc.replay.recording import Recording
 from hsloc.replay.references import read_reference
-from hsloc.replay.saved_maps import load_grid, load_state
+from hsloc.replay.saved_maps import load_grid, load_state, maps_beside, unread_maps
 from hsloc.replay.start import find_start, first_odometry
 from hsloc.slam.mapper import Mapper, Resume
 from hsloc.slam.point_mapper import PointMapper
@@ -242,9 +242,18 @@ def find_map(spec: RunSpec, log: Log) -> tuple[OccupancyGrid | None, tuple[str, 
     if spec.map_path is not None:
         return load_grid(spec.map_path)
     grid = log.map()
-    if grid is None and spec.mode == "localise":
-        raise MapError(f"{spec.logs[0]}: the log has no /map; give one with --map map.yaml")
-    return grid, ()
+    if grid is not None:
+        return grid, ()
+    unread = unread_maps(log.summary)
+    beside = maps_beside(spec.logs[0])
+    given = str(beside[0]) if beside else "map.yaml"
+    what = f"cannot use {unread[0]}" if unread else "the log has no /map"
+    if spec.mode == "localise":
+        raise MapError(f"{spec.logs[0]}: {what}; give one with --map {given}")
+    if spec.mode == "slam" or spec.resume is not None or not (unread or beside):
+        return None, ()
+    hint = f"{what}, so one is drawn; to localise on a map give it with --map {given}"
+    return None, (hint + ("" if not beside[1:] else f" (also there: {', '.join(p.name for p in beside[1:])})"),)
 
 
 def _must(grid: OccupancyGrid | None) -> OccupancyGrid:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 from hsloc.errors import MapError
 from hsloc.maps import read_map
 from hsloc.slam.state import STATE_FILE, fingerprint, read_state
 
+_MAP_TYPES = ("nav_msgs/msg/OccupancyGrid", "foxglove.Grid")
+_HEAD = 4096
+
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from hsloc.log.summary import LogSummary
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.replay.run import RunSpec
     from hsloc.slam.state import MapState
@@ -26,6 +31,27 @@ def state_file(path: Path) -> Path:
     if path.is_dir():
         return path / STATE_FILE
     return path.with_name(STATE_FILE) if path.suffix == ".yaml" else path
+
+
+def maps_beside(log: Path) -> list[Path]:
+    """Maps of nav2 in the folder of a log, by name: what a user may have meant, but has not said."""
+    folder = log if log.is_dir() else log.parent
+    try:
+        return [path for path in sorted(folder.glob("*.yaml")) if _is_map(path)]
+    except OSError:
+        return []
+
+
+def _is_map(path: Path) -> bool:
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD).decode(errors="replace")
+    return all(re.search(rf"^{key}\s*:", head, re.MULTILINE) for key in ("image", "resolution", "origin"))
+
+
+def unread_maps(summary: LogSummary) -> list[str]:
+    """Topics of maps in a log that gave none: not to be decoded, or several without one being /map."""
+    topics = [f"{t.topic} ({t.typename})" for t in summary.topics if t.typename in _MAP_TYPES and t.count]
+    return topics if len(topics) < 2 else [f"any of {', '.join(topics)}, of which none is /map"]
 
 
 def load_grid(path: Path) -> tuple[OccupancyGrid, tuple[str, ...]]:

@@ -13,6 +13,7 @@ from hsloc.evaluation import evaluate, evaluate_relations, read_relations
 from hsloc.evaluation.association import AssociationMethod, associate
 from hsloc.evaluation.map_quality import compare_maps, crispness
 from hsloc.evaluation.metrics import compare
+from hsloc.log.summary import LaserSummary
 from hsloc.model.trajectory import Trajectory
 
 _MOST = 0.5
@@ -69,6 +70,7 @@ def metrics(
             "duration_s": duration(result),
             "odometry_messages": len(result.odometry),
             "path_length_m": result.trajectory.length(),
+            **_read(result),
         },
         "scans": {
             "total": len(diagnostics),
@@ -97,6 +99,33 @@ def metrics(
     if relations is not None:
         values["relations"] = evaluate_relations(result.trajectory, read_relations(relations)).to_dict()
     return values
+
+
+def _read(result: Result) -> dict[str, object]:
+    """What of the log was read, and from when on."""
+    summary, stamps = result.summary, result.trajectory.stamps_ns
+    lasers = summary.lasers or (
+        LaserSummary(summary.scan_topic or "", summary.laser_frame or "", summary.T_base_laser, summary.laser_flipped,
+                     summary.extrinsics),
+    )  # fmt: skip
+    truth = summary.truth_topic if result.spec.reference is None else result.spec.reference
+    return {
+        "first_stamp_ns": int(stamps.min()) if len(stamps) else None,
+        "odometry": None if result.spec.no_odometry else summary.odom_topic,
+        "reference": None if result.reference is None else truth,
+        "lasers": [
+            {
+                "topic": laser.topic,
+                "frame": laser.frame,
+                "x": laser.T_base_laser.x,
+                "y": laser.T_base_laser.y,
+                "yaw": laser.T_base_laser.theta,
+                "upside_down": laser.flipped,
+                "extrinsics": laser.extrinsics,
+            }
+            for laser in lasers
+        ],
+    }
 
 
 def _map_name(result: Result) -> str:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from hsloc.errors import MapError
 from hsloc.maps import read_map
+from hsloc.maps.metadata import read_metadata
 from hsloc.slam.state import STATE_FILE, fingerprint, read_state
 
 _MAP_TYPES = ("nav_msgs/msg/OccupancyGrid", "foxglove.Grid")
@@ -24,6 +25,16 @@ if TYPE_CHECKING:
 def map_file(path: Path) -> Path:
     """The file meant by --map: in a folder of results its map.yaml."""
     return path / "map.yaml" if path.is_dir() else path
+
+
+def map_files(path: Path) -> list[Path]:
+    """The files that a map consists of: its YAML and its picture, or its map.npz."""
+    file = map_file(path)
+    if file.suffix == ".npz":
+        return [file]
+    beside = file.with_suffix(".yaml")
+    # As read_map has it: an image may be named, too, with its YAML beside it.
+    return [file, read_metadata(file).image] if file.suffix in (".yaml", ".yml") else [beside, file]
 
 
 def state_file(path: Path) -> Path:

@@ -88,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     folder = arguments.out or default_folder(arguments.log[0].name.split(".")[0] or "run")
     refuse_early(folder, arguments.overwrite)
-    with ProgressLine(arguments.quiet) as line:
+    with ProgressLine(arguments.quiet or arguments.no_progress) as line:
 
         def show(progress: Progress) -> None:
             speed = progress.done_s / max(line.elapsed, 1e-9)

@@ -57,13 +57,17 @@ def add_read_arguments(parser: argparse.ArgumentParser) -> None:
         "--deskew", action="store_true", help="move each beam to where the robot was when it was measured"
     )
     group.add_argument("--start", type=float, metavar="S", help="begin so many seconds into the log")
-    group.add_argument("--end", type=float, metavar="S", help="end so many seconds into the log")
+    end = group.add_mutually_exclusive_group()
+    end.add_argument("--end", type=float, metavar="S", help="end so many seconds into the log")
+    end.add_argument("--duration", type=float, metavar="S", help="end so many seconds after --start")
+    parser.add_argument("--no-progress", action="store_true", help="no bar on the terminal")
 
 
 def read_options(arguments: argparse.Namespace) -> ReadOptions:
     """What `add_read_arguments` collected."""
     from hsloc.log.summary import ReadOptions
 
+    end = arguments.end if arguments.duration is None else (arguments.start or 0.0) + arguments.duration
     return ReadOptions(
         scan_topic=None if arguments.scan_topic is None else ",".join(arguments.scan_topic),
         odom_topic=arguments.odom_topic,
@@ -71,7 +75,7 @@ def read_options(arguments: argparse.Namespace) -> ReadOptions:
         base_frame=arguments.base_frame,
         laser_pose=to_pose(arguments.laser_pose),
         start_s=arguments.start,
-        end_s=arguments.end,
+        end_s=end,
         deskew=arguments.deskew,
     )
 

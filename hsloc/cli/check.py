@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     log = open_log(arguments.log, replace(read_options(arguments), require_scan=False, require_odometry=False))
     start, span = log.summary.start_ns, max(log.summary.end_ns - log.summary.start_ns, 1)
-    with ProgressLine(arguments.quiet or arguments.json) as line:
+    with ProgressLine(arguments.quiet or arguments.json or arguments.no_progress) as line:
         report = check_log(log, lambda log_time: line.show("check", (log_time - start) / span))
     if arguments.json:
         from json import dumps

@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     options = replace(read_options(arguments), require_odometry=False)
     log = open_log(arguments.log, options)
     span = max(log.summary.end_ns - log.summary.origin_ns, 1)
-    with ProgressLine(arguments.quiet) as line:
+    with ProgressLine(arguments.quiet or arguments.no_progress) as line:
         conversion = convert_log(
             log, target, lambda stamp: line.show("convert", (stamp - log.summary.origin_ns) / span)
         )

@@ -1,6 +1,7 @@
 """Compare trajectories with a reference (APE, RPE, per axis) or with checked relations; figures as evo's.
 
-Files are TUM (`t x y z qx qy qz qw`), or folders of results: where the first is one, each brings its own reference.
+Files are TUM (`t x y z qx qy qz qw`), also as CSV; logs (LOG, LOG:TOPIC, LOG:/tf:map.base_link); or folders of results:
+where the first is one, each brings its own reference.
 With --relations a single file is an estimate of its own and needs no reference.
 """
 
@@ -27,7 +28,7 @@ COLUMNS = ("rmse", "mean", "median", "std", "min", "max", "sse")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Files, how to pair and align them, and what to print."""
-    parser.add_argument("files", nargs="+", metavar="TUM", help="REFERENCE ESTIMATE ..., or RESULTS ...")
+    parser.add_argument("files", nargs="+", metavar="POSES", help="REFERENCE ESTIMATE ..., or RESULTS ...")
     parser.add_argument(
         "--alignment", "-a", choices=("none", "origin", "se2", "se3"), default="none",
         help="move the estimate onto the reference first: by its first pose, or by least squares (default: none)",
@@ -52,6 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-reference", action="store_true", help="with --relations: all files are estimates, none the reference"
     )
+    parser.add_argument(
+        "--save-results", type=Path, metavar="DIR", help="write evo's result files there, for evo_res: a zip a measure"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -60,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.evaluation.metrics import format_json
     from hsloc.evaluation.relations import read_relations
     from hsloc.evaluation.rpe import Delta
-    from hsloc.evaluation.tum import read_tum
+    from hsloc.replay.references import read_reference
 
     files: list[str] = arguments.files
     # The results of a run bring their own reference.
@@ -74,18 +78,23 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     delta = Delta(arguments.delta, arguments.delta_unit, arguments.all_pairs)
     relations = None if arguments.relations is None else read_relations(arguments.relations)
-    reference = None if alone or own else read_tum(files[0])
+    reference = None if alone or own else read_reference(files[0])
     results = {
         path: _evaluate(
             path,
-            read_tum(_inside(path, "trajectory.tum")),
-            read_tum(_inside(path, "reference.tum")) if own else reference,
+            read_reference(_inside(path, "trajectory.tum")),
+            read_reference(_inside(path, "reference.tum")) if own else reference,
             relations,
             delta,
             arguments,
         )
         for path in files[0 if alone or own else 1 :]
     }
+    if arguments.save_results is not None:
+        if alone:
+            print("hsloc eval: error: --save-results needs a reference to take errors from", file=sys.stderr)
+            return 2
+        _save(arguments, list(results), None if own else files[0], delta)
     if arguments.json:
         document = {
             "reference": None if alone or own else files[0],
@@ -139,6 +148,37 @@ def _evaluate(
         return evaluation, None if relations is None else evaluate_relations(estimate, relations)
     except EvaluationError as error:
         raise EvaluationError(f"{path}: {error}") from error
+
+
+def _save(arguments: argparse.Namespace, paths: list[str], reference: str | None, delta: Delta) -> None:
+    """Write the result files of each estimate, named after it, into the folder of --save-results."""
+    from hsloc.errors import OutputError
+    from hsloc.evaluation.alignment import parse_alignment
+    from hsloc.evaluation.evo_results import write_evo_results
+    from hsloc.evaluation.metrics import compare
+    from hsloc.replay.references import read_reference
+
+    folder: Path = arguments.save_results
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be made ({error.strerror or error}); choose another folder") from error
+    short = [Path(path).resolve().with_suffix("").name for path in paths]
+    unique = len(set(short)) == len(short)
+    for path, name in zip(paths, short, strict=True):
+        truth = _inside(path, "reference.tum") if reference is None else reference
+        comparison = compare(
+            read_reference(_inside(path, "trajectory.tum")),
+            read_reference(truth),
+            alignment=arguments.alignment,
+            max_difference_s=arguments.t_max_diff,
+            association=arguments.association,
+            offset_s=arguments.t_offset,
+        )
+        whole = "_".join(part for part in Path(path).with_suffix("").parts if part not in ("/", "..", "."))
+        write_evo_results(
+            folder, name if unique else whole, comparison, parse_alignment(arguments.alignment), delta, (truth, path)
+        )
 
 
 def _report(results: dict[str, Result], delta: Delta) -> list[str]:

@@ -72,6 +72,7 @@ def _values(log: Log, losses: Losses, counts: dict[str, int]) -> dict[str, Any]:
         "start_ns": summary.start_ns,
         "end_ns": summary.end_ns,
         "duration_s": summary.duration_s,
+        "parts": [{"path": str(part.path), "start_ns": part.start_ns, "end_ns": part.end_ns} for part in summary.parts],
         "topics": [
             {
                 "topic": topic.topic,
@@ -122,7 +123,11 @@ def _lines(summary: LogSummary, losses: Losses, report: dict[str, Any]) -> list[
     """The report for people."""
     lines = [f"log:       {', '.join(report['paths'])}"]
     lines += [f"format:    {summary.format}" + (f", profile {summary.profile}" if summary.profile else "")]
-    lines += [f"start:     {time_text(summary.start_ns)}", f"duration:  {summary.duration_s:.3f} s", "", "topics:"]
+    lines += [f"start:     {time_text(summary.start_ns)}", f"duration:  {summary.duration_s:.3f} s"]
+    for part in summary.parts if len(summary.parts) > 1 else ():
+        begin, end = ((stamp - summary.start_ns) / 1e9 for stamp in (part.start_ns, part.end_ns))
+        lines += [f"part:      {begin:.3f} to {end:.3f} s: {part.path}"]
+    lines += ["", "topics:"]
     lines += _table(summary)
     lines += ["", "what hsloc reads:"]
     chosen = (("scans", summary.scan_topic), ("odometry", summary.odom_topic), ("truth", summary.truth_topic))

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 COMMANDS = (
     "record",
     "replay",
+    "map",
     "info",
     "check",
     "eval",

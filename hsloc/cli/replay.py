@@ -50,6 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="move the estimate onto the truth first (default: none on a given map, se2 on a drawn one)",
     )
     parser.add_argument(
+        "--reference", metavar="POSES",
+        help="compare with a TUM or CSV file, LOG, LOG:TOPIC, TOPIC or /tf:map.base_link (default: truth in the log)",
+    )  # fmt: skip
+    parser.add_argument(
         "--relations", type=Path, metavar="FILE", help="score by relations: `t1 t2 x y z roll pitch yaw`"
     )
     parser.add_argument("--json", action="store_true", help="print the metrics as JSON on stdout")
@@ -80,10 +84,11 @@ def run(arguments: argparse.Namespace) -> int:
         preset=arguments.preset,
         mode=arguments.mode,
         no_odometry=arguments.no_odom,
+        reference=arguments.reference,
     )
     folder = arguments.out or default_folder(arguments.log[0].name.split(".")[0] or "run")
     refuse_early(folder, arguments.overwrite)
-    with ProgressLine(arguments.quiet) as line:
+    with ProgressLine(arguments.quiet or arguments.no_progress) as line:
 
         def show(progress: Progress) -> None:
             speed = progress.done_s / max(line.elapsed, 1e-9)
@@ -104,7 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     if arguments.out is None:
         link_latest(folder)
-    _tell(result, arguments)
+    _tell(result, metrics["warnings"], arguments)
     if arguments.json:
         print(format_json({**metrics, "timings": timings(result), "results": str(folder)}), end="")
     elif not arguments.quiet:
@@ -112,11 +117,11 @@ def run(arguments: argparse.Namespace) -> int:
     return EXIT_DATA_LOST if result.losses.data_lost else EXIT_OK
 
 
-def _tell(result: Result, arguments: argparse.Namespace) -> None:
+def _tell(result: Result, warnings: object, arguments: argparse.Namespace) -> None:
     """Warnings and losses, on stderr."""
     if arguments.quiet:
         return
-    for warning in result.warnings:
+    for warning in warnings if isinstance(warnings, list) else ():
         print(f"hsloc: warning: {warning}", file=sys.stderr)
     candidates = result.summary.reference_candidates
     if result.reference is None and candidates:

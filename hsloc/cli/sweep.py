@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         done = 0
-        with ProgressLine(arguments.quiet) as line:
+        with ProgressLine(arguments.quiet or arguments.no_progress) as line:
 
             def tell(outcome: Outcome) -> None:
                 nonlocal done

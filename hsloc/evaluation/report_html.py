@@ -15,6 +15,7 @@ import numpy as np
 from hsloc.evaluation.files import write_text_atomically
 from hsloc.evaluation.metrics import format_json
 from hsloc.evaluation.report_data import Curve, prepare, reason_counts, status_counts
+from hsloc.evaluation.report_remarks import remarks_html, text_of
 from hsloc.evaluation.report_svg import Chart, chart_svg, timeline_html
 from hsloc.evaluation.report_svg_map import map_svg
 from hsloc.evaluation.report_table import DASH, summary, table_rows
@@ -76,7 +77,7 @@ def write_report_html(
     provenance = Provenance() if provenance is None else provenance
     data = prepare(trajectory, odometry, reference, diagnostics, metrics)
     drawing, extent = map_svg(data, grid, points)
-    charts, end = time_charts(data), _end(data)
+    charts, end = time_charts(data, drifts=text_of(metrics, "run", "mode") == "slam"), _end(data)
     fragments = {
         "title": escape(title),
         "facts": "".join(f"<li>{escape(fact)}</li>" for fact in summary(data, metrics)),
@@ -85,6 +86,7 @@ def write_report_html(
         "legend": _legend(data, grid, points),
         "headline": _headline(data, metrics),
         "charts": "".join(_figure(chart, end) for chart in charts) + _convergence(convergence),
+        "remarks": remarks_html(metrics),
         "scans": _scans(data, end),
         "statistics": _statistics(metrics),
         "provenance": _provenance(provenance),
@@ -96,8 +98,12 @@ def write_report_html(
     write_text_atomically(Path(path), _fill(_template("report.html"), fragments))
 
 
-def time_charts(data: ReportData) -> list[Chart]:
-    """All that is known over time: errors where there is truth, fitness, standard deviations, effort."""
+def time_charts(data: ReportData, drifts: bool = False) -> list[Chart]:
+    """All that is known over time: errors where there is truth, fitness, standard deviations, effort.
+
+    With `drifts` the standard deviations are those of a map that is being drawn, before its loops are closed.
+    """
+    of = ", before loops are closed" if drifts else ""
     charts = []
     lost = () if data.scans is None else data.scans.lost
     if data.errors is not None:
@@ -112,9 +118,9 @@ def time_charts(data: ReportData) -> list[Chart]:
         marks = Curve(scans.seconds[refused], scans.fitness[refused])
         charts.append(Chart("fitness", "Fitness of the match", "", fitness, "green", 1.0, False, marks, lost))
         sigma = Curve(scans.seconds, scans.sigma_m * 100.0)
-        charts.append(Chart("sigma_cm", "Position, standard deviation", "cm", sigma, "blue", spans=lost))
+        charts.append(Chart("sigma_cm", f"Position, standard deviation{of}", "cm", sigma, "blue", spans=lost))
         sigma = Curve(scans.seconds, scans.sigma_deg)
-        charts.append(Chart("sigma_deg", "Heading, standard deviation", "deg", sigma, "blue", spans=lost))
+        charts.append(Chart("sigma_deg", f"Heading, standard deviation{of}", "deg", sigma, "blue", spans=lost))
         spent = Curve(scans.seconds, np.where(scans.evaluations > 0, scans.evaluations, np.nan))
         charts.append(Chart("evaluations", "Fitness evaluations of the search", "", spent, "purple", spans=lost))
     return [_without_gaps(chart) for chart in charts if np.isfinite(chart.curve.values).any()]
@@ -151,9 +157,8 @@ def _convergence(convergence: Mapping[str, tuple[Floats, Floats]] | None) -> str
     for index, (name, (evaluations, fitness)) in enumerate((convergence or {}).items()):
         curve = Curve(np.asarray(evaluations, dtype=np.float64), np.asarray(fitness, dtype=np.float64))
         if len(curve.seconds):
-            title = f"Convergence: {name}"
-            chart = Chart(f"convergence{index}", title, "best fitness over evaluations", curve, "green", 1.0, False,
-                          over_time=False)  # fmt: skip
+            title, unit = f"Convergence: {name}", "median best fitness over evaluations"
+            chart = Chart(f"convergence{index}", title, unit, curve, "green", 1.0, False, over_time=False)
             parts.append(_figure(chart, float(curve.seconds.max())))
     return "".join(parts)
 
@@ -173,11 +178,19 @@ def _legend(data: ReportData, grid: OccupancyGrid | None, points: Floats | None)
             (Status.RELOCALISED, "pose found"),
         ):
             entries.append((str(status), label, bool(data.scans.where(status).any())))
-    return "".join(
-        f'<label><input type="checkbox" checked data-toggle="{name}"><i class="key {name}"></i>{label}</label>'
-        for name, label, there in entries
-        if there
-    ) + ('<span><i class="key guessed"></i>pose unknown</span>' if not data.believed.all() else "")
+    return (
+        "".join(
+            f'<label><input type="checkbox" checked data-toggle="{name}"><i class="key {name}"></i>{label}</label>'
+            for name, label, there in entries
+            if there
+        )
+        + (
+            '<span><i class="key start"></i>start</span><span><i class="key end"></i>end</span>'
+            if len(data.path)
+            else ""
+        )
+        + ('<span><i class="key guessed"></i>pose unknown</span>' if not data.believed.all() else "")
+    )
 
 
 def _headline(data: ReportData, metrics: Mapping[str, object]) -> str:

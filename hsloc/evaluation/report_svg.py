@@ -135,8 +135,13 @@ def ticks(low: float, high: float, count: int) -> list[float]:
 
 
 def number(value: float) -> str:
-    """A tick's number, with a true minus sign."""
+    """A tick's number, with a true minus sign; powers of ten from 100 000 on as such."""
+    if value >= 1e5 and abs(log10(value) - round(log10(value))) < 1e-9:
+        return "10" + str(round(log10(value))).translate(_SUPERSCRIPT)
     return f"{value:.6g}".replace("-", "−")
+
+
+_SUPERSCRIPT = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def _vertical_scale(known: Floats, chart: Chart) -> tuple[Callable[[float], float], list[float]]:
@@ -148,6 +153,9 @@ def _vertical_scale(known: Floats, chart: Chart) -> tuple[Callable[[float], floa
         floor_value = max(float(np.percentile(known, 1.0)), middle / 30.0)
         low_log, high_log = log10(floor_value), log10(high * 1.3)
         powers = [10.0**power for power in range(ceil(low_log), floor(high_log) + 1)]
+        if len(powers) < 3:
+            steps = (step * 10.0**power for power in range(floor(low_log), floor(high_log) + 1) for step in (1, 2, 5))
+            powers = [value for value in steps if low_log <= log10(value) <= high_log]
 
         def logarithmic(value: float) -> float:
             part = (log10(max(value, floor_value)) - low_log) / (high_log - low_log)

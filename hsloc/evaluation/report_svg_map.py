@@ -57,8 +57,22 @@ def map_svg(data: ReportData, grid: OccupancyGrid | None, points: Floats | None)
     if data.reference is not None and len(data.reference):
         parts.append(_layer("reference", f'<path class="reference" d="{_path(data.reference, middle, finest)}"/>'))
     parts.append(_marks(data, middle))
+    parts.append(_axes(extent, middle))
     parts.append('<g id="here" visibility="hidden"><circle class="here" r="7"/></g></svg>')
     return "".join(parts), extent
+
+
+def _axes(extent: Extent, middle: Floats) -> str:
+    """Where the map's frame has its origin, and its axes, if that is in the picture."""
+    if not (extent.x0 <= 0.0 <= extent.x1 and extent.y0 <= 0.0 <= extent.y1):
+        return ""
+    x, y = _local(np.zeros(2), middle).tolist()
+    arrows = '<path class="x" d="M0 0h30m-5-3l5 3l-5 3"/><path class="y" d="M0 0v-30m-3 5l3-5l3 5"/>'
+    names = '<text x="33" y="4">x</text><text x="-3" y="-34">y</text>'
+    return (
+        f'<g class="axes" data-layer="axes" transform="translate({x:.6g} {y:.6g})">'
+        f"<title>origin of the map</title><g>{arrows}{names}</g></g>"
+    )
 
 
 def _layer(name: str, content: str) -> str:

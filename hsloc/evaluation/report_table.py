@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from math import degrees, isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.evaluation.report_data import status_counts
+from hsloc.evaluation.report_remarks import text_of
 from hsloc.model import Status
 
 if TYPE_CHECKING:
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from hsloc.evaluation.report_data import ReportData, Scans
 
 DASH = "–"
+_YEAR_2000_NS, _YEAR_2100_NS = 946_684_800e9, 4_102_444_800e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +37,25 @@ def table_rows(data: ReportData, metrics: Mapping[str, object]) -> list[Row]:
 
 def summary(data: ReportData, metrics: Mapping[str, object]) -> list[str]:
     """The facts under the title, the most important first."""
-    parts = [f"{format_length(data.length_m)} path", f"{format_duration(data.duration_s)}"]
+    parts = [*_how(metrics), f"{format_length(data.length_m)} path", f"{format_duration(data.duration_s)}"]
     if data.scans is not None:
         parts.append(f"{len(data.scans.seconds):,} scans".replace(",", " "))
     rmse = number(metrics, "ape", "trans_part", "rmse")
     if rmse is not None:
-        parts.append(f"APE rmse {format_length(rmse)}")
+        believed = number(metrics, "localised_only", "ape", "trans_part", "rmse")
+        where = "" if believed is None else f", {format_length(believed)} where localised"
+        parts.append(f"APE rmse {format_length(rmse)}{where}")
+    return parts
+
+
+def _how(metrics: Mapping[str, object]) -> list[str]:
+    """What was done, and when the log begins where its clock is that of the calendar."""
+    mode, name = text_of(metrics, "run", "mode"), text_of(metrics, "run", "map")
+    words = {"localise": f"localised on {'the map of the log' if name == 'log' else name}", "slam": f"map {name}"}
+    parts = [words[mode]] if mode in words and name else []
+    stamp = number(metrics, "log", "first_stamp_ns")
+    if stamp is not None and _YEAR_2000_NS <= stamp < _YEAR_2100_NS:
+        parts.append(f"{datetime.fromtimestamp(stamp // 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC")
     return parts
 
 
@@ -135,7 +151,9 @@ def _single_rows(data: ReportData, metrics: Mapping[str, object]) -> list[Row]:
             rows.append(Row("fitness, median", (f"{np.median(fitness):.3f}",)))
     median, p95 = (number(metrics, "map", "residuals", name) for name in ("median", "p95"))
     if median is not None and p95 is not None:
-        rows.append(Row("scan to map, median, 95 %", (f"{format_length(median)}, {format_length(p95)}",)))
+        # The distance is that from cell to cell: what falls into a wall's own cell is no nearer than that.
+        near = ["in the cell" if value == 0.0 else format_length(value) for value in (median, p95)]
+        rows.append(Row("scan to map, median, 95 %", (", ".join(near),)))
     thickness = number(metrics, "map", "crispness", "wall_thickness_median")
     if thickness is not None:
         rows.append(Row("wall thickness", (format_length(thickness),)))

@@ -87,15 +87,19 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
 def read_tum(path: str | Path) -> Trajectory:
     """Read a TUM file, or the planar form `t x y theta` (metres, radians); `.gz` is unpacked.
 
-    Comments, blank lines, tabs and several spaces do not matter; the order of the file is kept.
+    Comments, blank lines, tabs, several spaces and commas do not matter, nor does a first line of column names; the
+    order of the file is kept.
     Raises `EvaluationError` that names the file and the line.
     """
     path = Path(path)
     stamps: list[int] = []
     poses: list[tuple[float, float, float]] = []
     for number, line in read_lines(path):
+        fields = line.replace(",", " ").split()
+        if not stamps and number == 1 and _names_columns(path, fields):
+            continue
         try:
-            stamp_ns, pose = _parse_pose(line.split())
+            stamp_ns, pose = _parse_pose(fields)
         except ValueError as error:
             raise EvaluationError(f"{path}, line {number}: {error}") from None
         stamps.append(stamp_ns)
@@ -103,6 +107,17 @@ def read_tum(path: str | Path) -> Trajectory:
     if not stamps:
         raise EvaluationError(f"{path}: holds no pose; a TUM file has lines `t x y z qx qy qz qw`")
     return Trajectory(np.array(stamps, dtype=np.int64), np.array(poses, dtype=np.float64).reshape(-1, 3))
+
+
+def _names_columns(path: Path, fields: list[str]) -> bool:
+    """Whether a line is the head of a CSV. Raises `EvaluationError` where it has the quaternion begin with w."""
+    names = [field.strip("\"'").lower() for field in fields]
+    if not all(name[:1].isalpha() and name not in ("nan", "inf", "infinity") for name in names):
+        return False
+    w, x = ([row for row, name in enumerate(names) if name in (f"q{axis}", f"q_{axis}", axis)] for axis in "wx")
+    if w and x and w[0] < x[-1] and len(names) == 8:
+        raise EvaluationError(f"{path}: its quaternions begin with w; the order must be t x y z qx qy qz qw")
+    return True
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, str]]:

@@ -17,7 +17,7 @@ from hsloc.localisation.motion import OdometryNoise, fuse, predict_covariance
 from hsloc.localisation.relocaliser import REMEMBERED, Relocaliser, RelocaliserParameters, Verdict
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Status
-from hsloc.model.events import Odometry, PairedScan
+from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY, Pose2
 
 if TYPE_CHECKING:
@@ -127,6 +127,8 @@ class Localiser:
             self._anchor(self._T_map_match, event.T_odom_base)
         if isinstance(event, Odometry):
             return self._follow(event)
+        if event.is_held:
+            return self._hold(event)
         return self._search(event) if self._searching else self._localise(event)
 
     def _follow(self, odometry: Odometry) -> Estimate:
@@ -134,6 +136,11 @@ class Localiser:
         self._count += 1
         status = Status.SEARCHING if self._searching else Status.PREDICTED
         return Estimate(odometry.stamp_ns, self._T_map_odom @ odometry.T_odom_base, status)
+
+    def _hold(self, paired: PairedScan) -> Estimate:
+        """A scan that is matched with a later one."""
+        status = Status.SEARCHING if self._searching else Status.PREDICTED
+        return Estimate(paired.scan.stamp_ns, self._T_map_odom @ paired.T_odom_base, status, reason=HELD)
 
     def _localise(self, paired: PairedScan) -> Estimate:
         scan, T_odom_base = paired.scan, paired.T_odom_base
@@ -146,7 +153,7 @@ class Localiser:
         covariance = predict_covariance(
             self._covariance, self._T_map_match, motion, p.odometry_noise.covariance(motion)
         )
-        points = scan.points_base()
+        points = paired.points_base()
         if len(points) < p.min_points:
             self._take(predicted, covariance, T_odom_base)
             return Estimate(scan.stamp_ns, predicted, Status.NO_RETURNS, covariance, reason=f"{len(points)} returns")
@@ -213,7 +220,7 @@ class Localiser:
     def _search(self, paired: PairedScan) -> Estimate:
         """Let the relocaliser see the scan; take its answer when it is sure."""
         scan, T_odom_base = paired.scan, paired.T_odom_base
-        verdict = self._relocaliser.update(scan, T_odom_base, self._count)
+        verdict = self._relocaliser.update(paired, self._count)
         pose = self._T_map_odom @ T_odom_base if verdict.pose is None else verdict.pose
         status = Status.SEARCHING
         if verdict.is_sure:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from hsloc.localisation.motion import OdometryNoise
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
-    from hsloc.model.events import Scan
+    from hsloc.model.events import PairedScan
     from hsloc.model.occupancy_grid import OccupancyGrid
 
     F64 = NDArray[np.float64]
@@ -146,14 +146,15 @@ class Relocaliser:
         self._T_odom_last = None
         self._seen.clear()
 
-    def update(self, scan: Scan, T_odom_base: Pose2, odometry_count: int) -> Verdict:
-        """Take a scan, the odometry at its stamp, and how many odometry messages there were until now."""
+    def update(self, paired: PairedScan, odometry_count: int) -> Verdict:
+        """Take a scan, and how many odometry messages there were until now."""
         p = self._parameters
+        T_odom_base = paired.T_odom_base
         motion = Pose2() if self._T_odom_last is None else self._T_odom_last.between(T_odom_base)
         moved = hypot(motion.x, motion.y) >= p.step_min_d or abs(motion.theta) >= p.step_min_a
         if self._hypotheses and not moved:
             return self._verdict(motion, 0, False)
-        points = scan.points_base()
+        points = paired.points_base()
         if len(points) < p.min_points:
             return self._verdict(motion, 0, False)
         self._T_odom_last = T_odom_base

@@ -1,4 +1,4 @@
-"""Foxglove's own messages, as JSON or protobuf: LaserScan, FrameTransform(s) and PoseInFrame.
+"""Foxglove's own messages, as JSON or protobuf: LaserScan, FrameTransform(s), PoseInFrame and Grid.
 
 Their values become the same tuples as those of ROS messages (see `hsloc.log.decode`). Protobuf messages are decoded
 by the definition that the log carries, which needs the optional package protobuf.
@@ -14,7 +14,8 @@ import numpy as np
 
 from hsloc.errors import LogFormatError
 from hsloc.log import definitions
-from hsloc.log.decode import LinkMessage, PoseMessage, ScanMessage
+from hsloc.log.decode import GridMessage, LinkMessage, PoseMessage, ScanMessage
+from hsloc.log.foxglove_grid import occupancy
 from hsloc.log.transforms import Transform3
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ TYPES = {
     "foxglove.FrameTransform": definitions.TF_MESSAGE,
     "foxglove.FrameTransforms": definitions.TF_MESSAGE,
     "foxglove.PoseInFrame": definitions.POSE_STAMPED,
+    "foxglove.Grid": definitions.OCCUPANCY_GRID,
 }
 """The type of ROS 2 that stands for each of Foxglove's."""
 ENCODINGS = ("json", "protobuf")
@@ -42,6 +44,8 @@ RANGE_MIN = 1e-3
 
 MAX_PAYLOAD_BYTES = 4 << 20
 """A message beyond is refused unread: objects take many times the memory of their bytes."""
+_MAX_GRID_BYTES = 512 << 20
+"""Its cells are one run of bytes, and stay that."""
 _MAX_LINKS = 10_000
 _MAX_NAME = 4096
 _MAX_SECONDS = 1 << 33
@@ -62,20 +66,17 @@ def decoder(channel: Channel) -> Callable[[Payload], Any]:
     Raises LogFormatError where the channel's definition cannot be used, or protobuf is not installed.
     """
     convert = _CONVERT[channel.typename]
+    most = _MAX_GRID_BYTES if channel.typename == "foxglove.Grid" else MAX_PAYLOAD_BYTES
     if channel.message_encoding == "json":
-        return lambda data: convert(_parse_json(data), _get_json)
+        return lambda data: convert(json.loads(_bounded(data, most)), _get_json)
     parse = _protobuf_parser(channel)
-    return lambda data: convert(parse(_bounded(data)), _get_protobuf)
+    return lambda data: convert(parse(_bounded(data, most)), _get_protobuf)
 
 
-def _bounded(data: Payload) -> bytes:
-    if len(data) > MAX_PAYLOAD_BYTES:
-        raise ValueError(f"a message of {len(data)} bytes, at most {MAX_PAYLOAD_BYTES} are read")
+def _bounded(data: Payload, most: int) -> bytes:
+    if len(data) > most:
+        raise ValueError(f"a message of {len(data)} bytes, at most {most} are read")
     return bytes(data)
-
-
-def _parse_json(data: Payload) -> Any:
-    return json.loads(_bounded(data))
 
 
 def _get_json(message: Any, name: str) -> Any:
@@ -247,9 +248,18 @@ def pose_in_frame(message: Any, get: Get) -> PoseMessage:
     return PoseMessage(_stamp(message, get), _frame(message, get, "frame_id"), _pose(message, get).to_pose2())
 
 
+def grid(message: Any, get: Get) -> GridMessage:
+    """foxglove.Grid that holds occupancies."""
+    origin = _pose(message, get).normalised().to_pose2()
+    if not origin.is_finite():
+        raise ValueError("its place is not finite")
+    return GridMessage(_stamp(message, get), _frame(message, get, "frame_id"), occupancy(message, get, origin))
+
+
 _CONVERT: dict[str, Callable[[Any, Get], Any]] = {
     "foxglove.LaserScan": laser_scan,
     "foxglove.FrameTransform": transform,
     "foxglove.FrameTransforms": transforms,
     "foxglove.PoseInFrame": pose_in_frame,
+    "foxglove.Grid": grid,
 }

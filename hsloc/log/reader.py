@@ -121,6 +121,14 @@ def open_log(paths: Path | str | Sequence[Path | str], options: ReadOptions | No
     return Log(RosSource(containers, options), options, [part for file in files for part in _parts(file)])
 
 
+def is_log(path: Path) -> bool:
+    """Whether a file or folder is a log of a known format, by what it holds; raises LogError as `open_log`."""
+    from hsloc.log.text import find_format
+
+    (first, *_) = _expand(path)
+    return _kind(first) != "text" or find_format(first) is not None
+
+
 def _text_source(path: Path, options: ReadOptions) -> Source:
     from hsloc.log.text import TextSource, find_format
 

@@ -9,6 +9,7 @@ from hsloc.log import definitions, foxglove
 from hsloc.log.decoders import Undecodable, canonical_type, decoder_for, is_decodable
 from hsloc.log.feeds import MAP_FRAME
 from hsloc.log.frames import BASE_FRAMES, Mountings, read_links
+from hsloc.log.parts import check_parts
 from hsloc.log.summary import LaserSummary, LogSummary, Losses, ReadOptions, TopicSummary
 from hsloc.log.topics import TF, TRUTH_TYPES, carries, choose_topics, is_truth_name, of_type
 from hsloc.model import IDENTITY
@@ -75,6 +76,9 @@ class Survey:
             where += f" and {len(containers) - 1} more"
         self.choice = choose_topics(where, self.active, options, self.tf_frames is not None)
         self._warnings += self.choice.problems
+        frames = self.tf_frames if self.choice.odom == TF else None
+        self._parts, doubts = check_parts(containers, self.choice.scans, self.choice.odom, frames)
+        self._warnings += doubts
         self.scans = {topic: self._first(topic, definitions.LASER_SCAN) for topic in self.choice.scans}
         self.odom_type = self._pose_type(self.choice.odom)
         self.odom = self._first(self.choice.odom, self.odom_type)
@@ -192,6 +196,7 @@ class Survey:
             laser_flipped=laser.flipped,
             extrinsics=laser.extrinsics,
             lasers=tuple(lasers),
+            parts=self._parts,
             order="log" if converted else "stamp",
             metadata={name: dict(v) for c in self.containers for name, v in c.metadata.items()},
             warnings=tuple(dict.fromkeys(self._warnings + self.mountings.warnings)),

@@ -91,6 +91,15 @@ class LaserSummary:
 
 
 @dataclass(frozen=True, slots=True)
+class PartSummary:
+    """One of several files that are one run, with the log times of its first and last scan or odometry."""
+
+    path: Path
+    start_ns: int
+    end_ns: int
+
+
+@dataclass(frozen=True, slots=True)
 class LogSummary:
     """What a log holds and what hsloc takes from it.
 
@@ -99,6 +108,7 @@ class LogSummary:
     T_base_laser comes from: `/tf_static`, `/tf`, `option`, `file format` or `identity`. `order` is `stamp` (events
     in the order of their header stamps) or `log` (in the order of the log, where that is the true one). Where several
     lasers are merged, `scan_topic` names them all, `lasers` tells of each, and the other fields tell of the first.
+    `parts` are the files that hold scans or odometry that are read, in the order of time.
     """
 
     paths: tuple[Path, ...]
@@ -119,6 +129,7 @@ class LogSummary:
     laser_flipped: bool = False
     extrinsics: str = "identity"
     lasers: tuple[LaserSummary, ...] = ()
+    parts: tuple[PartSummary, ...] = ()
     order: str = "stamp"
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()

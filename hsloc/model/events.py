@@ -87,10 +87,31 @@ class Scan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairedScan:
-    """A scan, and where odometry says the base was at its stamp."""
+    """A scan, and where odometry says the base was at its stamp.
+
+    Of several lasers, scans of about the same time are matched together: `companions` are those that this one carries,
+    and a scan that another one will carry `is_held`: nothing is to be matched yet.
+    """
 
     scan: Scan
     T_odom_base: Pose2
+    companions: tuple[PairedScan, ...] = ()
+    is_held: bool = False
+
+    def points_base(self) -> NDArray[np.float64]:
+        """The hits of the scan and its companions in the base's frame at the scan's stamp, metres, shape (m, 2)."""
+        points = self.scan.points_base()
+        if not self.companions:
+            return points
+        return np.concatenate((points, *(self.to(other) @ other.scan.points_base() for other in self.companions)))
+
+    def to(self, other: PairedScan) -> Pose2:
+        """How the base moved from this scan to another, by odometry."""
+        return self.T_odom_base.between(other.T_odom_base)
+
+
+HELD = "matched together with the next laser's scan"
+"""What an estimator says of a scan that is held."""
 
 
 Event = Odometry | Scan | Truth

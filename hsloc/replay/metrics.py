@@ -3,18 +3,32 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
 from hsloc import __version__
 from hsloc.errors import EvaluationError
 from hsloc.evaluation import evaluate, evaluate_relations, read_relations
+from hsloc.evaluation.association import AssociationMethod, associate
 from hsloc.evaluation.map_quality import compare_maps, crispness
 from hsloc.evaluation.metrics import compare
+from hsloc.log.summary import LaserSummary
 from hsloc.model.trajectory import Trajectory
 
+_MOST = 0.5
+"""Of the sparser trajectory's poses, the part that must have a partner nearby."""
+
+
+class Pairing(TypedDict, total=False):
+    """Arguments of `hsloc.evaluation.evaluate`."""
+
+    association: AssociationMethod
+    max_difference_s: float
+
+
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -24,12 +38,16 @@ if TYPE_CHECKING:
 
 
 def metrics(
-    result: Result, residuals: Residuals, alignment: str | None = None, relations: Path | None = None
+    result: Result,
+    residuals: Residuals,
+    alignment: str | None = None,
+    relations: Path | None = None,
+    doubts: Sequence[str] = (),
 ) -> dict[str, object]:
     """The content of metrics.json: the same for the same run, wall times left out.
 
     `alignment` of the trajectory with the truth: by default none on a given map, and se2 on one that was drawn, whose
-    frame is its own. `relations` is a file for the metric [K].
+    frame is its own. `relations` is a file for the metric [K], `doubts` are warnings besides the result's own.
     """
     diagnostics = result.diagnostics
     status = Counter(diagnostics.status)
@@ -52,6 +70,7 @@ def metrics(
             "duration_s": duration(result),
             "odometry_messages": len(result.odometry),
             "path_length_m": result.trajectory.length(),
+            **_read(result),
         },
         "scans": {
             "total": len(diagnostics),
@@ -67,7 +86,7 @@ def metrics(
         "map": _map_quality(result, residuals),
         "localised": {"share_of_poses": float(result.localised.mean()) if len(result.localised) else 0.0},
         "losses": {"data_lost": result.losses.data_lost, "notes": result.losses.lines()},
-        "warnings": list(result.warnings),
+        "warnings": [*result.warnings, *doubts],
     }
     if result.reference is not None and len(result.reference) > 1:
         chosen = alignment or ("se2" if result.mode == "slam" else "none")
@@ -80,6 +99,33 @@ def metrics(
     if relations is not None:
         values["relations"] = evaluate_relations(result.trajectory, read_relations(relations)).to_dict()
     return values
+
+
+def _read(result: Result) -> dict[str, object]:
+    """What of the log was read, and from when on."""
+    summary, stamps = result.summary, result.trajectory.stamps_ns
+    lasers = summary.lasers or (
+        LaserSummary(summary.scan_topic or "", summary.laser_frame or "", summary.T_base_laser, summary.laser_flipped,
+                     summary.extrinsics),
+    )  # fmt: skip
+    truth = summary.truth_topic if result.spec.reference is None else result.spec.reference
+    return {
+        "first_stamp_ns": int(stamps.min()) if len(stamps) else None,
+        "odometry": None if result.spec.no_odometry else summary.odom_topic,
+        "reference": None if result.reference is None else truth,
+        "lasers": [
+            {
+                "topic": laser.topic,
+                "frame": laser.frame,
+                "x": laser.T_base_laser.x,
+                "y": laser.T_base_laser.y,
+                "yaw": laser.T_base_laser.theta,
+                "upside_down": laser.flipped,
+                "extrinsics": laser.extrinsics,
+            }
+            for laser in lasers
+        ],
+    }
 
 
 def _map_name(result: Result) -> str:
@@ -98,7 +144,8 @@ def _map_quality(result: Result, residuals: Residuals) -> dict[str, object]:
         values["mapping"] = result.mapping.quality.to_dict()
     if result.true_grid is not None and result.reference is not None:
         try:
-            moved = compare(result.trajectory, result.reference, alignment="se2").T_reference_estimate
+            options = pairing(result.trajectory, result.reference)
+            moved = compare(result.trajectory, result.reference, alignment="se2", **options).T_reference_estimate
             values["comparison"] = compare_maps(result.grid, result.true_grid, T_truth_map=moved).to_dict()
         except EvaluationError as error:
             values["comparison_error"] = str(error)
@@ -121,9 +168,26 @@ def duration(result: Result) -> float:
     return float(stamps.max() - stamps.min()) / 1e9 if len(stamps) else 0.0
 
 
+def pairing(trajectory: Trajectory, reference: Trajectory) -> Pairing:
+    """How to pair the poses: the nearest within 10 ms, as evo does, if most of the sparser trajectory finds one.
+
+    Else the denser one is interpolated, across gaps of up to a second: a reference at 1 Hz has no pose within 10 ms of
+    one of a robot's that was seen at 7 Hz.
+    """
+    try:
+        found = associate(reference, trajectory)
+        if len(found) >= _MOST * min(len(reference), len(trajectory)):
+            return {}
+    except EvaluationError:
+        pass
+    denser = max(trajectory, reference, key=len)
+    usual = float(np.median(np.diff(np.sort(denser.stamps_ns)))) / 1e9 if len(denser) > 1 else 0.0
+    return {"association": "interpolation", "max_difference_s": min(max(0.75 * usual, 0.01), 1.0)}
+
+
 def _against(trajectory: Trajectory, reference: Trajectory, alignment: str) -> dict[str, object]:
     try:
-        return evaluate(trajectory, reference, alignment=alignment).to_dict()
+        return evaluate(trajectory, reference, alignment=alignment, **pairing(trajectory, reference)).to_dict()
     except EvaluationError as error:
         return {"evaluation_error": str(error)}
 

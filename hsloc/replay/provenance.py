@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import platform
 import shlex
+from hashlib import file_digest
 from importlib import metadata
 from typing import TYPE_CHECKING
 
 from hsloc import __version__
 from hsloc.config import dump
 from hsloc.evaluation.report_html import Provenance
+from hsloc.replay.saved_maps import map_files
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hsloc.model.pose2 import Pose2
     from hsloc.replay.run import Result, RunSpec
 
@@ -23,7 +27,14 @@ def provenance(result: Result) -> Provenance:
     versions = {"hsloc": __version__, "Python": platform.python_version()}
     versions |= {name: metadata.version(name) for name in _PACKAGES}
     hashes = {" ".join(result.spec.names()): result.input_sha256}
+    if result.spec.map_path is not None:
+        hashes |= {path.name: _sha256(path) for path in map_files(result.spec.map_path)}
     return Provenance(command(result.spec), dump(result.spec.config), versions, hashes)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return file_digest(stream, "sha256").hexdigest()
 
 
 def command(spec: RunSpec) -> str:
@@ -38,6 +49,7 @@ def command(spec: RunSpec) -> str:
         ("--scan-topic", read.scan_topic),
         ("--odom-topic", read.odom_topic),
         ("--truth-topic", read.truth_topic),
+        ("--reference", spec.reference),
         ("--base-frame", read.base_frame),
         ("--laser-pose", _pose(read.laser_pose)),
         ("--start", read.start_s),

@@ -82,8 +82,8 @@ def _write(
     relations: Path | None,
     progress: Callable[[float], None] | None,
 ) -> dict[str, object]:
-    residuals = write_recording(result, folder / "run.mcap", progress)
-    values = metrics(result, residuals, alignment, relations)
+    review = write_recording(result, folder / "run.mcap", progress)
+    values = metrics(result, review.residuals, alignment, relations, review.doubts)
     write_tum(folder / "trajectory.tum", result.trajectory)
     if len(result.odometry):
         write_tum(folder / "odometry.tum", result.odometry)
@@ -108,5 +108,6 @@ def _write(
         "metrics": values,
     }
     draw_report(folder / "report.png", **shown)  # type: ignore[arg-type]
-    write_report_html(folder / "report.html", **shown, provenance=provenance(result))  # type: ignore[arg-type]
+    more = {"provenance": provenance(result), "convergence": review.convergence}
+    write_report_html(folder / "report.html", **shown, **more)  # type: ignore[arg-type]
     return values

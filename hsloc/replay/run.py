@@ -22,7 +22,8 @@ from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
 from hsloc.replay.engine import replay
 from hsloc.replay.recording import Recording
-from hsloc.replay.saved_maps import load_grid, load_state
+from hsloc.replay.references import read_reference
+from hsloc.replay.saved_maps import load_grid, load_state, maps_beside, unread_maps
 from hsloc.replay.start import find_start, first_odometry
 from hsloc.slam.mapper import Mapper, Resume
 from hsloc.slam.point_mapper import PointMapper
@@ -62,6 +63,7 @@ class RunSpec:
     With `no_odometry` the log's odometry is not looked at (slam alone). The start is `initial_pose`, else the one
     that the log states for the time of the first event, else unknown; with `unknown_start` it is unknown whatever the
     log states. `labels` are the names of the logs in reports, where the files' own names say nothing.
+    `reference` names poses to compare with, see `hsloc.replay.references`; otherwise they are the log's truth.
     """
 
     logs: tuple[Path, ...]
@@ -76,6 +78,7 @@ class RunSpec:
     labels: tuple[str, ...] = ()
     mode: str = "auto"
     no_odometry: bool = False
+    reference: str | None = None
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
@@ -92,6 +95,10 @@ class RunSpec:
             )
         if self.no_odometry and self.read.deskew:
             raise ConfigError("scans are deskewed with odometry; leave out --no-odom or --deskew")
+        if self.reference is not None and self.read.truth_topic is not None:
+            raise ConfigError(
+                "--reference and --truth-topic both name the poses to compare with; leave out one of them"
+            )
         _check_window(self.read.start_s, self.read.end_s)
         if len({path.resolve() for path in self.logs}) < len(self.logs):
             raise ConfigError(f"{self.logs[0]}: a log is named twice; several logs must be parts of one run")
@@ -153,6 +160,7 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
     """
     begin = time.perf_counter()
     log = open_log(spec.logs, replace(spec.read, require_odometry=not spec.no_odometry))
+    reference = None if spec.reference is None else read_reference(spec.reference, spec.logs)
     grid, warnings = find_map(spec, log)
     state, remarks = load_state(spec)
     warnings = (*warnings, *remarks)
@@ -199,7 +207,7 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
         trajectory=trajectory,
         localised=localised,
         odometry=recording.odometry(),
-        reference=recording.reference(),
+        reference=recording.reference() if reference is None else reference,
         grid=_must(grid),
         diagnostics=recording.diagnostics(),
         losses=log.losses,
@@ -238,9 +246,18 @@ def find_map(spec: RunSpec, log: Log) -> tuple[OccupancyGrid | None, tuple[str, 
     if spec.map_path is not None:
         return load_grid(spec.map_path)
     grid = log.map()
-    if grid is None and spec.mode == "localise":
-        raise MapError(f"{spec.logs[0]}: the log has no /map; give one with --map map.yaml")
-    return grid, ()
+    if grid is not None:
+        return grid, ()
+    unread = unread_maps(log.summary)
+    beside = maps_beside(spec.logs[0])
+    given = str(beside[0]) if beside else "map.yaml"
+    what = f"cannot use {unread[0]}" if unread else "the log has no /map"
+    if spec.mode == "localise":
+        raise MapError(f"{spec.logs[0]}: {what}; give one with --map {given}")
+    if spec.mode == "slam" or spec.resume is not None or not (unread or beside):
+        return None, ()
+    hint = f"{what}, so one is drawn; to localise on a map give it with --map {given}"
+    return None, (hint + ("" if not beside[1:] else f" (also there: {', '.join(p.name for p in beside[1:])})"),)
 
 
 def _must(grid: OccupancyGrid | None) -> OccupancyGrid:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 from hsloc.errors import MapError
 from hsloc.maps import read_map
+from hsloc.maps.metadata import read_metadata
 from hsloc.slam.state import STATE_FILE, fingerprint, read_state
+
+_MAP_TYPES = ("nav_msgs/msg/OccupancyGrid", "foxglove.Grid")
+_HEAD = 4096
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from hsloc.log.summary import LogSummary
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.replay.run import RunSpec
     from hsloc.slam.state import MapState
@@ -21,11 +27,42 @@ def map_file(path: Path) -> Path:
     return path / "map.yaml" if path.is_dir() else path
 
 
+def map_files(path: Path) -> list[Path]:
+    """The files that a map consists of: its YAML and its picture, or its map.npz."""
+    file = map_file(path)
+    if file.suffix == ".npz":
+        return [file]
+    beside = file.with_suffix(".yaml")
+    # As read_map has it: an image may be named, too, with its YAML beside it.
+    return [file, read_metadata(file).image] if file.suffix in (".yaml", ".yml") else [beside, file]
+
+
 def state_file(path: Path) -> Path:
     """The file meant by --resume: beside map.yaml, or in a folder of results."""
     if path.is_dir():
         return path / STATE_FILE
     return path.with_name(STATE_FILE) if path.suffix == ".yaml" else path
+
+
+def maps_beside(log: Path) -> list[Path]:
+    """Maps of nav2 in the folder of a log, by name: what a user may have meant, but has not said."""
+    folder = log if log.is_dir() else log.parent
+    try:
+        return [path for path in sorted(folder.glob("*.yaml")) if _is_map(path)]
+    except OSError:
+        return []
+
+
+def _is_map(path: Path) -> bool:
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD).decode(errors="replace")
+    return all(re.search(rf"^{key}\s*:", head, re.MULTILINE) for key in ("image", "resolution", "origin"))
+
+
+def unread_maps(summary: LogSummary) -> list[str]:
+    """Topics of maps in a log that gave none: not to be decoded, or several without one being /map."""
+    topics = [f"{t.topic} ({t.typename})" for t in summary.topics if t.typename in _MAP_TYPES and t.count]
+    return topics if len(topics) < 2 else [f"any of {', '.join(topics)}, of which none is /map"]
 
 
 def load_grid(path: Path) -> tuple[OccupancyGrid, tuple[str, ...]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hsloc import __version__
@@ -10,7 +11,9 @@ from hsloc.log.writer import LogWriter
 from hsloc.model.events import Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.model.trajectory import Trajectory
+from hsloc.replay.convergence import ConvergenceSample
 from hsloc.replay.engine import pair
+from hsloc.replay.mountings import MountingCheck
 from hsloc.replay.provenance import config_text
 from hsloc.replay.residuals import Residuals
 
@@ -18,19 +21,36 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from hsloc.replay.run import Result
 
 _PATH_POSES = 2000
 """A path to look at needs no more poses; viewers slow down."""
 
 
-def write_recording(result: Result, path: Path, progress: Callable[[float], None] | None = None) -> Residuals:
-    """Write map, scans, transforms, poses and the path; returns how well the scans fit the map.
+@dataclass(frozen=True, slots=True, eq=False)
+class Review:
+    """What a second look at the scans says: how they fit the map, doubts of mountings, how the search converges."""
+
+    residuals: Residuals
+    doubts: list[str]
+    convergence: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
+
+
+def write_recording(result: Result, path: Path, progress: Callable[[float], None] | None = None) -> Review:
+    """Write map, scans, transforms, poses and the path; returns what the second look at the scans says.
 
     The scans come from the log, read once more, so that memory does not grow with it. The map is that of the result.
     """
     log = open_log(result.spec.logs, result.spec.read)
     residuals = Residuals(result.grid)
+    check = MountingCheck(result.grid, len(result.diagnostics), len(result.summary.lasers))
+    config = result.spec.config
+    sample = ConvergenceSample(
+        result.grid, config.make_matcher(), config.likelihood_field.sigma, len(result.diagnostics)
+    )
     places = _Places(result)
     mountings: set[str] = set()
     start = int(result.trajectory.stamps_ns[0])
@@ -51,6 +71,8 @@ def write_recording(result: Result, path: Path, progress: Callable[[float], None
                 writer.scan(scan)
                 if believed:
                     residuals.add(scan, T_map_base)
+                    check.add(scan, T_map_base)
+                    sample.add(scan, T_map_base)
             elif isinstance(event, Odometry) and not result.follows_scans:
                 T_map_odom, T_map_base = places.of_odometry()
                 _write_pose(writer, event.stamp_ns, T_map_odom, event.T_odom_base, T_map_base)
@@ -58,7 +80,7 @@ def write_recording(result: Result, path: Path, progress: Callable[[float], None
                 progress(places.row / len(result.trajectory))
         every = max(len(result.trajectory) // _PATH_POSES, 1)
         writer.path(start, Trajectory(result.trajectory.stamps_ns[::every], result.trajectory.poses[::every]))
-    return residuals
+    return Review(residuals, [*residuals.doubts(), *check.doubts()], sample.curves(config.matcher.upper()))
 
 
 class _Places:

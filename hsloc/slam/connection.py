@@ -11,6 +11,7 @@ from hsloc.errors import MapError
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
 from hsloc.matching.hide import Hide
 from hsloc.matching.likelihood_field import LikelihoodField
+from hsloc.model.events import PairedScan
 from hsloc.model.pose2 import Pose2
 from hsloc.slam.gathered import restored, together
 from hsloc.slam.loop_closer import LoopCloser
@@ -77,7 +78,7 @@ def _relocalised(
         relocaliser.start()
         for scan in range(int(begin), min(int(begin) + _LOOKED, len(log.poses))):
             T_front_base = Pose2.from_array(log.poses[scan])
-            verdict = relocaliser.update(log.scans.scan(scan), T_front_base, 0)
+            verdict = relocaliser.update(PairedScan(log.scans.scan(scan), T_front_base), 0)
             if verdict.is_sure and verdict.pose is not None:
                 yield verdict.pose @ T_front_base.inverse(), scan
                 break

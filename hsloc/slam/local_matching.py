@@ -107,7 +107,7 @@ class LocalMatch:
     reason: str = ""
 
 
-_FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
+FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
 """No motion is known better than this (m^2, rad^2)."""
 _FORGET = 0.05
 """Weight of a new match in the usual fitness."""
@@ -139,8 +139,8 @@ class LocalMatcher:
         enough = len(points) >= p.min_points
         if self._T_odom_key is None:
             if not enough:
-                return LocalMatch(IDENTITY, IDENTITY, _FLOOR, Status.NO_RETURNS, False, reason=f"{len(points)} returns")
-            return self._keep(paired, points, LocalMatch(IDENTITY, IDENTITY, _FLOOR, Status.MATCHED, True, 1.0))
+                return LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.NO_RETURNS, False, reason=f"{len(points)} returns")
+            return self._keep(paired, points, LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.MATCHED, True, 1.0))
         motion, covariance = self._predict(paired)
         predicted = self._T_map_key @ motion
         small = hypot(motion.x, motion.y) < p.keyscan_min_d and abs(motion.theta) < p.keyscan_min_a
@@ -159,7 +159,7 @@ class LocalMatcher:
         p = self._parameters
         if self._use_odometry and self._T_odom_key is not None:
             motion = self._T_odom_key.between(paired.T_odom_base)
-            return motion, p.odometry_noise.covariance(motion) + _FLOOR
+            return motion, p.odometry_noise.covariance(motion) + FLOOR
         stamp, pose = self._last if self._last is not None else (paired.scan.stamp_ns, self._T_map_key)
         seconds = min(max((paired.scan.stamp_ns - stamp) * 1e-9, 0.0), 1.0)
         # A clock that jumps makes wild velocities: no step is predicted longer than the window is wide.
@@ -183,7 +183,7 @@ class LocalMatcher:
         self._usual = match.fitness if self._usual is None else self._usual + _FORGET * (match.fitness - self._usual)
         pose, fused = fuse(predicted, in_map, match.pose, p.match_trust * match.covariance)
         return LocalMatch(
-            pose, key.between(pose), turn.T @ fused @ turn + _FLOOR, Status.MATCHED, True, match.fitness, evaluations
+            pose, key.between(pose), turn.T @ fused @ turn + FLOOR, Status.MATCHED, True, match.fitness, evaluations
         )
 
     def _search(self, points: F64, predicted: Pose2, covariance: F64) -> tuple[Match, int]:

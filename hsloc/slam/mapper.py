@@ -7,18 +7,18 @@ the map is drawn.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.localisation.motion import predict_covariance
 from hsloc.model.estimate import Estimate, Status
-from hsloc.model.events import Odometry, PairedScan
+from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.slam.drawing import DrawingParameters
 from hsloc.slam.keyscans import KeyScan
-from hsloc.slam.local_matching import LocalMatcher, LocalMatchingParameters
+from hsloc.slam.local_matching import FLOOR, LocalMatcher, LocalMatchingParameters
 from hsloc.slam.loop_closer import LoopParameters
 from hsloc.slam.refinement import RefinementParameters
 from hsloc.slam.track import Track
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
+    from hsloc.model.events import Scan
     from hsloc.model.pose2 import Pose2
     from hsloc.slam.local_matching import LocalMatch
     from hsloc.slam.result import MappingResult
@@ -71,6 +72,7 @@ class Mapper:
         self._scans: list[KeyScan] = []
         self._stamps: list[int] = []
         self._local: list[LocalMatch] = []
+        self._held: list[tuple[int, PairedScan]] = []
         self._T_map_odom = IDENTITY
         self._T_map_key = IDENTITY
         self._T_last_scan = IDENTITY
@@ -83,16 +85,20 @@ class Mapper:
             T_odom_base = event.T_odom_base if self._parameters.use_odometry else self._T_last_scan
             self._track.add(T_odom_base, is_scan=False)
             return Estimate(event.stamp_ns, self._T_map_odom @ T_odom_base, Status.PREDICTED)
-        points = event.scan.points_base()
+        if event.is_held:
+            self._held.append((len(self._track), event))
+            self._track.add(event.T_odom_base, is_scan=True)
+            pose = self._T_map_odom @ event.T_odom_base
+            return Estimate(event.scan.stamp_ns, pose, Status.PREDICTED, reason=HELD)
+        points = event.points_base()
         found = self._matcher.update(event, points)
         covariance = predict_covariance(self._covariance, self._T_map_key, found.motion, found.covariance)
         T_odom_base = event.T_odom_base if self._parameters.use_odometry else found.pose
+        local = self._keep_companions(event, found) if found.is_keyscan else found
         self._track.add(T_odom_base, is_scan=True, is_key=found.is_keyscan)
         if found.is_keyscan:
             self._covariance, self._T_map_key = covariance, found.pose
-            self._scans.append(KeyScan.of(event.scan))
-            self._stamps.append(event.scan.stamp_ns)
-            self._local.append(found)
+            self._keep(event.scan, local)
         self._T_map_odom = found.pose @ T_odom_base.inverse()
         self._T_last_scan = found.pose
         return Estimate(
@@ -104,6 +110,28 @@ class Mapper:
             found.evaluations,
             found.reason,
         )
+
+    def _keep(self, scan: Scan, local: LocalMatch) -> None:
+        self._scans.append(KeyScan.of(scan))
+        self._stamps.append(scan.stamp_ns)
+        self._local.append(local)
+
+    def _keep_companions(self, event: PairedScan, found: LocalMatch) -> LocalMatch:
+        """Make the companions of a keyscan keyscans before it; the keyscan's match, seen from the last of them.
+
+        From scan to scan of one cloud the odometry tells the motion: each keeps its own beams, for each has an origin.
+        """
+        numbers = {id(held.scan): number for number, held in self._held}
+        self._held = []
+        motion, covariance = found.motion, found.covariance
+        previous = event
+        for companion in event.companions:
+            self._track.make_key(numbers[id(companion.scan)])
+            place = event.to(companion)
+            motion = found.motion @ place if previous is event else previous.to(companion)
+            self._keep(companion.scan, replace(found, pose=found.pose @ place, motion=motion, covariance=covariance))
+            previous, motion, covariance = companion, companion.to(event), FLOOR
+        return replace(found, motion=motion, covariance=covariance)
 
     def finish(self, progress: Callable[[float], None] | None = None) -> MappingResult:
         """Close loops, refine, draw; `progress` is told parts from 0 to 1. May be called once, at the end.

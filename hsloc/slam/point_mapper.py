@@ -16,7 +16,7 @@ from hsloc.errors import ConfigError
 from hsloc.localisation.motion import OdometryNoise, predict_covariance
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Status
-from hsloc.model.events import Odometry, PairedScan
+from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.slam.local_map import LocalMap
@@ -96,6 +96,8 @@ class PointMapper:
             self._T_odom_base = event.T_odom_base
         if isinstance(event, Odometry):
             return Estimate(event.stamp_ns, predicted, Status.PREDICTED)
+        if event.is_held:
+            return Estimate(event.scan.stamp_ns, predicted, Status.PREDICTED, reason=HELD)
         noise = self._parameters.odometry_noise.covariance(motion)
         covariance = predict_covariance(self._covariance, self._T_map_base, motion, noise)
         estimate = self._localise(event, predicted, covariance)
@@ -118,7 +120,7 @@ class PointMapper:
     def _localise(self, paired: PairedScan, predicted: Pose2, covariance: F64) -> Estimate:
         p = self._parameters
         stamp = paired.scan.stamp_ns
-        points = paired.scan.points_base()
+        points = paired.points_base()
         if len(points) < p.min_points:
             return Estimate(stamp, predicted, Status.NO_RETURNS, covariance, reason=f"{len(points)} returns")
         if not self._points:

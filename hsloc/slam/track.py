@@ -32,6 +32,14 @@ class Track:
         self._poses.append((T_odom_base.x, T_odom_base.y, T_odom_base.theta))
         self._is_scan.append(is_scan)
 
+    def make_key(self, event: int) -> None:
+        """Make a scan of before, the event of that number, a keyscan; keyscans must come in order."""
+        self._keys.append(event)
+
+    def __len__(self) -> int:
+        """How many events there were."""
+        return len(self._poses)
+
     def key_odometry(self) -> F64:
         """Odometry of the keyscans, shape (n, 3)."""
         return np.array([self._poses[k] for k in self._keys]).reshape(-1, 3)

@@ -86,3 +86,34 @@ def test_the_configuration_of_a_run_runs_again(tmp_path):
     assert load(Path(again)) != Config()
     assert main(["replay", SLIP, "--end", "8", "-q", "--config", again, "--out", str(second)]) == 0
     assert (first / "trajectory.tum").read_bytes() == (second / "trajectory.tum").read_bytes()
+
+
+def test_map_is_replay_that_draws_a_map(tmp_path, capsys):
+    assert main(["map", SLIP, "--end", "4", "--out", str(tmp_path / "a"), "-q"]) == 0
+    assert main(["replay", SLIP, "--mode", "slam", "--end", "4", "--out", str(tmp_path / "b"), "-q"]) == 0
+    for name in ("map.pgm", "map.yaml", "trajectory.tum", "config.yaml"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_a_duration_counts_from_the_start(tmp_path, capsys):
+    assert main(["replay", SLIP, "--start", "2", "--duration", "3", "--out", str(tmp_path / "a"), "-q"]) == 0
+    assert (
+        main(["replay", SLIP, "--start", "2", "--end", "5", "--out", str(tmp_path / "b"), "-q", "--no-progress"]) == 0
+    )
+    for name in ("trajectory.tum", "config.yaml"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    with pytest.raises(SystemExit) as caught:
+        main(["replay", SLIP, "--duration", "3", "--end", "5"])
+    assert caught.value.code == 2
+    assert "argument --end: not allowed with argument --duration" in capsys.readouterr().err
+    assert main(["replay", SLIP, "--start", "2", "--duration", "-1"]) == 1
+    assert "--end is 1; it must be later than --start 2" in capsys.readouterr().err
+
+
+def test_the_progress_bar_can_be_left_out(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    command = ["replay", SLIP, "--end", "2", "--overwrite", "--out", str(tmp_path / "a")]
+    assert main(command) == 0
+    assert "writing   [" in capsys.readouterr().err
+    assert main([*command, "--no-progress"]) == 0
+    assert capsys.readouterr().err == ""

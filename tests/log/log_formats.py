@@ -215,7 +215,7 @@ def foxglove_mcap(source: Path, target: Path, encoding: str, single_transforms: 
     return write(target, items(), source)
 
 
-DOUBLE, STRING, MESSAGE = 1, 9, 11
+DOUBLE, INT32, FIXED32, STRING, MESSAGE, BYTES = 1, 5, 7, 9, 11, 12
 FIELDS: dict[str, list[tuple[str, int, str | int, bool]]] = {
     "Vector3": [(name, n + 1, DOUBLE, False) for n, name in enumerate("xyz")],
     "Quaternion": [(name, n + 1, DOUBLE, False) for n, name in enumerate("xyzw")],
@@ -237,6 +237,20 @@ FIELDS: dict[str, list[tuple[str, int, str | int, bool]]] = {
         ("rotation", 5, "foxglove.Quaternion", False),
     ],
     "FrameTransforms": [("transforms", 1, "foxglove.FrameTransform", True)],
+    "Vector2": [(name, n + 1, DOUBLE, False) for n, name in enumerate("xy")],
+    # Its type is an enumeration, which is an int32 on the wire.
+    "PackedElementField": [("name", 1, STRING, False), ("offset", 2, FIXED32, False), ("type", 3, INT32, False)],
+    "Grid": [
+        ("timestamp", 1, "google.protobuf.Timestamp", False),
+        ("frame_id", 2, STRING, False),
+        ("pose", 3, "foxglove.Pose", False),
+        ("column_count", 4, FIXED32, False),
+        ("cell_size", 5, "foxglove.Vector2", False),
+        ("row_stride", 6, FIXED32, False),
+        ("cell_stride", 7, FIXED32, False),
+        ("fields", 8, "foxglove.PackedElementField", True),
+        ("data", 9, BYTES, False),
+    ],
     "PoseInFrame": [
         ("timestamp", 1, "google.protobuf.Timestamp", False),
         ("frame_id", 2, STRING, False),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from math import pi
 
@@ -11,10 +12,12 @@ import pytest
 
 from hsloc.cli.main import main
 from hsloc.errors import TopicError
+from hsloc.evaluation import evaluate
 from hsloc.log.reader import open_log
 from hsloc.log.summary import ReadOptions
 from hsloc.log.writer import LogWriter
 from hsloc.model import Odometry, Pose2, Scan
+from hsloc.model.events import HELD
 from hsloc.replay.run import RunSpec, run
 from hsloc.simulation.presets import preset
 from hsloc.simulation.recorder import record
@@ -29,19 +32,25 @@ def log(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lasers")
     parts = {}
     for name, mounting, offset in (("front", FRONT, 0.0), ("rear", REAR, 0.05)):
-        scenario = preset("office")
+        scenario = preset("corridor_loop")
         sensor = replace(scenario.sensor, mounting=mounting, frame_id=name, field_of_view=pi, beams=180)
         scenario = replace(scenario, seed=9, duration_s=20.0, sensor=sensor, scan_offset_s=offset)
         record(scenario, folder / f"{name}.mcap")
         parts[name] = open_log(folder / f"{name}.mcap")
-    path = folder / "both.mcap"
-    start = parts["front"].initial_pose()[1]
+    rear = [event for event in parts["rear"].events() if isinstance(event, Scan)]
+    events = sorted([*parts["front"].events(), *rear], key=lambda event: event.stamp_ns)
+    return write(folder / "both.mcap", parts["front"], events, REAR)
+
+
+def write(path, log, events, T_base_rear):
+    """The events with the map and the start of a log, and a rear laser that is said to be there (None: unsaid)."""
+    start = log.initial_pose()[1]
+    links = [("base_link", "front", FRONT)] + ([] if T_base_rear is None else [("base_link", "rear", T_base_rear)])
     with LogWriter(path) as writer:
         writer.metadata("hsloc.initial_pose", {"x": repr(start.x), "y": repr(start.y), "theta": repr(start.theta)})
-        writer.transforms(0, [("base_link", "front", FRONT), ("base_link", "rear", REAR)], static=True)
-        writer.occupancy_grid(parts["front"].map(), 0)
-        rear = [event for event in parts["rear"].events() if isinstance(event, Scan)]
-        for event in sorted([*parts["front"].events(), *rear], key=lambda event: event.stamp_ns):
+        writer.transforms(0, links, static=True)
+        writer.occupancy_grid(log.map(), 0)
+        for event in events:
             if isinstance(event, Scan):
                 writer.scan(event, topic=f"/{event.frame_id}")
             elif isinstance(event, Odometry):
@@ -66,14 +75,31 @@ def test_scans_of_all_topics_come_in_order_with_their_own_mounting(log):
     assert len(alone) == len(scans) // 2
 
 
-def test_a_run_uses_both_lasers(log):
-    result = run(RunSpec(logs=(log,), read=BOTH))
+def error(log, topics, mode):
+    """RMSE of APE (m) and the result."""
+    result = run(RunSpec(logs=(log,), read=ReadOptions(scan_topic=topics), mode=mode))
+    alignment = "none" if mode == "localise" else "se2"
+    return evaluate(result.trajectory, result.reference, alignment=alignment).ape.trans_part.rmse, result
+
+
+def test_both_lasers_are_matched_as_one_cloud_and_are_better_than_either(log):
+    alone = [error(log, topic, "localise")[0] for topic in ("/front", "/rear")]
+    both, result = error(log, "/front,/rear", "localise")
+    assert both < min(alone)
     assert len(result.diagnostics) == 401
-    status = result.diagnostics.status
-    # The first scan of each 25 cm is matched, and that is one of the rear as often as one of the front.
-    assert all("matched" in status[side::2] for side in (0, 1))
-    difference = result.trajectory.interpolated(result.reference.stamps_ns) - result.reference.poses
-    assert np.hypot(difference[:, 0], difference[:, 1]).max() < 0.06
+    held = [reason == HELD for reason in result.diagnostics.reason]
+    # The first scan comes before the other laser is known of; then each second one carries the one before.
+    assert held == [False, *([True, False] * 200)]
+    assert "matched" in result.diagnostics.status
+
+
+def test_a_map_of_both_lasers_holds_the_beams_of_both(log):
+    result = error(log, "/front,/rear", "slam")[1]
+    mounted = {tuple(np.round(row[:3], 6)) for row in result.mapping.state.scans.geometry}
+    assert mounted == {(0.3, 0.0, 0.0), (-0.3, 0.05, round(pi, 6))}
+    stamps = result.mapping.keyscan_stamps_ns
+    assert (np.diff(stamps) > 0).all()
+    assert evaluate(result.trajectory, result.reference, alignment="se2").ape.trans_part.max < 0.03
 
 
 def test_the_command_takes_the_flag_twice_or_commas(log, tmp_path, capsys):
@@ -98,3 +124,35 @@ def test_a_mounting_by_hand_is_for_all_and_said_so(log):
     summary = open_log(log, replace(BOTH, laser_pose=Pose2(1.0, 0.0, 0.0))).summary
     assert [laser.T_base_laser.x for laser in summary.lasers] == [1.0, 1.0]
     assert "--laser-pose is taken for all 2 lasers" in summary.warnings
+
+
+@pytest.mark.parametrize(
+    ("T_base_rear", "told"),
+    [
+        (REAR, []),
+        (
+            Pose2(-0.3, 0.05, pi - 0.1),
+            [r"the laser rear does not fit front: .* at -0\.30, 0\.05 m, 174\.3 deg, by the map"],
+        ),
+        (
+            Pose2(-0.05, 0.05, pi),
+            [r"the laser rear does not fit front: .* by the map it would be at about -0\.(29|30|31),"],
+        ),
+        (
+            Pose2(-0.3, 0.05, pi / 2),
+            [r"of the points of the laser rear lie at a wall of the map, but (9\d|100) % of those"],
+        ),
+        (None, ["no transform from base_link to rear", "of the points of the laser rear lie at a wall"]),
+    ],
+)
+def test_a_laser_that_is_mounted_otherwise_than_is_said_is_told(log, tmp_path, capsys, T_base_rear, told):
+    opened = open_log(log, BOTH)
+    path = write(tmp_path / "told.mcap", opened, list(opened.events()), T_base_rear)
+    options = ["--scan-topic=/front,/rear", "--out", str(tmp_path / "out"), "--json"]
+    assert main(["replay", str(path), *options]) == 0
+    captured = capsys.readouterr()
+    warnings = [line for line in captured.err.splitlines() if line.startswith("hsloc: warning: ")]
+    assert len(warnings) == len(told)
+    for line, pattern in zip(warnings, told, strict=True):
+        assert re.search(pattern, line)
+    assert [f"hsloc: warning: {line}" for line in json.loads(captured.out)["warnings"]] == warnings

@@ -37,7 +37,9 @@ def test_turtlebot_from_an_unknown_start(data: Path, tmp_path, log):
     )
     found = run(spec)
     assert found.localised.all()
-    residuals = write_recording(found, tmp_path / "run.mcap")
+    review = write_recording(found, tmp_path / "run.mcap")
+    residuals = review.residuals
+    assert review.doubts == []
     values = metrics(found, residuals)
     assert values["map"]["residuals"]["within_0.15_m"] >= 0.85
     assert any("free_thresh" in warning for warning in found.warnings)

@@ -1,0 +1,80 @@
+"""Several lasers: scans taken at about the same time are matched as one cloud.
+
+Matched one by one, lasers that measure together would never all be heard: the first scan after each step of the robot
+passes the motion gate, and that is always the same laser's. A laser that looks to one side knows less, too, than all
+together. So a scan is held until every laser has told of about the same moment; the last of them carries the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from hsloc.model.events import Odometry, PairedScan
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from hsloc.model.events import Truth
+
+    Paired = Odometry | PairedScan | Truth
+
+_PART = 0.6
+"""Scans at most this part of the slowest laser's period apart are one cloud: of two lasers that turn equally fast, each
+scan has one of the other within half of it, and stamps jitter."""
+_USUAL_NS, _LONGEST_NS = 100_000_000, 400_000_000
+"""A laser's period before it is known, and at most."""
+_SILENT_NS = 500_000_000
+"""A laser that has told nothing for so long is not waited for."""
+
+
+def clouds(events: Iterable[Paired]) -> Iterator[Paired]:
+    """Events as `hsloc.replay.engine.pair` gives them, scans of several lasers (by `frame_id`) joined.
+
+    All events pass in their order. Each scan is either held (`is_held`), or is to be matched together with its
+    `companions`, which were. Without odometry nothing tells how the robot moved between two scans: none is held then.
+    """
+    lasers = _Lasers()
+    told = False
+    for event in events:
+        told = told or isinstance(event, Odometry)
+        yield lasers.joined(event) if told and isinstance(event, PairedScan) else event
+
+
+class _Lasers:
+    """When each laser was heard of last, and which scans wait to be carried."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, int] = {}
+        self._period: dict[str, int] = {}
+        self._held: dict[str, PairedScan] = {}
+        self._carried_ns = 0
+
+    def joined(self, paired: PairedScan) -> PairedScan:
+        """The scan, held or with its companions."""
+        frame, stamp = paired.scan.frame_id, paired.scan.stamp_ns
+        self._hear(frame, stamp)
+        if len(self._last) == 1:
+            self._carried_ns = stamp
+            return paired
+        reach = round(_PART * max(self._period.values()))
+        self._held = {name: held for name, held in self._held.items() if abs(stamp - held.scan.stamp_ns) <= reach}
+        self._held.pop(frame, None)
+        awake = {name for name, last in self._last.items() if abs(stamp - last) < _SILENT_NS}
+        # Lasers whose scans never come near each other must not wait for ever.
+        starved = abs(stamp - self._carried_ns) > 2 * max(self._period.values())
+        if awake <= {frame, *self._held} or starved:
+            companions = tuple(self._held.values())
+            self._held = {}
+            self._carried_ns = stamp
+            return replace(paired, companions=companions)
+        self._held[frame] = paired
+        return replace(paired, is_held=True)
+
+    def _hear(self, frame: str, stamp_ns: int) -> None:
+        last = self._last.get(frame)
+        if last is None:
+            self._period[frame] = _USUAL_NS
+        elif 0 < stamp_ns - last < _LONGEST_NS:
+            self._period[frame] = stamp_ns - last
+        self._last[frame] = stamp_ns

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Engine, create_engine, event
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
+from service.logs import log
+from service.migrations import migrate
 from service.settings import SettingsError
-from service.tables import SCHEMA_VERSION, Base
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -18,7 +21,10 @@ if TYPE_CHECKING:
 
 
 class Database:
-    """Sessions on the database of a data folder."""
+    """Sessions on the database of a data folder, brought to today's schema.
+
+    Raises SettingsError for a file that is no database of ours, or one of a newer hsloc.
+    """
 
     def __init__(self, path: Path) -> None:
         self._engine = create_engine(
@@ -26,13 +32,18 @@ class Database:
         )
         self._writing = threading.Lock()
         _prepare(self._engine)
-        with self._engine.connect().execution_options(write=True) as connection:
-            version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
-            if version > SCHEMA_VERSION:
-                raise SettingsError(f"{path}: written by a newer hsloc (schema {version}, known {SCHEMA_VERSION})")
-            Base.metadata.create_all(connection)
-            connection.exec_driver_sql(f"PRAGMA user_version={SCHEMA_VERSION}")
-            connection.commit()
+        try:
+            with self._engine.connect().execution_options(write=True) as connection:
+                before, after = migrate(connection, path)
+                connection.commit()
+        except (SettingsError, DBAPIError, sqlite3.Error) as error:
+            self._engine.dispose()
+            if isinstance(error, SettingsError):
+                raise
+            cause = error.orig if isinstance(error, DBAPIError) else error
+            raise SettingsError(f"{path}: cannot be used as database: {cause}; give another --data") from error
+        if 0 < before < after:
+            log("database.migrated", before=before, after=after)
 
     @contextmanager
     def read(self) -> Iterator[Session]:

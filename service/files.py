@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 from sqlalchemy import case, func, select
 
 from service.errors import ServiceError, conflict, no_space, not_found
-from service.tables import ACTIVE, FileRow, JobRow
+from service.requests import files_of
+from service.tables import ACTIVE, AssetRow, FileRow, JobRow
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -68,11 +69,7 @@ class Files:
             self._need_room(session, who, 0)
 
     def _need_room(self, session: Session, who: Principal, size: int) -> None:
-        size_or_none = func.coalesce(FileRow.size, 0)
-        announced = case((FileRow.received > size_or_none, FileRow.received), else_=size_or_none)
-        used = session.scalar(select(func.coalesce(func.sum(announced), 0)).where(FileRow.tenant == who.tenant)) or 0
-        if used + size > self.settings.tenant_bytes:
-            raise no_space(f"your uploads take {used} of {self.settings.tenant_bytes} bytes; delete some")
+        need_quota(session, who, self.settings.tenant_bytes, size)
         # What others announced and have not sent yet is theirs already.
         pending = session.scalar(
             select(func.coalesce(func.sum(FileRow.size - FileRow.received), 0)).where(
@@ -128,10 +125,27 @@ class Files:
         self.storage.upload_path(file_id).unlink(missing_ok=True)
 
 
+def need_quota(session: Session, who: Principal, most: int, size: int = 0) -> None:
+    """Raises ServiceError 507 where uploads, as received or announced, and results of a tenant take too much.
+
+    Results count wherever they are stored, by their manifest.
+    """
+    size_or_none = func.coalesce(FileRow.size, 0)
+    announced = case((FileRow.received > size_or_none, FileRow.received), else_=size_or_none)
+    uploads = session.scalar(select(func.coalesce(func.sum(announced), 0)).where(FileRow.tenant == who.tenant)) or 0
+    results = session.scalar(
+        select(func.coalesce(func.sum(AssetRow.size), 0))
+        .join(JobRow, JobRow.id == AssetRow.job_id)
+        .where(JobRow.tenant == who.tenant)
+    )
+    if uploads + (results or 0) + size > most:
+        raise no_space(f"your uploads take {uploads} and your results {results} of {most} bytes; delete some")
+
+
 def needed(session: Session, file_id: str) -> bool:
     """Whether a job that has not ended reads the file."""
     active = session.scalars(select(JobRow.request).where(JobRow.state.in_(ACTIVE)))
-    return any(file_id == request["log"] or file_id in (request.get("map") or {}).values() for request in active)
+    return any(file_id in files_of(request) for request in active)
 
 
 def _file(session: Session, who: Principal, file_id: str) -> FileRow:

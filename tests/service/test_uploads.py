@@ -188,7 +188,7 @@ def test_an_unfinished_upload_expires(make_client: Callable[..., TestClient]) ->
     path, whole = begin(client, 10), upload(client)
     append(client, path, 0, b"12345")
     context = client.app.state.context  # type: ignore[attr-defined]
-    tidy = Housekeeping(context.database, context.storage, context.settings).tidy
+    tidy = Housekeeping(context.database, context.storage, context.settings, context.stores).tidy
     tidy(time.time())
     assert offset(client, path) == 5
     tidy(time.time() + 11.0)

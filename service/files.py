@@ -7,7 +7,7 @@ import uuid
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sqlalchemy import case, func, select
+from sqlalchemy import case, func, select, tuple_
 
 from service.errors import ServiceError, conflict, no_space, not_found
 from service.requests import files_of
@@ -83,13 +83,14 @@ class Files:
         with self.database.read() as session:
             return _file(session, who, file_id)
 
-    def list(self, who: Principal, limit: int = 200, after: float | None = None) -> Sequence[FileRow]:
-        """Uploads, newest first."""
-        query = select(FileRow).where(FileRow.tenant == who.tenant).order_by(FileRow.created.desc()).limit(limit)
-        if after is not None:
-            query = query.where(FileRow.created < after)
+    def list(self, who: Principal, limit: int = 200, before: str | None = None) -> Sequence[FileRow]:
+        """Uploads, newest first; `before` is the id of the last one seen. Raises ServiceError 404 if that is gone."""
+        query = select(FileRow).where(FileRow.tenant == who.tenant).limit(limit)
         with self.database.read() as session:
-            return session.scalars(query).all()
+            if before is not None:
+                last = _file(session, who, before)
+                query = query.where(tuple_(FileRow.created, FileRow.id) < tuple_(last.created, last.id))
+            return session.scalars(query.order_by(FileRow.created.desc(), FileRow.id.desc())).all()
 
     def advance(self, file_id: str, received: int) -> None:
         """So many bytes are on the disk."""
@@ -108,12 +109,17 @@ class Files:
             return row
 
     def restart(self, who: Principal, file_id: str, size: int | None) -> None:
-        """Begin an unfinished upload anew."""
+        """Begin an unfinished upload anew, of `size` bytes, for which the same holds as for a new one."""
+        if size is not None:
+            self.need_size(size)
         with self.database.write() as session:
             row = _file(session, who, file_id)
             if row.state == "complete":
                 raise conflict("complete", "this upload is finished and cannot be changed")
-            row.received, row.size = 0, size
+            row.received, row.size = 0, None  # what was reserved for it is free again
+            session.flush()
+            self._need_room(session, who, size or 0)
+            row.size = size
 
     def delete(self, who: Principal, file_id: str) -> None:
         """Remove an upload. Raises ServiceError 409 while an active job needs it."""

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
     from service.results import Asset
 
+FLAT = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl")
+"""Here no folder is made before its files: there is none, and s3fs would make a bucket of a name that was mistyped."""
+
 
 class ObjectStore:
     """A `ResultStore` over a file system of fsspec. Holds no connection of its own, and may be used from many threads.
@@ -50,6 +53,7 @@ class ObjectStore:
             raise SettingsError(f"HSLOC_RESULTS_URL is {url!r}; its file system is not installed{hint}") from error
         except Exception as error:
             raise SettingsError(f"HSLOC_RESULTS_URL is {url!r}, which cannot be used: {error}") from error
+        self._flat = parts.scheme in FLAT
         self._url = url if url.endswith("://") else url.rstrip("/")
         self._root = f"{str(root).rstrip('/')}/{instance}"
 
@@ -62,7 +66,8 @@ class ObjectStore:
         """Write every asset, and see that each is there with all its bytes."""
         folder = f"{self._root}/{checked_result(name)}"
         with _typed(f"writing {name}", missing=True):
-            self._fs.makedirs(folder, exist_ok=True)
+            if not self._flat:
+                self._fs.makedirs(folder, exist_ok=True)
             for asset in assets:
                 target = f"{folder}/{checked_asset(asset.name)}"
                 self._fs.put_file(str(output / asset.name), target)

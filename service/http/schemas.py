@@ -46,9 +46,10 @@ class FileView(BaseModel):
 
 
 class FileList(BaseModel):
-    """Uploads, newest first."""
+    """Uploads, newest first; pass `next` as `before` for more."""
 
     files: list[FileView]
+    next: Ident | None
 
 
 class MapFiles(Strict):

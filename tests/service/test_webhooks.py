@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import http.client
 import json
+import socket
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -94,7 +96,12 @@ def test_given_up_after_some_attempts(make_client: Callable[..., TestClient], re
 
 @pytest.mark.parametrize(
     "host",
-    ["127.0.0.1", "localhost", "[::1]", "10.0.0.1", "169.254.169.254", "[::ffff:127.0.0.1]", "0.0.0.0", "2130706433"],
+    [
+        *("127.0.0.1", "localhost", "[::1]", "10.0.0.1", "169.254.169.254", "[::ffff:127.0.0.1]", "0.0.0.0"),
+        "2130706433",
+        # What a gateway makes an IPv4 address of: NAT64, 6to4, IPv4-compatible, Teredo.
+        *("[64:ff9b::7f00:1]", "[64:ff9b::a9fe:a9fe]", "[2002:a00:1::1]", "[::a00:1]", "[2001:0:7f00:1::]"),
+    ],
 )
 def test_private_addresses_are_refused(host: str) -> None:
     with pytest.raises(webhooks.ForbiddenAddress):
@@ -105,3 +112,28 @@ def test_other_schemes_and_user_names_are_refused() -> None:
     for url in ("file:///etc/passwd", "ftp://x/", "http://user:password@example.com/", "http://"):
         with pytest.raises(ValueError):
             webhooks.post(url, b"", {}, private=False)
+
+
+def test_a_receiver_that_answers_by_drips_is_cut_off() -> None:
+    """It would hold up everybody's webhooks: each byte is within the time-out of the line."""
+    stop = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def drip() -> None:
+            line, _ = listening.accept()
+            with line:
+                line.sendall(b"HTTP/1.1 ")
+                while not stop.wait(0.1):
+                    try:
+                        line.sendall(b" ")
+                    except OSError:
+                        return
+
+        thread = threading.Thread(target=drip)
+        thread.start()
+        begin = time.monotonic()
+        with pytest.raises((OSError, http.client.HTTPException)):
+            webhooks.post(f"http://127.0.0.1:{listening.getsockname()[1]}/", b"{}", {}, private=True, within_s=1.0)
+        assert 0.9 < time.monotonic() - begin < 4.0
+        stop.set()
+        thread.join()

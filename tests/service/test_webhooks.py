@@ -6,7 +6,10 @@ import hashlib
 import hmac
 import http.client
 import json
+import shutil
 import socket
+import ssl
+import subprocess
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -19,6 +22,7 @@ from service import webhooks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from fastapi.testclient import TestClient
 
@@ -137,3 +141,24 @@ def test_a_receiver_that_answers_by_drips_is_cut_off() -> None:
         assert 0.9 < time.monotonic() - begin < 4.0
         stop.set()
         thread.join()
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl to make a certificate with")
+def test_over_tls_to_whom_the_certificate_names(
+    receiver: Receiver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    key, certificate = tmp_path / "key.pem", tmp_path / "cert.pem"
+    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=localhost"]
+    command += ["-addext", "subjectAltName=DNS:localhost", "-keyout", str(key), "-out", str(certificate)]
+    subprocess.run(command, check=True, capture_output=True)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    receiver.socket = context.wrap_socket(receiver.socket, server_side=True)
+    port = receiver.server_port
+    with pytest.raises(ssl.SSLCertVerificationError):
+        webhooks.post(f"https://localhost:{port}/", b"{}", {}, private=True)
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    assert webhooks.post(f"https://localhost:{port}/x", b"{}", {}, private=True) == 200
+    assert receiver.got[-1][1] == b"{}"
+    with pytest.raises(ssl.SSLCertVerificationError):
+        webhooks.post(f"https://127.0.0.1:{port}/", b"{}", {}, private=True)

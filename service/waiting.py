@@ -46,27 +46,23 @@ def wait(work: Callable[[], T], timeout_s: float) -> T:
 
 
 class Desk:
-    """Takes the calls of the routes: so many at a time, each for so long."""
+    """Takes the calls of the routes: so many at a time, each for so long, the wait for its turn included."""
 
     def __init__(self, timeout_s: float, most: int = 64) -> None:
-        self._timeout_s, self._most, self._open = timeout_s, most, 0
+        self._timeout_s, self._turns = timeout_s, asyncio.Semaphore(most)
 
     async def ask(self, work: Callable[[], T]) -> T:
-        """The result of `work`. Raises StoreError if it takes too long, or too many others do."""
-        if self._open >= self._most:
-            raise StoreError(f"{self._open} calls to the store are open already")
-        self._open += 1
-        loop = asyncio.get_running_loop()
-        future = begin(work)
-        future.add_done_callback(lambda _: self._close(loop))  # not earlier: a thread that hangs counts
+        """The result of `work`. Raises StoreError if it takes too long, or if too many others do."""
         try:
-            return await asyncio.wait_for(asyncio.wrap_future(future), self._timeout_s)
+            async with asyncio.timeout(self._timeout_s):
+                await self._turns.acquire()
+                loop, future = asyncio.get_running_loop(), begin(work)
+                # Its place is free when the thread has ended, not when nobody waits for it any more.
+                future.add_done_callback(lambda _: self._free(loop))
+                return await asyncio.wrap_future(future)
         except TimeoutError as error:
             raise StoreError(f"no answer within {self._timeout_s:g} s") from error
 
-    def _close(self, loop: asyncio.AbstractEventLoop) -> None:
-        def less() -> None:
-            self._open -= 1
-
+    def _free(self, loop: asyncio.AbstractEventLoop) -> None:
         with suppress(RuntimeError):  # the loop has ended meanwhile, and nobody counts any more
-            loop.call_soon_threadsafe(less)
+            loop.call_soon_threadsafe(self._turns.release)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import functools
 import threading
 import time
 import uuid
@@ -18,6 +20,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from service import patience
 from service.http import results_routes
 from service.http.app import create_app
+from service.waiting import Desk
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -80,7 +83,11 @@ def _fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(Faulty, "puts", 0)
     monkeypatch.setattr(Faulty, "release", threading.Event())
     yield
+    Faulty.fault = ""
     Faulty.release.set()
+    for thread in threading.enumerate():
+        if thread.name == "store":
+            thread.join(10.0)  # what hung must not go on in the next test
 
 
 @pytest.fixture
@@ -171,6 +178,28 @@ def test_a_store_that_hangs_holds_up_nobody_else(client: TestClient) -> None:
         assert time.monotonic() < deadline  # the calls that hung have ended, and there is room for others
         time.sleep(0.05)
     assert answer.content == b"{}\n"
+
+
+def test_many_readers_wait_for_their_turn() -> None:
+    busy = most = 0
+    lock = threading.Lock()
+
+    def read(k: int) -> int:
+        nonlocal busy, most
+        with lock:
+            busy += 1
+            most = max(most, busy)
+        time.sleep(0.03)
+        with lock:
+            busy -= 1
+        return k
+
+    async def all_at_once() -> list[int]:
+        desk = Desk(timeout_s=5.0, most=3)
+        return list(await asyncio.gather(*(desk.ask(functools.partial(read, k)) for k in range(30))))
+
+    assert asyncio.run(all_at_once()) == list(range(30))
+    assert most == 3
 
 
 @pytest.mark.parametrize("fault", ["refuse", "short"])

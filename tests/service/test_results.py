@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import signal
 import time
 import uuid
 import zipfile
@@ -30,6 +31,8 @@ from service.storage import Storage
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from conftest import Live
 
 KINDS = ("folder", "memory", "file")
 NAME = f"{uuid.UUID(int=1)}.1"
@@ -339,3 +342,27 @@ def test_the_folder_is_the_default(tmp_path: Path) -> None:
     storage = Storage(tmp_path / "data")
     assert isinstance(Stores(storage, settings(tmp_path)).current, FolderStore)
     storage.close()
+
+
+def test_kill_9_between_storing_and_commit_loses_nothing(make_live: Callable[..., Live], tmp_path: Path) -> None:
+    live = make_live(HSLOC_RESULTS_URL=f"file://{tmp_path}/mounted", HSLOC_LEASE_S="2")
+    with live.client() as client:
+        jobs = [submit(client, b"ok %d" % k, seed=k) for k in range(12)]
+    for pause in (0.35, 0.55):
+        time.sleep(pause)
+        live.end(signal.SIGKILL)
+        live.start()
+    instance = (live.data / "instance").read_text()
+    with live.client() as client:
+        for k, job in enumerate(jobs):
+            assert wait(client, job)["state"] == "succeeded"
+            for each in client.get(f"/v1/jobs/{job}/results").json()["assets"]:
+                assert hashlib.sha256(client.get(each["href"]).content).hexdigest() == each["sha256"]
+            assert client.get(f"/v1/jobs/{job}/results/trajectory.tum").text.startswith(f"{k} ")
+    live.end()
+    live.start()  # and sweeps, when it has started
+    folder = tmp_path / "mounted" / instance
+    deadline = time.monotonic() + 5.0
+    while len(list(folder.iterdir())) > len(jobs) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert sorted(path.name.partition(".")[0] for path in folder.iterdir()) == sorted(jobs)

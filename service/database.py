@@ -8,12 +8,13 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Engine, create_engine, event
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.orm import Session
 
 from service.logs import log
 from service.migrations import migrate
 from service.settings import SettingsError
+from service.storage import BALLAST
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -33,15 +34,28 @@ class Database:
         self._writing = threading.Lock()
         _prepare(self._engine)
         try:
-            with self._engine.connect().execution_options(write=True) as connection:
-                before, after = migrate(connection, path)
-                connection.commit()
-        except (SettingsError, DBAPIError, sqlite3.Error) as error:
+            try:
+                self._migrate(path)
+            except (OperationalError, sqlite3.OperationalError):
+                # SQLite needs a little room to open, too; a server that does not start can delete nothing.
+                path.with_name(BALLAST).unlink(missing_ok=True)
+                self._engine.dispose()
+                self._migrate(path)
+        except SettingsError:
             self._engine.dispose()
-            if isinstance(error, SettingsError):
-                raise
+            raise
+        except (DBAPIError, sqlite3.Error) as error:
+            self._engine.dispose()
             cause = error.orig if isinstance(error, DBAPIError) else error
-            raise SettingsError(f"{path}: cannot be used as database: {cause}; give another --data") from error
+            remedy = (
+                "make room on its disk and see that it can be written" if _of_the_disk(error) else "give another --data"
+            )
+            raise SettingsError(f"{path}: cannot be used as database: {cause}; {remedy}") from error
+
+    def _migrate(self, path: Path) -> None:
+        with self._engine.connect().execution_options(write=True) as connection:
+            before, after = migrate(connection, path)
+            connection.commit()
         if 0 < before < after:
             log("database.migrated", before=before, after=after)
 
@@ -68,6 +82,11 @@ class Database:
     def close(self) -> None:
         """Close all connections."""
         self._engine.dispose()
+
+
+def _of_the_disk(error: Exception) -> bool:
+    """Whether it is not what is in the file that is wrong."""
+    return isinstance(error, OperationalError | sqlite3.OperationalError)
 
 
 def _prepare(engine: Engine) -> None:

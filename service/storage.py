@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
+BALLAST = "ballast"
+"""A file that is given up when the disk is full, so that the database can delete."""
 BALLAST_BYTES = 4 << 20
 
 
@@ -73,11 +75,11 @@ class Storage:
 
     def drop_ballast(self) -> None:
         """Give the database room to delete with, when the disk is full to the last byte."""
-        (self.root / "ballast").unlink(missing_ok=True)
+        (self.root / BALLAST).unlink(missing_ok=True)
 
     def restore_ballast(self) -> None:
         """Put the reserve back, if there is room."""
-        path = self.root / "ballast"
+        path = self.root / BALLAST
         if path.exists() or self.free_bytes() < self.min_free_bytes + 2 * BALLAST_BYTES:
             return
         with suppress(OSError), path.open("wb") as file:

@@ -10,7 +10,7 @@ import pytest
 from conftest import settings, wait
 from fastapi.testclient import TestClient
 
-from service import migrations
+from service import database, migrations
 from service.database import Database
 from service.http.app import create_app
 from service.settings import SettingsError
@@ -18,6 +18,8 @@ from service.tables import SCHEMA_VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from sqlalchemy import Connection
 
 FIRST = Path(__file__).parent / "schema1.sql"
 """The database of hsloc at schema 1 after kill -9: jobs that succeeded, failed, were cancelled, ran and waited."""
@@ -147,3 +149,22 @@ def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
     path.write_bytes(b"not a database, but long enough to be read as one" * 100)
     with pytest.raises(SettingsError, match="file is not a database"):
         Database(path)
+
+
+def test_a_full_disk_does_not_keep_a_server_from_starting(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ballast = old.with_name("ballast")
+    ballast.write_bytes(bytes(10))
+
+    def migrate(connection: Connection, path: Path) -> tuple[int, int]:
+        if ballast.exists() or full:
+            raise sqlite3.OperationalError("database or disk is full")
+        return migrations.migrate(connection, path)
+
+    full = False
+    monkeypatch.setattr(database, "migrate", migrate)
+    Database(old).close()
+    assert not ballast.exists()
+    assert version(old) == SCHEMA_VERSION
+    full = True
+    with pytest.raises(SettingsError, match="disk is full; make room on its disk"):
+        Database(old)

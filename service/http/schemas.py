@@ -172,8 +172,9 @@ class ProgressView(BaseModel):
 class JobView(BaseModel):
     """A job.
 
-    `reason` of a failed job: invalid_input, out_of_memory, cpu_limit, wall_limit, output_limit, disk_full,
-    fault_injection; of a crashed one: signal, exit, internal_error, protocol, attempts.
+    `reason` of a failed job: invalid_input, out_of_memory, cpu_limit, wall_limit, output_limit, disk_full, store (the
+    map to extend is in a store that this server is not set to), fault_injection; of a crashed one: signal, exit,
+    internal_error, protocol, attempts.
     """
 
     id: Ident

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 
 from service.errors import ServiceError
 from service.files import need_quota
+from service.housekeeping import Housekeeping
 from service.http.app import create_app
 from service.http.results_routes import parse_range
 from service.object_store import ObjectStore
@@ -27,6 +28,7 @@ from service.principal import ANYBODY
 from service.results import BLOCK, Asset, FolderStore, ResultStore, Stores, collect
 from service.settings import SettingsError
 from service.storage import Storage
+from service.tables import AssetRow, JobRow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -182,8 +184,6 @@ def test_an_empty_and_a_large_file_are_read_in_blocks(client: TestClient, tmp_pa
         return block
 
     with context.database.write() as session:
-        from service.tables import AssetRow, JobRow
-
         row = session.query(JobRow).filter_by(id=job).one()
         row.folder = name
         session.query(AssetRow).filter_by(job_id=job).delete()
@@ -204,8 +204,6 @@ def test_an_empty_and_a_large_file_are_read_in_blocks(client: TestClient, tmp_pa
 
 
 def test_retention_takes_results_with_it(make_client: Callable[..., TestClient], url: str) -> None:
-    from service.housekeeping import Housekeeping
-
     client = make_client(results_url=url, retention_s=100.0)
     wait(client, submit(client))
     assert len(kept(client)) == 1
@@ -284,6 +282,18 @@ def test_results_stay_where_they_were_when_the_setting_changes(tmp_path: Path) -
         while kept(client) and time.monotonic() < deadline:
             time.sleep(0.02)  # the first round of the housekeeping
         assert kept(client) == []
+
+
+def test_a_map_in_a_store_that_is_not_set_any_more_cannot_be_extended(tmp_path: Path) -> None:
+    with TestClient(create_app(settings(tmp_path, results_url=f"memory://{uuid.uuid4()}"))) as client:
+        drawn = submit(client)
+        wait(client, drawn)
+        with client.app.state.context.database.write() as session:  # type: ignore[attr-defined]
+            session.add(AssetRow(job_id=drawn, name="map.npz", size=1, sha256="00", media_type="x"))
+    with TestClient(create_app(settings(tmp_path))) as client:
+        ended = wait(client, submit(client, b"ok", resume=drawn))
+        assert (ended["state"], ended["reason"]) == ("failed", "store")
+        assert "HSLOC_RESULTS_URL" in ended["message"]
 
 
 @pytest.mark.parametrize(

@@ -81,6 +81,14 @@ class JobRequest(Strict):
                 {"required": ["log"], "properties": {"log": {"type": "string"}}},
                 {"required": ["logs"], "properties": {"logs": {"type": "array"}}},
             ],
+            "if": {"required": ["resume"], "properties": {"resume": {"type": "string"}}},
+            "then": {
+                "properties": {
+                    "map": {"type": "null"},
+                    "mode": {"enum": ["auto", "slam"]},
+                    "mapper": {"enum": ["graph", None]},
+                }
+            },
             "examples": [
                 {"log": "3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f", "seed": 7},
                 {

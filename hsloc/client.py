@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from hsloc.errors import HslocError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -109,9 +109,14 @@ class Client:
             if progress is not None:
                 progress(offset, size)
 
-    def submit(self, log: str, **request: Any) -> dict[str, Any]:
-        """Queue a job on an uploaded log; options as in the API. Sent again without harm (Idempotency-Key)."""
-        body = json.dumps({"log": log, **request}).encode()
+    def submit(self, log: str | Sequence[str], **request: Any) -> dict[str, Any]:
+        """Queue a job on an uploaded log, or on several that are parts of one run; options as in the API.
+
+        Among them `relations`, the id of an upload, and `resume`, the id of a job whose map is extended. Sent again
+        without harm (Idempotency-Key).
+        """
+        logs = [log] if isinstance(log, str) else list(log)
+        body = json.dumps({**({"log": logs[0]} if len(logs) == 1 else {"logs": logs}), **request}).encode()
         headers = {"Content-Type": "application/json", "Idempotency-Key": str(uuid.uuid4())}
         found: dict[str, Any] = self.request("POST", "/v1/jobs", body, headers).json()
         return found

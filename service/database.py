@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Engine, create_engine, event
+from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.orm import Session
 
+from service.logs import log
+from service.migrations import migrate
 from service.settings import SettingsError
-from service.tables import SCHEMA_VERSION, Base
+from service.storage import BALLAST
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -18,7 +22,10 @@ if TYPE_CHECKING:
 
 
 class Database:
-    """Sessions on the database of a data folder."""
+    """Sessions on the database of a data folder, brought to today's schema.
+
+    Raises SettingsError for a file that is no database of ours, or one of a newer hsloc.
+    """
 
     def __init__(self, path: Path) -> None:
         self._engine = create_engine(
@@ -26,13 +33,31 @@ class Database:
         )
         self._writing = threading.Lock()
         _prepare(self._engine)
+        try:
+            try:
+                self._migrate(path)
+            except (OperationalError, sqlite3.OperationalError):
+                # SQLite needs a little room to open, too; a server that does not start can delete nothing.
+                path.with_name(BALLAST).unlink(missing_ok=True)
+                self._engine.dispose()
+                self._migrate(path)
+        except SettingsError:
+            self._engine.dispose()
+            raise
+        except (DBAPIError, sqlite3.Error) as error:
+            self._engine.dispose()
+            cause = error.orig if isinstance(error, DBAPIError) else error
+            remedy = (
+                "make room on its disk and see that it can be written" if _of_the_disk(error) else "give another --data"
+            )
+            raise SettingsError(f"{path}: cannot be used as database: {cause}; {remedy}") from error
+
+    def _migrate(self, path: Path) -> None:
         with self._engine.connect().execution_options(write=True) as connection:
-            version = connection.exec_driver_sql("PRAGMA user_version").scalar_one()
-            if version > SCHEMA_VERSION:
-                raise SettingsError(f"{path}: written by a newer hsloc (schema {version}, known {SCHEMA_VERSION})")
-            Base.metadata.create_all(connection)
-            connection.exec_driver_sql(f"PRAGMA user_version={SCHEMA_VERSION}")
+            before, after = migrate(connection, path)
             connection.commit()
+        if 0 < before < after:
+            log("database.migrated", before=before, after=after)
 
     @contextmanager
     def read(self) -> Iterator[Session]:
@@ -57,6 +82,11 @@ class Database:
     def close(self) -> None:
         """Close all connections."""
         self._engine.dispose()
+
+
+def _of_the_disk(error: Exception) -> bool:
+    """Whether it is not what is in the file that is wrong."""
+    return isinstance(error, OperationalError | sqlite3.OperationalError)
 
 
 def _prepare(engine: Engine) -> None:

@@ -20,14 +20,16 @@ from sqlalchemy.exc import OperationalError
 
 from service.logs import log
 from service.processes import kill_marked
+from service.removals import Removals
 from service.supervisor import Attempt
-from service.tables import FileRow, JobRow
+from service.tables import FileRow
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from service.database import Database
     from service.leases import Leases
+    from service.results import Stores
     from service.settings import Settings
     from service.storage import Storage
 
@@ -76,9 +78,12 @@ class LocalDispatcher:
         leases: Leases,
         storage: Storage,
         settings: Settings,
+        stores: Stores,
         ended: Callable[[str], None] = lambda state: None,
+        store_failed: Callable[[], None] = lambda: None,
     ) -> None:
-        self._leases, self._storage, self._settings, self._ended = leases, storage, settings, ended
+        self._leases, self._storage, self._settings, self._stores = leases, storage, settings, stores
+        self._ended, self._store_failed = ended, store_failed
         self._owner = uuid.uuid4().hex
         self._stop = threading.Event()
         self._work = threading.Condition()
@@ -97,6 +102,7 @@ class LocalDispatcher:
         for job_id in self._leases.recover(self._owner):
             log("job.requeued", job=job_id)
         sweep(self._leases.database, self._storage)
+        Removals(self._leases.database, self._stores, self._settings.store_timeout_s).sweep(self._stores.folder)
         for k in range(self._settings.slots):
             thread = threading.Thread(target=self._slot, name=f"slot-{k}", daemon=True)
             thread.start()
@@ -150,7 +156,16 @@ class LocalDispatcher:
         cancel = threading.Event()
         self._running[claim.job_id] = cancel
         try:
-            attempt = Attempt(claim, self._leases, self._storage, self._settings, stop=self._stop, cancel=cancel)
+            attempt = Attempt(
+                claim,
+                self._leases,
+                self._storage,
+                self._settings,
+                self._stores,
+                stop=self._stop,
+                cancel=cancel,
+                store_failed=self._store_failed,
+            )
             self._ended(attempt.run())
         finally:
             self._running.pop(claim.job_id, None)
@@ -158,16 +173,14 @@ class LocalDispatcher:
 
 
 def sweep(database: Database, storage: Storage) -> None:
-    """Remove what a killed server left: folders of attempts, results that no job names, bytes that no upload names.
+    """Remove what a killed server left: folders of attempts, bytes that no upload names.
 
     Only at start-up, when nothing runs.
     """
     with database.read() as session:
-        folders = set(session.scalars(select(JobRow.folder).where(JobRow.folder.is_not(None))))
         files = set(session.scalars(select(FileRow.id)))
     for kind, path in storage.leftovers():
-        keep = path.name in folders if kind == "result" else path.name in files if kind == "upload" else False
-        if not keep:
+        if kind == "work" or path.name not in files:
             log("sweep", kind=kind, name=path.name)
             with suppress(OSError):
                 shutil.rmtree(path) if path.is_dir() else os.unlink(path)

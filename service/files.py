@@ -7,10 +7,11 @@ import uuid
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sqlalchemy import case, func, select
+from sqlalchemy import case, func, select, tuple_
 
 from service.errors import ServiceError, conflict, no_space, not_found
-from service.tables import ACTIVE, FileRow, JobRow
+from service.requests import files_of
+from service.tables import ACTIVE, AssetRow, FileRow, JobRow
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -68,11 +69,7 @@ class Files:
             self._need_room(session, who, 0)
 
     def _need_room(self, session: Session, who: Principal, size: int) -> None:
-        size_or_none = func.coalesce(FileRow.size, 0)
-        announced = case((FileRow.received > size_or_none, FileRow.received), else_=size_or_none)
-        used = session.scalar(select(func.coalesce(func.sum(announced), 0)).where(FileRow.tenant == who.tenant)) or 0
-        if used + size > self.settings.tenant_bytes:
-            raise no_space(f"your uploads take {used} of {self.settings.tenant_bytes} bytes; delete some")
+        need_quota(session, who, self.settings.tenant_bytes, size)
         # What others announced and have not sent yet is theirs already.
         pending = session.scalar(
             select(func.coalesce(func.sum(FileRow.size - FileRow.received), 0)).where(
@@ -86,13 +83,14 @@ class Files:
         with self.database.read() as session:
             return _file(session, who, file_id)
 
-    def list(self, who: Principal, limit: int = 200, after: float | None = None) -> Sequence[FileRow]:
-        """Uploads, newest first."""
-        query = select(FileRow).where(FileRow.tenant == who.tenant).order_by(FileRow.created.desc()).limit(limit)
-        if after is not None:
-            query = query.where(FileRow.created < after)
+    def list(self, who: Principal, limit: int = 200, before: str | None = None) -> Sequence[FileRow]:
+        """Uploads, newest first; `before` is the id of the last one seen. Raises ServiceError 404 if that is gone."""
+        query = select(FileRow).where(FileRow.tenant == who.tenant).limit(limit)
         with self.database.read() as session:
-            return session.scalars(query).all()
+            if before is not None:
+                last = _file(session, who, before)
+                query = query.where(tuple_(FileRow.created, FileRow.id) < tuple_(last.created, last.id))
+            return session.scalars(query.order_by(FileRow.created.desc(), FileRow.id.desc())).all()
 
     def advance(self, file_id: str, received: int) -> None:
         """So many bytes are on the disk."""
@@ -111,12 +109,17 @@ class Files:
             return row
 
     def restart(self, who: Principal, file_id: str, size: int | None) -> None:
-        """Begin an unfinished upload anew."""
+        """Begin an unfinished upload anew, of `size` bytes, for which the same holds as for a new one."""
+        if size is not None:
+            self.need_size(size)
         with self.database.write() as session:
             row = _file(session, who, file_id)
             if row.state == "complete":
                 raise conflict("complete", "this upload is finished and cannot be changed")
-            row.received, row.size = 0, size
+            row.received, row.size = 0, None  # what was reserved for it is free again
+            session.flush()
+            self._need_room(session, who, size or 0)
+            row.size = size
 
     def delete(self, who: Principal, file_id: str) -> None:
         """Remove an upload. Raises ServiceError 409 while an active job needs it."""
@@ -128,10 +131,27 @@ class Files:
         self.storage.upload_path(file_id).unlink(missing_ok=True)
 
 
+def need_quota(session: Session, who: Principal, most: int, size: int = 0) -> None:
+    """Raises ServiceError 507 where uploads, as received or announced, and results of a tenant take too much.
+
+    Results count wherever they are stored, by their manifest.
+    """
+    size_or_none = func.coalesce(FileRow.size, 0)
+    announced = case((FileRow.received > size_or_none, FileRow.received), else_=size_or_none)
+    uploads = session.scalar(select(func.coalesce(func.sum(announced), 0)).where(FileRow.tenant == who.tenant)) or 0
+    results = session.scalar(
+        select(func.coalesce(func.sum(AssetRow.size), 0))
+        .join(JobRow, JobRow.id == AssetRow.job_id)
+        .where(JobRow.tenant == who.tenant)
+    )
+    if uploads + (results or 0) + size > most:
+        raise no_space(f"your uploads take {uploads} and your results {results} of {most} bytes; delete some")
+
+
 def needed(session: Session, file_id: str) -> bool:
     """Whether a job that has not ended reads the file."""
     active = session.scalars(select(JobRow.request).where(JobRow.state.in_(ACTIVE)))
-    return any(file_id == request["log"] or file_id in (request.get("map") or {}).values() for request in active)
+    return any(file_id in files_of(request) for request in active)
 
 
 def _file(session: Session, who: Principal, file_id: str) -> FileRow:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -9,16 +10,20 @@ from typing import TYPE_CHECKING
 from sqlalchemy import delete, select
 
 from service.files import needed
-from service.jobs import erase
+from service.jobs import erase, extended
 from service.logs import log
+from service.removals import Removals
+from service.results import StoreError
 from service.tables import ENDED, FileRow, IdempotencyRow, JobRow
 
 if TYPE_CHECKING:
     from service.database import Database
+    from service.results import Stores
     from service.settings import Settings
     from service.storage import Storage
 
 EVERY_S = 60.0
+SWEEP_S = 3600.0
 KEY_S = 7 * 86400.0
 """An Idempotency-Key is remembered for a week."""
 
@@ -26,8 +31,10 @@ KEY_S = 7 * 86400.0
 class Housekeeping:
     """A thread that tidies up."""
 
-    def __init__(self, database: Database, storage: Storage, settings: Settings) -> None:
-        self._database, self._storage, self._settings = database, storage, settings
+    def __init__(self, database: Database, storage: Storage, settings: Settings, stores: Stores) -> None:
+        self._database, self._storage, self._settings, self._stores = database, storage, settings, stores
+        self._removals = Removals(database, stores, settings.store_timeout_s)
+        self._swept = -math.inf
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="housekeeping", daemon=True)
 
@@ -41,7 +48,9 @@ class Housekeeping:
         self._thread.join(10.0)
 
     def _run(self) -> None:
-        while not self._stop.wait(EVERY_S):
+        pause = 0.0
+        while not self._stop.wait(pause):
+            pause = EVERY_S
             try:
                 self.tidy(time.time())
             except Exception as error:
@@ -51,18 +60,28 @@ class Housekeeping:
         """One round."""
         self._storage.restore_ballast()
         paths = self._expired_uploads(now)
-        folders: list[str] = []
         if self._settings.retention_s is not None:
-            old_files, folders = self._old(now - self._settings.retention_s)
-            paths += old_files
+            paths += self._old(now - self._settings.retention_s)
         with self._database.write() as session:
             session.execute(delete(IdempotencyRow).where(IdempotencyRow.created < now - KEY_S))
         for file_id in paths:
             self._storage.upload_path(file_id).unlink(missing_ok=True)
-        for folder in folders:
-            self._storage.remove(folder)
-        if paths or folders:
-            log("tidy", uploads=len(paths), results=len(folders))
+        results = self._removals.clear()
+        if paths or results:
+            log("tidy", uploads=len(paths), results=results)
+        self._sweep(now)
+
+    def _sweep(self, now: float) -> None:
+        """Leftovers in the object store: at the first round and then now and then. (The folder's go at start-up.)"""
+        store = self._stores.current
+        if store.url is None or now - self._swept < SWEEP_S:
+            return
+        try:
+            self._removals.sweep(store)
+        except StoreError as error:
+            log("store.error", what="sweep", error=str(error))
+        else:
+            self._swept = now
 
     def _expired_uploads(self, now: float) -> list[str]:
         with self._database.write() as session:
@@ -71,14 +90,15 @@ class Housekeeping:
                 session.delete(row)
             return [row.id for row in rows]
 
-    def _old(self, before: float) -> tuple[list[str], list[str]]:
-        """Jobs that ended before, and uploads of that age that no active job needs."""
+    def _old(self, before: float) -> list[str]:
+        """Erase jobs that ended before and uploads of that age, but none that an active job needs; the uploads' ids."""
         with self._database.write() as session:
             jobs = session.scalars(select(JobRow).where(JobRow.state.in_(ENDED), JobRow.ended < before)).all()
             for job in jobs:
-                erase(session, job)
+                if not extended(session, job.id):
+                    erase(session, job)
             query = select(FileRow).where(FileRow.state == "complete", FileRow.created < before)
             files = [row for row in session.scalars(query) if not needed(session, row.id)]
             for row in files:
                 session.delete(row)
-            return [row.id for row in files], [job.folder for job in jobs if job.folder is not None]
+            return [row.id for row in files]

@@ -13,6 +13,10 @@ from sqlalchemy import delete, func, select
 
 from service.errors import ServiceError, busy, conflict, not_found
 from service.events import record
+from service.files import need_quota
+from service.inputs import STATE
+from service.removals import removal_of
+from service.requests import logs_of
 from service.storage import safe_name
 from service.tables import ACTIVE, AssetRow, DeliveryRow, EventRow, FileRow, IdempotencyRow, JobRow
 
@@ -45,8 +49,9 @@ class Jobs:
     def submit(self, who: Principal, request: dict[str, Any], key: str | None = None) -> Submitted:
         """Queue a job; when this returns, the job is on the disk.
 
-        `request` is a validated `JobRequest` as plain data. Raises ServiceError: 404 for files that are not there,
-        409 for a key that was used for another request, 429 when too many wait, 507 when the disk is full.
+        `request` is a validated `JobRequest` as plain data. Raises ServiceError: 404 for files and jobs that are not
+        there, 409 for a key that was used for another request, 422 for a job without a map to extend, 429 when too
+        many wait, 507 when the disk or the quota is full.
         """
         digest = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
         with self.database.write() as session:
@@ -55,21 +60,19 @@ class Jobs:
                 if known.sha256 != digest:
                     raise conflict("idempotency", "this Idempotency-Key was used for a different request")
                 return Submitted(_job(session, who, known.job_id), created=False)
-            self.storage.need_space()
-            self._need_queue(session, who)
+            self._need_room(session, who)
             job = self._insert(session, who, request, None)
             if key is not None:
                 now = time.time()
                 session.add(IdempotencyRow(tenant=who.tenant, key=key, sha256=digest, job_id=job.id, created=now))
             return Submitted(job, created=True)
 
-    def rerun(self, who: Principal, job_id: str, changes: dict[str, Any]) -> JobRow:
-        """The same job again, seed and all, with what `changes` names put in its place."""
+    def rerun(self, who: Principal, job_id: str, request: dict[str, Any]) -> JobRow:
+        """The job again, with what the caller made of its request."""
         with self.database.write() as session:
             old = _job(session, who, job_id)
-            self.storage.need_space()
-            self._need_queue(session, who)
-            return self._insert(session, who, {**old.request, **changes}, old.id)
+            self._need_room(session, who)
+            return self._insert(session, who, request, old.id)
 
     def get(self, who: Principal, job_id: str) -> JobRow:
         """One job."""
@@ -122,17 +125,21 @@ class Jobs:
             return job
 
     def delete(self, who: Principal, job_id: str) -> None:
-        """Remove a job that has ended, and its results. Raises ServiceError 409 while it is active."""
+        """Remove a job that has ended; its results are noted down for `Removals`.
+
+        Raises ServiceError 409 while it is active, or while an active job extends its map.
+        """
         with self.database.write() as session:
             job = _job(session, who, job_id)
             if job.state in ACTIVE:
                 raise conflict("active", f"the job is {job.state}; cancel it first")
-            folder = job.folder
+            if extended(session, job_id):
+                raise conflict("in_use", "an active job extends the map of this one; cancel that first")
             erase(session, job)
-        if folder is not None:
-            self.storage.remove(folder)
 
-    def _need_queue(self, session: Session, who: Principal) -> None:
+    def _need_room(self, session: Session, who: Principal) -> None:
+        self.storage.need_space()
+        need_quota(session, who, self.settings.tenant_bytes)
         waiting = session.scalar(
             select(func.count()).select_from(JobRow).where(JobRow.tenant == who.tenant, JobRow.state == "queued")
         )
@@ -140,17 +147,22 @@ class Jobs:
             raise busy(f"{waiting} jobs are waiting already, which is the limit", 10.0)
 
     def _insert(self, session: Session, who: Principal, request: dict[str, Any], rerun_of: str | None) -> JobRow:
-        log = _complete_file(session, who, request["log"], "log")
+        logs = [_complete_file(session, who, ident, "log") for ident in logs_of(request)]
         if request.get("map") is not None:
             _complete_file(session, who, request["map"]["yaml"], "map.yaml")
             _complete_file(session, who, request["map"]["image"], "map.image")
+        if request.get("relations") is not None:
+            _complete_file(session, who, request["relations"], "relations")
+        if request.get("resume") is not None:
+            _need_map(session, _job(session, who, request["resume"]))
         job = JobRow(
             id=str(uuid.uuid4()),
             tenant=who.tenant,
-            file_id=log.id,
-            log_name=log.name,
+            file_id=logs[0].id,
+            log_name=", ".join(log.name for log in logs)[:1000],
             request=request,
             rerun_of=rerun_of,
+            resume_of=request.get("resume"),
             state="queued",
             created=time.time(),
             attempt=0,
@@ -197,11 +209,29 @@ def end(session: Session, job: JobRow, state: str, reason: str | None, message: 
 
 
 def erase(session: Session, job: JobRow) -> None:
-    """Remove the rows of a job."""
+    """Remove the rows of a job, and note down that its results are to go."""
+    if job.folder is not None:
+        session.add(removal_of(job))
     for table in (AssetRow, EventRow, DeliveryRow):
         session.execute(delete(table).where(table.job_id == job.id))
     session.execute(delete(IdempotencyRow).where(IdempotencyRow.job_id == job.id))
     session.delete(job)
+
+
+def extended(session: Session, job_id: str) -> bool:
+    """Whether a job that has not ended extends the map of this one."""
+    query = select(JobRow.id).where(JobRow.resume_of == job_id, JobRow.state.in_(ACTIVE)).limit(1)
+    return session.scalar(query) is not None
+
+
+def _need_map(session: Session, job: JobRow) -> None:
+    """Raises ServiceError 422 unless the job left a map that can be extended."""
+    if job.state != "succeeded":
+        raise ServiceError(422, "resume", f"resume: job {job.id} is {job.state}; only a succeeded one has left a map")
+    if session.get(AssetRow, (job.id, STATE)) is None:
+        raise ServiceError(
+            422, "resume", f"resume: job {job.id} drew no map with the graph mapper, so there is none to extend"
+        )
 
 
 def _job(session: Session, who: Principal, job_id: str) -> JobRow:

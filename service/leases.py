@@ -14,14 +14,25 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from sqlalchemy import select
 
 from service.events import record
+from service.inputs import STATE
 from service.jobs import end
+from service.requests import files_of
 from service.tables import AssetRow, FileRow, JobRow
 
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
 
     from service.database import Database
-    from service.storage import Asset
+    from service.results import Asset
+
+
+class Source(NamedTuple):
+    """The saved map that a job extends."""
+
+    store: str | None
+    folder: str
+    size: int
+    sha256: str
 
 
 class Claim(NamedTuple):
@@ -35,6 +46,7 @@ class Claim(NamedTuple):
     request: dict[str, Any]
     names: dict[str, str]
     """Labels of the files of the request."""
+    source: Source | None = None
 
 
 class Beat(NamedTuple):
@@ -64,9 +76,8 @@ class Leases:
             job.started = job.started or now
             job.phase = job.done = job.total = job.scans = job.speed = job.progressed = None
             record(session, job, "state", {"state": "running", "attempt": job.attempt})
-            return Claim(
-                job.id, job.tenant, owner, job.attempt, job.log_name, job.request, _names(session, job.request)
-            )
+            names, source = _names(session, job.request), _source(session, job)
+            return Claim(job.id, job.tenant, owner, job.attempt, job.log_name, job.request, names, source)
 
     def beat(self, claim: Claim, progress: dict[str, Any] | None) -> Beat:
         """Prolong the lease, and note the progress."""
@@ -82,13 +93,18 @@ class Leases:
                 record(session, job, "progress", progress)
             return Beat(mine=True, cancel=job.cancel)
 
-    def succeed(self, claim: Claim, folder: str, assets: list[Asset], summary: dict[str, Any]) -> bool:
-        """End a job well; False if it was taken away or cancelled, and the results must go."""
+    def succeed(
+        self, claim: Claim, folder: str, assets: list[Asset], summary: dict[str, Any], store: str | None = None
+    ) -> bool:
+        """End a job well; False if it was taken away or cancelled, and the results must go.
+
+        The results, which the store has already, become visible by this commit.
+        """
         with self.database.write() as session:
             job = _held(session, claim)
             if job is None or job.cancel:
                 return False
-            job.folder, job.summary = folder, summary
+            job.folder, job.store, job.summary = folder, store, summary
             for asset in assets:
                 session.add(
                     AssetRow(
@@ -177,7 +193,17 @@ def _held(session: Session, claim: Claim) -> JobRow | None:
 
 
 def _names(session: Session, request: dict[str, Any]) -> dict[str, str]:
-    chart = request.get("map") or {}
-    idents = [request["log"], *chart.values()]
-    rows = session.execute(select(FileRow.id, FileRow.name).where(FileRow.id.in_(idents))).all()
+    rows = session.execute(select(FileRow.id, FileRow.name).where(FileRow.id.in_(files_of(request)))).all()
     return {row.id: row.name for row in rows}
+
+
+def _source(session: Session, job: JobRow) -> Source | None:
+    """The map that is extended; it cannot be gone, for the job that drew it is kept while this one is active."""
+    if job.resume_of is None:
+        return None
+    found = session.execute(
+        select(JobRow.store, JobRow.folder, AssetRow.size, AssetRow.sha256)
+        .join(AssetRow, AssetRow.job_id == JobRow.id)
+        .where(JobRow.id == job.resume_of, JobRow.tenant == job.tenant, AssetRow.name == STATE)
+    ).one()
+    return Source(found.store, found.folder or "", found.size, found.sha256)

@@ -8,6 +8,7 @@ import resource
 import signal
 import sys
 import time
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import uvicorn
@@ -20,6 +21,8 @@ from service.principal import SCOPES, Tokens
 from service.settings import Settings, SettingsError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from fastapi import FastAPI
 
 SHUTDOWN_S = 10
@@ -117,6 +120,39 @@ def new_token(settings: Settings, tenant: str, scopes: str = ",".join(SCOPES), d
     finally:
         database.close()
     return 0
+
+
+def list_tokens(settings: Settings) -> int:
+    """Show what tokens there are; works while the service runs. Raises SettingsError."""
+    with _tokens(settings) as tokens:
+        for row in tokens.rows():
+            state = "revoked" if row.revoked is not None else "never expires"
+            if row.revoked is None and row.expires is not None:
+                state = f"expires {time.strftime('%Y-%m-%dT%H:%MZ', time.gmtime(row.expires))}"
+            made = time.strftime("%Y-%m-%dT%H:%MZ", time.gmtime(row.created))
+            sys.stdout.write(f"{row.id}  {row.tenant}  {row.scopes.replace(' ', ',')}  made {made}  {state}\n")
+    return 0
+
+
+def revoke_token(settings: Settings, ident: str) -> int:
+    """Make a token worthless from the next request on; works while the service runs. Raises SettingsError."""
+    with _tokens(settings) as tokens:
+        if not tokens.revoke(ident):
+            raise SettingsError(f"there is no token {ident!r}; `hsloc serve --list-tokens` shows what there is")
+    return 0
+
+
+@contextmanager
+def _tokens(settings: Settings) -> Iterator[Tokens]:
+    """The tokens of a data folder that exists already."""
+    path = settings.data / "hsloc.db"
+    if not path.is_file():
+        raise SettingsError(f"{settings.data}: no data folder of hsloc; name it with --data")
+    database = Database(path)
+    try:
+        yield Tokens(database)
+    finally:
+        database.close()
 
 
 def show_token(token: str) -> None:

@@ -15,6 +15,8 @@ from service.errors import ServiceError
 from service.tables import TokenRow
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from service.database import Database
 
 SCOPES = ("read", "write", "admin")
@@ -82,6 +84,11 @@ class Tokens:
             if row is not None:
                 row.revoked = time.time()
             return row is not None
+
+    def rows(self) -> Sequence[TokenRow]:
+        """All tokens, oldest first; the secrets are not among what is kept."""
+        with self._database.read() as session:
+            return session.scalars(select(TokenRow).order_by(TokenRow.created)).all()
 
     def any(self) -> bool:
         """Whether a token was ever issued."""

@@ -1,20 +1,24 @@
-"""Ending a job's processes: all of them, also those that left the group."""
+"""Starting a job's process, and ending its processes: all of them, also those that left the group."""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import time
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    import subprocess
     from collections.abc import Iterator
 
 MARK = "HSLOC_JOB"
 """Environment variable that every process of a job inherits: `<instance>:<job>.<attempt>`."""
+_KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "MPLCONFIGDIR", "PYTHONPATH", "VIRTUAL_ENV")
+_KEPT_PREFIXES = ("OPENBLAS_", "OMP_", "MKL_", "NPY_", "NUMBA_")
+"""What a job's process sees of the server's environment: no token, no password; but all that decides the last bits of
+its arithmetic, which are to be those of `hsloc replay` in the same environment."""
 
 
 def end_job(process: subprocess.Popen[bytes], mark: str, grace_s: float) -> None:
@@ -67,3 +71,40 @@ def marked(mark: str) -> Iterator[int]:
                 variables = (path / "environ").read_bytes().split(b"\0")
                 if any(variable.startswith(wanted) for variable in variables):
                     yield int(path.name)
+
+
+def start_job(
+    command: tuple[str, ...], folder: Path, mark: str, threads: int, cache: Path
+) -> tuple[subprocess.Popen[bytes], int]:
+    """The process of a job in a session and process group of its own; the reading end of its pipe. Raises OSError."""
+    environment = {k: v for k, v in os.environ.items() if k in _KEPT or k.startswith(_KEPT_PREFIXES)}
+    environment.setdefault("MPLCONFIGDIR", str(cache))
+    environment |= {
+        MARK: mark,
+        "HOME": str((folder / "tmp").absolute()),
+        "TMPDIR": str((folder / "tmp").absolute()),
+        "PYTHONUNBUFFERED": "1",
+        "NUMBA_NUM_THREADS": str(threads),
+        "OMP_NUM_THREADS": str(threads),
+        "OPENBLAS_NUM_THREADS": str(threads),
+    }
+    reading, writing = os.pipe()
+    try:
+        with (folder / "log.txt").open("wb") as output:
+            process = subprocess.Popen(
+                [*command, str(folder.absolute()), "--fd", str(writing), "--parent", str(os.getpid())],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                pass_fds=(writing,),
+                cwd=folder,
+                env=environment,
+                start_new_session=True,
+            )
+    except OSError:
+        os.close(reading)
+        raise
+    finally:
+        os.close(writing)
+    os.set_blocking(reading, False)
+    return process, reading

@@ -187,6 +187,8 @@ class _Taking:
         if self._check is not None and self._check.digest() != self._wanted:
             raise ServiceError(460, "checksum", "the checksum does not match; the bytes were not taken")
         self._make_safe(descriptor)
+        if self._row.size is None:
+            self._files.need_room(self._who)  # nothing was reserved for it
 
     def _make_safe(self, descriptor: int) -> None:
         if self._at == self.safe:

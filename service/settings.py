@@ -25,6 +25,10 @@ class Settings:
 
     data: Path = Path("hsloc-data")
     """Folder of the database, the uploads and the results; on a local disk."""
+    results_url: str = ""
+    """Where results go instead of the data folder, as fsspec knows it: `s3://bucket/prefix`, `file:///mnt/results`."""
+    store_timeout_s: float = 30.0
+    """A store that takes longer for one call is taken for dead (503); a job's results are tried again."""
     slots: int = 1
     """Jobs that run at the same time."""
 
@@ -36,7 +40,7 @@ class Settings:
     max_upload_bytes: int = 64 * GIB
     """The largest file that is taken."""
     tenant_bytes: int = 256 * GIB
-    """What the uploads of one tenant may take together."""
+    """What the uploads and results of one tenant may take together; more are refused (507)."""
     min_free_bytes: int = 256 * MIB
     """Uploads and jobs are refused (507) when the disk has less; keeps room for the database and for deleting."""
     upload_ttl_s: float = 24 * 3600.0
@@ -135,6 +139,8 @@ def _parse(name: str, text: str, hint: Any) -> Any:
             return parse_size(text)
         if hint is Path:
             return Path(text)
+        if hint is str:
+            return text
         if hint == tuple[str, ...]:
             return tuple(part.strip() for part in text.split(",") if part.strip())
         return float(text)

@@ -7,11 +7,9 @@ import hashlib
 import os
 import re
 import shutil
-import stat
 import uuid
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from sqlalchemy.exc import OperationalError
 
@@ -22,56 +20,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-_ASSET_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}\Z")
-MEDIA_TYPES = {
-    ".tum": "text/plain; charset=utf-8",
-    ".json": "application/json",
-    ".yaml": "application/yaml",
-    ".png": "image/png",
-    ".pgm": "image/x-portable-graymap",
-    ".svg": "image/svg+xml",
-    ".html": "text/html; charset=utf-8",
-    ".mcap": "application/octet-stream",
-    ".ply": "application/octet-stream",
-    ".csv": "text/csv; charset=utf-8",
-}
-"""What results may be; anything else is application/octet-stream."""
+BALLAST = "ballast"
+"""A file that is given up when the disk is full, so that the database can delete."""
 BALLAST_BYTES = 4 << 20
-MAX_ASSETS = 1000
-
-
-@dataclass(frozen=True, slots=True)
-class Asset:
-    """A file of a result."""
-
-    name: str
-    size: int
-    sha256: str
-    media_type: str
-
-
-class ResultStore(Protocol):
-    """Where results live. Law: after `publish` a folder is there whole, or (raised) not at all.
-
-    The local folder is the one that exists; an object store would satisfy the same three methods, its `publish`
-    uploading under a fresh prefix that the job's row then names.
-    """
-
-    def publish(self, output: Path, name: str) -> list[Asset]:
-        """Make the files of `output` the results `name`."""
-        ...
-
-    def open_path(self, name: str, asset: str) -> Path:
-        """A local path to read an asset from."""
-        ...
-
-    def remove(self, name: str) -> None:
-        """Remove results; no error if they are gone."""
-        ...
 
 
 class Storage:
-    """The local data folder, held by one server at a time. Satisfies `ResultStore`."""
+    """The local data folder, held by one server at a time. Results are the business of `results`."""
 
     def __init__(self, root: Path, min_free_bytes: int = 0) -> None:
         self.root = root
@@ -120,11 +75,11 @@ class Storage:
 
     def drop_ballast(self) -> None:
         """Give the database room to delete with, when the disk is full to the last byte."""
-        (self.root / "ballast").unlink(missing_ok=True)
+        (self.root / BALLAST).unlink(missing_ok=True)
 
     def restore_ballast(self) -> None:
         """Put the reserve back, if there is room."""
-        path = self.root / "ballast"
+        path = self.root / BALLAST
         if path.exists() or self.free_bytes() < self.min_free_bytes + 2 * BALLAST_BYTES:
             return
         with suppress(OSError), path.open("wb") as file:
@@ -148,44 +103,13 @@ class Storage:
         """The folder of one attempt at a job."""
         return self.work / f"{_checked(job_id)}.{attempt}"
 
-    def publish(self, output: Path, name: str) -> list[Asset]:
-        """Hash, sync and rename the output of a job to `results/<name>`; returns the manifest.
-
-        Only regular files with plain names are taken; what else a job leaves behind is dropped.
-        """
-        assets: list[Asset] = []
-        for path in sorted(output.iterdir()):
-            mode = path.lstat().st_mode
-            if not stat.S_ISREG(mode) or not _ASSET_NAME.match(path.name) or len(assets) >= MAX_ASSETS:
-                _remove(path)
-                continue
-            path.chmod(0o600)
-            size, digest = hash_file(path, sync=True)
-            media = MEDIA_TYPES.get(path.suffix.lower(), "application/octet-stream")
-            assets.append(Asset(path.name, size, digest, media))
-        sync_folder(output)
-        output.rename(self.results / name)
-        sync_folder(self.results)
-        return assets
-
-    def open_path(self, name: str, asset: str) -> Path:
-        """The path of an asset that the manifest names."""
-        if not _ASSET_NAME.match(asset) or "/" in name or name.startswith("."):
-            raise ValueError(f"{asset!r} is not the name of an asset")
-        return self.results / name / asset
-
-    def remove(self, name: str) -> None:
-        """Remove the results `name`."""
-        if name and "/" not in name and not name.startswith("."):
-            shutil.rmtree(self.results / name, ignore_errors=True)
-
     def remove_work(self, path: Path) -> None:
         """Remove the folder of an attempt."""
         shutil.rmtree(path, ignore_errors=True)
 
     def leftovers(self) -> Iterator[tuple[str, Path]]:
-        """Every upload, attempt and result on the disk, with its kind."""
-        for kind, folder in (("upload", self.uploads), ("work", self.work), ("result", self.results)):
+        """Every upload and attempt on the disk, with its kind."""
+        for kind, folder in (("upload", self.uploads), ("work", self.work)):
             for path in folder.iterdir():
                 yield kind, path
 
@@ -203,7 +127,7 @@ def hash_file(path: Path, sync: bool = False) -> tuple[int, str]:
     return size, digest.hexdigest()
 
 
-def sync_folder(path: Path) -> None:
+def sync_folder(path: Path | str) -> None:
     """Make renames and new names in a folder last."""
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -235,10 +159,3 @@ def safe_name(label: str, default: str) -> str:
 def _checked(ident: str) -> str:
     """Identifiers are UUIDs; anything else must not become part of a path."""
     return str(uuid.UUID(ident))
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)

@@ -3,34 +3,37 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import random
 import selectors
-import shutil
 import signal
-import subprocess
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from service.inputs import fetch, prepare
 from service.logs import log
-from service.processes import MARK, end_job
-from service.storage import folder_bytes, safe_name
+from service.patience import BYTES_PER_S, Interrupted, Patience
+from service.processes import end_job, start_job
+from service.results import StoreError, collect
+from service.storage import folder_bytes
+from service.waiting import wait
 
 if TYPE_CHECKING:
+    import subprocess
     import threading
+    from collections.abc import Callable
 
     from service.leases import Claim, Leases
+    from service.results import ResultStore, Stores
     from service.settings import Settings
     from service.storage import Storage
 
+T = TypeVar("T")
 _LINE_BYTES = 1 << 18
 """The longest line of the pipe; more is a job gone mad."""
-_KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "MPLCONFIGDIR", "PYTHONPATH", "VIRTUAL_ENV")
-_KEPT_PREFIXES = ("OPENBLAS_", "OMP_", "MKL_", "NPY_", "NUMBA_")
-"""What a job's process sees of the server's environment: no token, no password; but all that decides the last bits of
-its arithmetic, which are to be those of `hsloc replay` in the same environment."""
 TICK_S = 0.1
 LOOK_S = 0.5
 """Time between two looks at the size of the folder, and between two notes of progress."""
@@ -55,19 +58,23 @@ class Attempt:
         leases: Leases,
         storage: Storage,
         settings: Settings,
+        stores: Stores,
         *,
         stop: threading.Event,
         cancel: threading.Event,
+        store_failed: Callable[[], None] = lambda: None,
     ) -> None:
         self._claim, self._leases, self._storage, self._settings = claim, leases, storage, settings
-        self._stop, self._cancel = stop, cancel
+        self._stop, self._cancel, self._store_failed = stop, cancel, store_failed
+        self._stores = stores
         self._folder = storage.work_path(claim.job_id, claim.attempt)
         self._mark = f"{storage.instance}:{claim.job_id}.{claim.attempt}"
         self._buffer = b""
         self._final: dict[str, Any] | None = None
         self._progress: dict[str, Any] | None = None
         self._told: dict[str, Any] | None = None
-        self._beaten = 0.0
+        self._beaten = self._looked = 0.0
+        self._begin = time.monotonic()
 
     def run(self) -> str:
         """The final state that was written, or `queued` or `lost`."""
@@ -85,6 +92,10 @@ class Attempt:
             if random.random() < self._settings.fault_fail_jobs:
                 return Outcome("failed", "fault_injection", "this server fails jobs on purpose (fault_fail_jobs)")
             process, pipe = self._start()
+        except Interrupted as end:
+            return _interrupted(end)
+        except StoreError as error:
+            return Outcome("failed", "store", str(error))
         except OSError as error:
             return Outcome("again", "start", f"the job could not be started: {error.strerror or error}")
         try:
@@ -96,73 +107,26 @@ class Attempt:
         return outcome
 
     def _prepare(self) -> None:
-        """`job.json`, the input under its own name (read-only), and an empty folder for temporary files."""
-        claim, settings = self._claim, self._settings
-        shutil.rmtree(self._folder, ignore_errors=True)
-        for name in ("input", "map", "tmp"):
-            (self._folder / name).mkdir(parents=True, mode=0o700)
-        request = claim.request
-        job: dict[str, Any] = {
-            "request": request,
-            "log": self._link("input", request["log"], "log"),
-            "limits": {
-                "memory_bytes": settings.job_memory_bytes,
-                "cpu_s": settings.job_cpu_s,
-                "output_bytes": settings.job_output_bytes,
-                "open_files": settings.job_open_files,
-            },
-        }
-        if request.get("map") is not None:
-            job["map"] = self._link("map", request["map"]["yaml"], "map.yaml")
-            # Any name but those that the YAML may ask for; the worker links the one it does ask for.
-            (self._folder / "map" / ".image").symlink_to(self._storage.upload_path(request["map"]["image"]).absolute())
-            job["map_image"] = ".image"
-        (self._folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
-
-    def _link(self, folder: str, file_id: str, default: str) -> str:
-        name = safe_name(self._claim.names.get(file_id, ""), default)
-        (self._folder / folder / name).symlink_to(self._storage.upload_path(file_id).absolute())
-        return name
+        """The folder with the input; also the map of an earlier job, wherever that is."""
+        claim = self._claim
+        prepare(self._folder, claim, self._storage, self._settings)
+        if claim.source is not None:
+            source, store = claim.source, self._stores.of(claim.source.store)
+            self._phase("fetch")
+            timeout = self._timeout(store, [source.size])
+            self._insist("fetch", lambda: fetch(store, source, self._folder), timeout)
 
     def _start(self) -> tuple[subprocess.Popen[bytes], int]:
-        """The process in a session and process group of its own; the reading end of its pipe."""
-        environment = {k: v for k, v in os.environ.items() if k in _KEPT or k.startswith(_KEPT_PREFIXES)}
-        environment.setdefault("MPLCONFIGDIR", str(self._storage.cache.absolute()))
-        threads = str(self._settings.job_threads)
-        environment |= {
-            MARK: self._mark,
-            "HOME": str((self._folder / "tmp").absolute()),
-            "TMPDIR": str((self._folder / "tmp").absolute()),
-            "PYTHONUNBUFFERED": "1",
-            "NUMBA_NUM_THREADS": threads,
-            "OMP_NUM_THREADS": threads,
-            "OPENBLAS_NUM_THREADS": threads,
-        }
-        reading, writing = os.pipe()
-        pipe_to = ("--fd", str(writing), "--parent", str(os.getpid()))
-        try:
-            with (self._folder / "log.txt").open("wb") as output:
-                process = subprocess.Popen(
-                    [*self._settings.worker_command, str(self._folder.absolute()), *pipe_to],
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=subprocess.STDOUT,
-                    pass_fds=(writing,),
-                    cwd=self._folder,
-                    env=environment,
-                    start_new_session=True,
-                )
-        except OSError:
-            os.close(reading)
-            raise
-        finally:
-            os.close(writing)
-        os.set_blocking(reading, False)
-        return process, reading
+        """The job's process, and the reading end of its pipe."""
+        settings = self._settings
+        return start_job(
+            settings.worker_command, self._folder, self._mark, settings.job_threads, self._storage.cache.absolute()
+        )
 
     def _watch(self, process: subprocess.Popen[bytes], pipe: int) -> Outcome:
         """Read the pipe, prolong the lease, keep the limits; until the process has ended or must."""
-        settings, begin = self._settings, time.monotonic()
+        settings = self._settings
+        begin = self._begin = time.monotonic()
         beat_at = size_at = begin
         with selectors.DefaultSelector() as selector:
             selector.register(pipe, selectors.EVENT_READ)
@@ -259,6 +223,12 @@ class Attempt:
         return ""
 
     def _settle(self, outcome: Outcome) -> str:
+        """Write the outcome, and log it; the state that was written."""
+        state = self._write(outcome)
+        log("job.end", job=self._claim.job_id, attempt=self._claim.attempt, state=state, reason=outcome.reason)
+        return state
+
+    def _write(self, outcome: Outcome) -> str:
         """Write the outcome, under the fence."""
         claim, state = self._claim, outcome.kind
         if outcome.kind == "done":
@@ -268,20 +238,59 @@ class Attempt:
             state = "queued"
         elif outcome.kind != "lost":
             self._leases.fail(claim, outcome.kind, outcome.reason, outcome.message)
-        log("job.end", job=claim.job_id, attempt=claim.attempt, state=state, reason=outcome.reason)
         return state
 
     def _publish(self, summary: dict[str, Any]) -> str:
-        """Rename the output into place, then commit; a crash between the two leaves a folder that is swept later."""
-        claim = self._claim
+        """Put the output into the store, then commit; a crash between the two leaves results that are swept later."""
+        claim, store, output = self._claim, self._stores.current, self._folder / "output"
         name = f"{claim.job_id}.{claim.attempt}"
+        self._phase("store")
         try:
-            assets = self._storage.publish(self._folder / "output", name)
+            assets = self._insist("collect", lambda: collect(output), math.inf)
+            timeout = self._timeout(store, [asset.size for asset in assets])
+            self._insist("publish", lambda: store.publish(output, name, assets), timeout)
+        except Interrupted as end:
+            return self._write(_interrupted(end))
         except OSError as error:
             self._leases.fail(claim, "failed", "disk_full", f"the results could not be kept: {error.strerror}")
             return "failed"
-        if self._leases.succeed(claim, name, assets, summary):
+        if self._leases.succeed(claim, name, assets, summary, store.url):
             return "succeeded"
-        self._storage.remove(name)
+        with suppress(StoreError):  # then the sweep finds them
+            wait(lambda: store.remove(name), self._settings.store_timeout_s)
         self._leases.fail(claim, "failed", "cancelled", "cancelled")
         return "lost"
+
+    def _insist(self, what: str, work: Callable[[], T], timeout_s: float) -> T:
+        patience = Patience(self._look, self._claim.job_id, self._store_failed)
+        return patience.insist(what, work, timeout_s)
+
+    def _look(self) -> str:
+        """Keep the lease while the store is waited for."""
+        if self._stop.is_set():
+            return "stop"
+        now = time.monotonic()
+        if now < self._looked + LOOK_S and not self._cancel.is_set():
+            return "go"
+        self._looked = now
+        return self._beat(now, self._begin)
+
+    def _phase(self, name: str) -> None:
+        """Say what is done beside the job's process."""
+        scans = self._progress["scans"] if self._progress is not None else 0
+        self._progress = {"phase": name, "done": 0.0, "total": 1.0, "scans": scans}
+
+    def _timeout(self, store: ResultStore, sizes: list[int]) -> float:
+        """How long a call to the store may take; a local disk takes as long as it takes."""
+        if store.url is None:
+            return math.inf
+        return self._settings.store_timeout_s * (1 + len(sizes)) + sum(sizes) / BYTES_PER_S
+
+
+def _interrupted(end: Interrupted) -> Outcome:
+    """What becomes of a job that was stopped while it waited for the store."""
+    return {
+        "stop": Outcome("again", "shutdown", "the server was stopped"),
+        "cancel": Outcome("failed", "cancelled", "cancelled"),
+        "lost": Outcome("lost"),
+    }[end.why]

@@ -7,7 +7,8 @@ from typing import Any, Literal
 from sqlalchemy import JSON, Index, Text, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+"""Stored in the database; what leads from one to the next is in `migrations`."""
 
 JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
 ACTIVE: tuple[JobState, ...] = ("queued", "running", "cancelling")
@@ -64,6 +65,8 @@ class JobRow(Base):
     log_name: Mapped[str]
     request: Mapped[dict[str, Any]]
     rerun_of: Mapped[str | None]
+    resume_of: Mapped[str | None] = mapped_column(index=True)
+    """The job whose map is extended."""
     state: Mapped[str] = mapped_column(default="queued")
     reason: Mapped[str | None]
     """Why it ended as it did, in a word: see the API's documentation."""
@@ -86,6 +89,8 @@ class JobRow(Base):
     heartbeat: Mapped[float | None]
     folder: Mapped[str | None]
     """Name of the folder with the results: of the attempt that won."""
+    store: Mapped[str | None]
+    """Where that folder is: the URL of an object store; None is the data folder."""
     summary: Mapped[dict[str, Any] | None]
     webhook: Mapped[str | None]
     __table_args__ = (Index("job_by_state", "state", "seq"),)
@@ -100,6 +105,15 @@ class AssetRow(Base):
     size: Mapped[int]
     sha256: Mapped[str]
     media_type: Mapped[str]
+
+
+class RemovalRow(Base):
+    """Results that no job has any more, and that are still to be removed from where they are."""
+
+    __tablename__ = "removal"
+    folder: Mapped[str] = mapped_column(primary_key=True)
+    store: Mapped[str | None]
+    created: Mapped[float]
 
 
 class EventRow(Base):

@@ -6,6 +6,7 @@ and drops an `event_id` that it has seen: a delivery whose answer was lost comes
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import hmac
 import http.client
@@ -30,7 +31,11 @@ if TYPE_CHECKING:
     from service.settings import Settings
 
 TIMEOUT_S = 5.0
+WITHIN_S = 15.0
+"""One delivery takes no longer, however slowly the receiver answers."""
 LONGEST_WAIT_S = 3600.0
+Address = ipaddress.IPv4Address | ipaddress.IPv6Address
+_EMBEDDING = [ipaddress.IPv6Network(text) for text in ("64:ff9b::/96", "::/96")]
 
 
 class ForbiddenAddress(OSError):
@@ -125,33 +130,45 @@ class Deliverer:
             return None, f"{type(error).__name__}: {error}"[:300]
 
 
-def post(url: str, body: bytes, headers: dict[str, str], private: bool) -> int:
+def post(url: str, body: bytes, headers: dict[str, str], private: bool, within_s: float = WITHIN_S) -> int:
     """POST to a public address; the status. Redirects are not followed: they would lead round the check.
 
-    The address is resolved once and connected to, so that a second answer of the name server cannot change it.
+    The address is resolved once and connected to, so that a second answer of the name server cannot change it. A
+    receiver that answers a byte now and then is cut off after `within_s`: others wait for their webhooks.
     """
     parts = urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname or parts.username is not None:
         raise ValueError("not an http(s) URL without user name")
     port = parts.port or (443 if parts.scheme == "https" else 80)
     address = _resolve(parts.hostname, port, private)
-    plain = socket.create_connection(address, TIMEOUT_S)
+    lines = [socket.create_connection(address, TIMEOUT_S)]
+    late = threading.Timer(within_s, lambda: _cut_off(lines[-1]))
+    late.daemon = True
+    late.start()
     kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
-    connection = kind(parts.hostname, port, timeout=TIMEOUT_S)
-    connection.sock = (
-        ssl.create_default_context().wrap_socket(plain, server_hostname=parts.hostname)
-        if parts.scheme == "https"
-        else plain
-    )
     try:
-        path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
-        connection.request("POST", path, body=body, headers=headers)
-        with connection.getresponse() as response:
-            response.read(1024)
-            return response.status
+        with contextlib.closing(kind(parts.hostname, port, timeout=TIMEOUT_S)) as connection:
+            if parts.scheme == "https":
+                context = ssl.create_default_context()
+                tls = context.wrap_socket(lines[0], server_hostname=parts.hostname, do_handshake_on_connect=False)
+                lines.append(tls)
+                tls.do_handshake()
+            connection.sock = lines[-1]
+            path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
+            connection.request("POST", path, body=body, headers=headers)
+            with connection.getresponse() as response:
+                response.read(1024)
+                return response.status
     finally:
-        connection.close()
-        plain.close()
+        late.cancel()
+        for line in lines:
+            line.close()
+
+
+def _cut_off(line: socket.socket) -> None:
+    """End a connection that another thread waits for; past TLS, which would wait for the other side's good-bye."""
+    with contextlib.suppress(OSError):
+        socket.socket.shutdown(line, socket.SHUT_RDWR)
 
 
 def _resolve(host: str, port: int, private: bool) -> tuple[str, int]:
@@ -159,8 +176,23 @@ def _resolve(host: str, port: int, private: bool) -> tuple[str, int]:
     found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     addresses = [str(each[4][0]) for each in found]
     for text in addresses:
-        address = ipaddress.ip_address(text.split("%")[0])
-        mapped = getattr(address, "ipv4_mapped", None) or address
-        if not private and (not mapped.is_global or mapped.is_multicast):
+        if not private and not all(_is_public(each) for each in _meant(ipaddress.ip_address(text.split("%")[0]))):
             raise ForbiddenAddress(f"{host} leads to {text}, which is not a public address")
     return addresses[0], port
+
+
+def _is_public(address: Address) -> bool:
+    return address.is_global and not address.is_multicast
+
+
+def _meant(address: Address) -> list[Address]:
+    """The address, and the IPv4 address that a gateway may make of it: mapped, 6to4, NAT64, IPv4-compatible."""
+    if isinstance(address, ipaddress.IPv4Address):
+        return [address]
+    if address.ipv4_mapped is not None:
+        return [address.ipv4_mapped]
+    if address.sixtofour is not None:
+        return [address, address.sixtofour]
+    if any(address in network for network in _EMBEDDING):
+        return [address, ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)]
+    return [address]

@@ -7,9 +7,11 @@ the same `hsloc.replay.run` as the command line. Whatever an upload holds is par
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import errno
 import json
 import os
+import re
 import sys
 import time
 import traceback
@@ -55,27 +57,36 @@ def main(argv: list[str] | None = None) -> int:
 
 def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, float, int], None]) -> dict[str, Any]:
     """Replay and write the results into `folder/output`; returns the summary for the job's row."""
+    from hsloc.evaluation import read_relations
     from hsloc.replay.results import timings, write_results
     from hsloc.replay.run import run
     from service.viewer import write_viewer
 
     report("open", 0.0, 1.0, 0)
     spec = make_spec(job, folder)
+    relations = None if job.get("relations") is None else folder / "relations" / job["relations"]
+    if relations is not None:
+        read_relations(relations)  # what cannot be read is told now, not after an hour of replay
 
     def replayed(progress: Progress) -> None:
         report(progress.phase, progress.done_s, progress.total_s, progress.scans)
 
     result = run(spec, replayed)
+    # Warnings are a part of the results, which are to be the same in every folder.
+    result = dataclasses.replace(result, warnings=tuple(plain_names(each) for each in result.warnings))
     scans = len(result.diagnostics)
     metrics = write_results(
         result,
         folder / "output",
         alignment=job["request"].get("alignment"),
+        relations=relations,
         progress=lambda share: report("write", share, 1.0, scans),
     )
     write_viewer(result, folder / "output", metrics)
     return {
-        "metrics": {key: metrics[key] for key in ("run", "log", "scans", "ape", "losses") if key in metrics},
+        "metrics": {
+            key: metrics[key] for key in ("run", "log", "scans", "ape", "relations", "losses") if key in metrics
+        },
         "data_lost": result.losses.data_lost,
         "warnings": [str(warning)[:500] for warning in result.warnings][:50],
         "notes": [line[:500] for line in result.losses.lines()][:50],
@@ -101,7 +112,8 @@ def make_spec(job: Mapping[str, Any], folder: Path) -> RunSpec:
     laser = read.get("laser_pose")
     options = {key: value for key, value in read.items() if key != "laser_pose"}
     return RunSpec(
-        logs=(folder / "input" / job["log"],),
+        logs=tuple(folder / place for place in job["logs"]),
+        resume=None if job.get("resume") is None else folder / job["resume"],
         map_path=None if job.get("map") is None else linked_map(folder, job["map"], job["map_image"]),
         config=config,
         read=ReadOptions(
@@ -156,12 +168,14 @@ def explain(error: Exception) -> dict[str, Any]:
             return {"failed": "disk_full", "message": "the server's disk became full while the job ran"}
         cause = cause.__cause__
     if isinstance(error, HslocError):
-        # The folder is the server's business; the user knows the file by its name.
-        message = str(error)
-        for folder in ("input", "map", "output"):
-            message = message.replace(f"{Path.cwd() / folder}/", "")
+        message = plain_names(str(error))
         return {"failed": "invalid_input", "message": message[:2000]}
     return {"failed": "internal_error", "message": f"{type(error).__name__}: {error}"[:2000]}
+
+
+def plain_names(text: str) -> str:
+    """A message with the files' own names: the folder is the server's business, and differs from run to run."""
+    return re.sub(rf"{re.escape(str(Path.cwd()))}/(?:(?:input(?:-\d+)?|map|relations|output)/)?", "", text)
 
 
 def _throttled(tell: Callable[[dict[str, Any]], None]) -> Callable[[str, float, float, int], None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import subprocess
 import tempfile
 import time
@@ -39,23 +40,32 @@ def run(server: Server, folder: Path, disk: Path) -> int:
     print("announced beyond the disk:", refusal(lambda: client.upload(large)))
     print("not announced:            ", refusal(lambda: chunked(server, 40)))
     # Somebody else takes the last byte: the service's own floor is gone, too.
-    with suppress(OSError), (disk / "somebody-else").open("wb") as file:
-        while True:
-            file.write(bytes(1 << 16))
-            file.flush()
+    fill(disk / "somebody-else")
     print("upload on a full disk:    ", refusal(lambda: chunked(server, 1)))
     print("job on a full disk:       ", refusal(lambda: client.submit(logs[0])))
     print("readyz:                   ", refusal(lambda: client.request("GET", "/readyz")))
+    server.end(signal.SIGKILL)
+    server.start()
+    print("killed with -9 and started again on the full disk")
+    fill(disk / "somebody-else-again")  # also what the server gave up in order to start
     client.request("DELETE", f"/v1/jobs/{jobs[0]}")
     client.request("DELETE", f"/v1/files/{logs[0]}")
     client.request("DELETE", f"/v1/files/{logs[1]}")
     print("deleted a job and two files on the full disk")
     (disk / "somebody-else").unlink()
+    (disk / "somebody-else-again").unlink()
     time.sleep(0.2)
     again = client.submit(client.upload(small))
     state = client.wait(again["id"])["state"]
     print(f"afterwards an upload and a job: {state}")
     return 0 if state == "succeeded" else 1
+
+
+def fill(path: Path) -> None:
+    with suppress(OSError), path.open("wb") as file:
+        while True:
+            file.write(bytes(1 << 16))
+            file.flush()
 
 
 def refusal(work: object) -> str:

@@ -29,6 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--new-token", metavar="TENANT", help="make a token for a tenant, print it, and end")
     group.add_argument("--scopes", default="read,write,admin", help="scopes of the new token (default: all)")
     group.add_argument("--expires-days", type=float, metavar="D", help="the new token ends after so many days")
+    group.add_argument("--list-tokens", action="store_true", help="show the tokens' ids and tenants, and end")
+    group.add_argument("--revoke-token", metavar="ID", help="make a token worthless, and end")
     parser.epilog = (
         "Everything else, such as limits, is set by variables HSLOC_<NAME>: HSLOC_MAX_UPLOAD_BYTES=2G, "
         "HSLOC_JOB_MEMORY_BYTES=4G, HSLOC_MIN_FREE_BYTES=256M, HSLOC_RETENTION_S, ...; HSLOC_TOKEN is a token of your "
@@ -50,6 +52,10 @@ def run(arguments: argparse.Namespace) -> int:
             chosen = replace(chosen, allowed_hosts=(*chosen.allowed_hosts, *arguments.allowed_host))
         if arguments.new_token is not None:
             return int(service.new_token(chosen, arguments.new_token, arguments.scopes, arguments.expires_days))
+        if arguments.list_tokens:
+            return int(service.list_tokens(chosen))
+        if arguments.revoke_token is not None:
+            return int(service.revoke_token(chosen, arguments.revoke_token))
         return int(
             service.serve(
                 chosen,

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hsloc.cli.arguments import pose, seed
+from hsloc.cli.arguments import add_read_arguments, pose, seed
 from hsloc.cli.progress import ProgressLine
 
 if TYPE_CHECKING:
@@ -19,9 +19,12 @@ HELP = "send a log to a running service"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Where to, what, and whether to wait."""
-    parser.add_argument("log", type=Path, help="log, one file")
+    parser.add_argument("log", nargs="+", type=Path, help="log, one file; several are one run")
     parser.add_argument("--url", default=os.environ.get("HSLOC_URL", "http://127.0.0.1:8000"), help="$HSLOC_URL")
     parser.add_argument("--map", type=Path, metavar="YAML", help="map as nav2 writes it (default: the log's own)")
+    parser.add_argument(
+        "--resume", metavar="JOB", help="extend the map of an earlier mapping job of this service: its id"
+    )
     parser.add_argument("--mode", choices=("auto", "localise", "slam"), default="auto")
     parser.add_argument("--matcher", choices=("hide", "harmony_search", "icp"))
     parser.add_argument("--mapper", choices=("graph", "point"))
@@ -31,9 +34,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     start.add_argument("--initial-pose", type=pose, metavar="X,Y,YAW", help="start, in metres and radians")
     start.add_argument("--unknown-start", action="store_true", help="search the whole map")
     parser.add_argument("--config", type=Path, metavar="FILE", help="parameters from YAML, on top of the preset")
+    parser.add_argument("--no-odom", action="store_true", help="draw a map without looking at the log's odometry")
+    parser.add_argument("--alignment", choices=("none", "origin", "se2"), help="as in `hsloc replay`")
+    parser.add_argument(
+        "--relations", type=Path, metavar="FILE", help="score by relations: `t1 t2 x y z roll pitch yaw`"
+    )
     parser.add_argument("--wait", action="store_true", help="wait until the job has ended; 1 unless it succeeded")
     parser.add_argument("--out", type=Path, metavar="DIR", help="wait, and fetch the results into this folder")
     parser.add_argument("-q", "--quiet", action="store_true", help="print the job's id only")
+    add_read_arguments(parser)
     parser.epilog = "The token, if the service asks for one, stands in $HSLOC_TOKEN."
 
 
@@ -49,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
             line.show("upload", done / total if total else 1.0, f"{done / 1e6:.1f} MB of {total / 1e6:.1f} MB")
 
         request = _request(arguments, client)
-        job = client.submit(client.upload(arguments.log, uploaded), **request)
+        job = client.submit([client.upload(path, uploaded) for path in arguments.log], **request)
         if arguments.wait or arguments.out is not None:
             job = client.wait(job["id"], lambda now: _show(line, now))
             if job["state"] == "succeeded" and arguments.out is not None:
@@ -63,8 +72,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _request(arguments: argparse.Namespace, client: Client) -> dict[str, Any]:
-    names = ("mode", "matcher", "mapper", "preset", "seed", "unknown_start")
+    names = ("mode", "matcher", "mapper", "preset", "seed", "unknown_start", "alignment", "resume")
     request: dict[str, Any] = {name: getattr(arguments, name) for name in names}
+    request["no_odometry"] = arguments.no_odom
+    request["read"] = _read(arguments)
     if arguments.initial_pose is not None:
         request["initial_pose"] = list(arguments.initial_pose)
     if arguments.config is not None:
@@ -72,7 +83,19 @@ def _request(arguments: argparse.Namespace, client: Client) -> dict[str, Any]:
     if arguments.map is not None:
         image = arguments.map.parent / str(_yaml(arguments.map).get("image", ""))
         request["map"] = {"yaml": client.upload(arguments.map), "image": client.upload(image)}
+    if arguments.relations is not None:
+        request["relations"] = client.upload(arguments.relations)
     return request
+
+
+def _read(arguments: argparse.Namespace) -> dict[str, Any]:
+    """How to read the log, as `hsloc replay` takes it."""
+    names = {"odom_topic", "truth_topic", "base_frame", "laser_pose", "deskew"}
+    found: dict[str, Any] = {name: getattr(arguments, name) for name in sorted(names)}
+    found |= {"start_s": arguments.start, "end_s": arguments.end}
+    if arguments.scan_topic is not None:
+        found["scan_topic"] = ",".join(arguments.scan_topic)
+    return found
 
 
 def _yaml(path: Path) -> dict[str, Any]:

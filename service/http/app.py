@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import asynccontextmanager
+from copy import deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +42,11 @@ from service.leases import Leases
 from service.logs import log
 from service.principal import Tokens
 from service.receiving import Receiver
+from service.removals import Removals
+from service.results import StoreError, Stores
+from service.settings import SettingsError
 from service.storage import Storage
+from service.waiting import Desk
 from service.webhooks import Deliverer
 
 if TYPE_CHECKING:
@@ -61,9 +66,20 @@ def create_app(settings: Settings) -> FastAPI:
     """
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     storage = Storage(settings.data, settings.min_free_bytes)
-    database = Database(settings.data / "hsloc.db")
+    try:
+        database, stores = Database(settings.data / "hsloc.db"), Stores(storage, settings)
+    except SettingsError:
+        storage.close()
+        raise
     leases = Leases(database, settings.lease_s, settings.max_attempts)
-    dispatcher = LocalDispatcher(leases, storage, settings, lambda state: metrics.ENDED.labels(state).inc())
+    dispatcher = LocalDispatcher(
+        leases,
+        storage,
+        settings,
+        stores,
+        ended=lambda state: metrics.ENDED.labels(state).inc(),
+        store_failed=metrics.STORE_ERRORS.inc,
+    )
     files = Files(database, storage, settings)
     context = Context(
         settings=settings,
@@ -73,15 +89,18 @@ def create_app(settings: Settings) -> FastAPI:
         jobs=Jobs(database, storage, settings),
         receiver=Receiver(files, settings),
         dispatcher=dispatcher,
+        stores=stores,
+        removals=Removals(database, stores, settings.store_timeout_s),
+        desk=Desk(settings.store_timeout_s),
     )
-    helpers = (Deliverer(database, settings), Housekeeping(database, storage, settings))
+    helpers = (Deliverer(database, settings), Housekeeping(database, storage, settings, stores))
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         dispatcher.start()
         for helper in helpers:
             helper.start()
-        log("start", version=__version__, slots=settings.slots, data=str(settings.data))
+        log("start", version=__version__, slots=settings.slots, data=str(settings.data), results=stores.current.url)
         try:
             yield
         finally:
@@ -147,6 +166,13 @@ def _add_errors(app: FastAPI, storage: Storage) -> None:
     async def gone(_request: Request, _error: ClientDisconnect) -> Response:
         return _answer(400, "disconnected", "the connection broke", {"connection": "close"})
 
+    @app.exception_handler(StoreError)
+    async def store(request: Request, error: StoreError) -> Response:
+        metrics.STORE_ERRORS.inc()
+        log("store.error", error=str(error))
+        headers = _closing(request, {"Retry-After": "5"})
+        return _answer(503, "store", "the results cannot be reached just now; try again", headers)
+
     @app.exception_handler(OperationalError)
     async def database(_request: Request, error: OperationalError) -> Response:
         log("database.error", error=str(error.orig))
@@ -183,7 +209,7 @@ def _describe(app: FastAPI) -> None:
             parts = schema.setdefault("components", {})
             parts["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
             models = parts["schemas"]
-            models["Config"] = options.options()["config_schema"]
+            models["Config"] = deepcopy(options.options()["config_schema"])
             models["RunRequest"] = RunRequest.model_json_schema(ref_template="#/components/schemas/{model}")
             models["RunRequest"].pop("$defs")  # FastAPI has put them among the others
             for name in ("RunRequest", "JobRequest", "RerunRequest"):

@@ -15,7 +15,10 @@ from service.http.schemas import Problem
 from service.jobs import Jobs
 from service.principal import Principal
 from service.receiving import Receiver
+from service.removals import Removals
+from service.results import Stores
 from service.settings import Settings
+from service.waiting import Desk
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,6 +38,9 @@ class Context:
     jobs: Jobs
     receiver: Receiver
     dispatcher: Dispatcher
+    stores: Stores
+    removals: Removals
+    desk: Desk
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server begins to shut down: event streams end."""
     streams: Counter[str] = field(default_factory=Counter)

@@ -74,10 +74,16 @@ async def put(
     return file_view(await _take(request, ctx, who, row, wanted))
 
 
-@router.get("", responses=problems())
-def list_files(ctx: Ctx, who: Reader, limit: Annotated[int, Query(ge=1, le=200)] = 50) -> FileList:
+@router.get("", responses=problems(404))
+def list_files(
+    ctx: Ctx,
+    who: Reader,
+    before: Annotated[str | None, Query(pattern=UUID_PATTERN, description="`next` of the page before")] = None,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+) -> FileList:
     """Your uploads, newest first."""
-    return FileList(files=[file_view(row) for row in ctx.files.list(who, limit)])
+    rows = ctx.files.list(who, limit, before)
+    return FileList(files=[file_view(row) for row in rows], next=rows[-1].id if len(rows) == limit else None)
 
 
 @router.get("/{file_id}", responses=problems(404))

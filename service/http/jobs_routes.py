@@ -16,8 +16,10 @@ from service.http.schemas import (
     JobView,
     RerunRequest,
     State,
+    checked,
 )
 from service.http.views import delivery_view, job_view
+from service.requests import plain
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 JobId = Annotated[str, Path(pattern=UUID_PATTERN, description="id of a job")]
@@ -37,7 +39,7 @@ def submit(ctx: Ctx, who: Writer, response: Response, request: JobRequest, idemp
     """Queue a job. The answer comes when the job is safe on the disk; 200 if it was there already (Idempotency-Key)."""
     if request.config is not None:
         request.config = options.check(request.config)
-    job, created = ctx.jobs.submit(who, request.model_dump(), idempotency_key)
+    job, created = ctx.jobs.submit(who, plain(request.model_dump()), idempotency_key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     if created:
         ctx.dispatcher.enqueue(job.id)
@@ -88,7 +90,8 @@ def rerun(
     for name in ("mode", "preset", "seed", "unknown_start"):
         if changed.get(name, ...) is None:
             del changed[name]
-    job = ctx.jobs.rerun(who, job_id, changed)
+    old = ctx.jobs.get(who, job_id)
+    job = ctx.jobs.rerun(who, job_id, plain(checked(JobRequest, {**old.request, **changed}).model_dump()))
     ctx.dispatcher.enqueue(job.id)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job_view(job)
@@ -96,8 +99,12 @@ def rerun(
 
 @router.delete("/{job_id}", status_code=204, responses=problems(404, 409))
 def delete(ctx: Ctx, who: Writer, job_id: JobId) -> None:
-    """Remove a job that has ended, and its results. The upload stays."""
+    """Remove a job that has ended, and its results. The upload stays.
+
+    Results in an object store are unreachable at once, and removed within a minute, or when the store is there again.
+    """
     ctx.storage.with_room(lambda: ctx.jobs.delete(who, job_id))
+    ctx.removals.clear_folder()
 
 
 @router.get("/{job_id}/webhooks", responses=problems(404))

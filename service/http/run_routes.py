@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 from anyio import to_thread
 from fastapi import APIRouter, Request, Response
-from pydantic import ValidationError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.concurrency import run_in_threadpool
 
 from service import options
 from service.errors import ServiceError
 from service.http.context import Context, Ctx, Writer, problems
-from service.http.schemas import JobRequest, JobView, RunRequest
+from service.http.schemas import MAX_LOGS, JobRequest, JobView, RunRequest, checked
 from service.http.views import job_view
+from service.requests import plain
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from service.tables import FileRow
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
-FILES = ("log", "map", "map_image")
+FILES = ("log", "map", "map_image", "relations")
 FIELD_BYTES = 64 << 10
 HEADER_BYTES = 8 << 10
 _FILE = {"type": "string", "contentMediaType": "application/octet-stream"}
@@ -37,9 +37,10 @@ _BODY = {
                     "type": "object",
                     "required": ["log"],
                     "properties": {
-                        "log": {**_FILE, "description": "the log"},
+                        "log": {**_FILE, "description": "the log; given several times, the parts of one run"},
                         "map": {**_FILE, "description": "the map's YAML"},
                         "map_image": {**_FILE, "description": "the map's image"},
+                        "relations": {**_FILE, "description": "relations to score by"},
                         "request": {"$ref": "#/components/schemas/RunRequest"},
                     },
                     "additionalProperties": False,
@@ -55,13 +56,13 @@ _BODY = {
 async def run(request: Request, response: Response, ctx: Ctx, who: Writer) -> JobView:
     """Upload a log (and a map) and queue a job, in one request. What was uploaded goes if the job cannot be queued."""
     parts = _Parts(request)
-    files: dict[str, str] = {}
+    files: dict[str, list[str]] = {}
     text = b"{}"
     try:
         async for name, label in parts.each():
-            if name in FILES and name not in files:
+            if name in FILES and (name not in files or (name == "log" and len(files["log"]) < MAX_LOGS)):
                 row = await to_thread.run_sync(ctx.files.create, who, label or name, None)
-                files[name] = row.id
+                files.setdefault(name, []).append(row.id)
                 await _receive(ctx, who, row, parts)
             elif name == "request":
                 text = await parts.text()
@@ -70,9 +71,9 @@ async def run(request: Request, response: Response, ctx: Ctx, who: Writer) -> Jo
         wanted = _request(text, files)
         if wanted.config is not None:
             wanted.config = await run_in_threadpool(options.check, wanted.config)
-        job, _ = await to_thread.run_sync(ctx.jobs.submit, who, wanted.model_dump())
+        job, _ = await to_thread.run_sync(ctx.jobs.submit, who, plain(wanted.model_dump()))
     except BaseException:
-        for file_id in files.values():
+        for file_id in (each for idents in files.values() for each in idents):
             ctx.receiver.forget(file_id)
             await to_thread.run_sync(ctx.files.delete, who, file_id)
         raise
@@ -87,21 +88,22 @@ async def _receive(ctx: Context, who: Principal, row: FileRow, parts: _Parts) ->
         await ctx.receiver.finish(row.id)
 
 
-def _request(text: bytes, files: dict[str, str]) -> JobRequest:
+def _request(text: bytes, files: dict[str, list[str]]) -> JobRequest:
     if "log" not in files:
         raise ServiceError(422, "invalid", "the field `log` is missing")
     if ("map" in files) != ("map_image" in files):
         raise ServiceError(422, "invalid", "a map is two files: `map` (YAML) and `map_image`")
     try:
-        how = RunRequest.model_validate(json.loads(text))
-        chart = {"yaml": files["map"], "image": files["map_image"]} if "map" in files else None
-        return JobRequest.model_validate({**how.model_dump(), "log": files["log"], "map": chart})
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ServiceError(422, "invalid", f"request.{where}: {first['msg']}") from error
+        found = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ServiceError(422, "invalid", "`request` is not JSON") from error
+    values, logs = checked(RunRequest, found).model_dump(exclude_unset=True), files["log"]
+    values |= {"log": logs[0]} if len(logs) == 1 else {"logs": logs}
+    if "map" in files:
+        values["map"] = {"yaml": files["map"][0], "image": files["map_image"][0]}
+    if "relations" in files:
+        values["relations"] = files["relations"][0]
+    return checked(JobRequest, values)
 
 
 class _Parts:

@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AwareDatetime, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
+from pydantic import (
+    AwareDatetime,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
+from service.errors import ServiceError
 from service.options import whole
 
 UUID_PATTERN = r"^[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}$"
 Ident = Annotated[str, Field(pattern=UUID_PATTERN, examples=["3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f"])]
 PoseList = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3, examples=[[1.0, 2.0, 0.0]])]
+MAX_LOGS = 64
+UNIQUE: dict[str, Any] = {"uniqueItems": True}
 Label = Annotated[str, Field(max_length=255)]
 Seed = Annotated[int, Field(ge=0, le=2**53 - 1), BeforeValidator(whole)]
 Config = dict[str, Any]
@@ -46,9 +59,10 @@ class FileView(BaseModel):
 
 
 class FileList(BaseModel):
-    """Uploads, newest first."""
+    """Uploads, newest first; pass `next` as `before` for more."""
 
     files: list[FileView]
+    next: Ident | None
 
 
 class MapFiles(Strict):
@@ -89,16 +103,66 @@ class RunRequest(Strict):
     )
     read: ReadRequest | None = None
     config: Config | None = Field(default=None, description="parameters, on top of the preset; see /v1/options")
+    resume: Ident | None = Field(
+        default=None, description="id of a job of yours that drew a map, which is extended: the new one is in its frame"
+    )
     webhook: Annotated[str, Field(max_length=2000, pattern=r"^https?://[^\s]+$")] | None = Field(
         default=None, description="URL that is told when the job has ended"
     )
 
 
 class JobRequest(RunRequest):
-    """What to run, and how."""
+    """What to run, and how. Either `log` or `logs`."""
 
-    log: Ident = Field(description="id of the uploaded log")
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [
+                {"required": ["log"], "properties": {"log": {"type": "string"}}},
+                {"required": ["logs"], "properties": {"logs": {"type": "array"}}},
+            ],
+            "if": {"required": ["resume"], "properties": {"resume": {"type": "string"}}},
+            "then": {
+                "properties": {
+                    "map": {"type": "null"},
+                    "mode": {"enum": ["auto", "slam"]},
+                    "mapper": {"enum": ["graph", None]},
+                }
+            },
+            "examples": [
+                {"log": "3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f", "seed": 7},
+                {
+                    "logs": ["3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f", "9b1f2c8e-4a0d-4f7e-8a55-2c7d9e0f1a2b"],
+                    "relations": "5d2e8b90-1c3f-4b6a-9d77-e4f5a6b7c8d9",
+                    "resume": "c7a1d3e5-6f80-4912-b3c4-d5e6f7a8b9c0",
+                    "mode": "slam",
+                },
+            ],
+        }
+    )
+
+    log: Ident | None = Field(default=None, description="id of the uploaded log")
+    logs: Annotated[list[Ident], Field(min_length=1, max_length=MAX_LOGS, json_schema_extra=UNIQUE)] | None = Field(
+        default=None, description="ids of several uploaded logs that are parts of one run, as `hsloc replay a b`"
+    )
+    relations: Ident | None = Field(
+        default=None, description="id of an uploaded file of relations to score by: `t1 t2 x y z roll pitch yaw`"
+    )
     map: MapFiles | None = Field(default=None, description="map; default: the one in the log")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> JobRequest:
+        """What contradicts itself is refused before it is queued."""
+        if (self.log is None) == (self.logs is None):
+            raise PydanticCustomError("logs", "give either `log`, or `logs` for several parts of one run")
+        if self.logs is not None and len(set(self.logs)) < len(self.logs):
+            raise PydanticCustomError("logs", "logs: a log is named twice; several logs must be parts of one run")
+        if self.resume is not None and (self.map is not None or self.mode == "localise"):
+            raise PydanticCustomError(
+                "resume", "a map is either localised in (`map`) or extended (`resume`); leave out one of them"
+            )
+        if self.resume is not None and self.mapper == "point":
+            raise PydanticCustomError("resume", "a map is extended by the graph mapper; leave out `resume` or `mapper`")
+        return self
 
 
 class RerunRequest(Strict):
@@ -111,6 +175,8 @@ class RerunRequest(Strict):
     seed: Seed | None = None
     initial_pose: PoseList | None = None
     unknown_start: bool | None = None
+    alignment: Literal["none", "origin", "se2"] | None = None
+    relations: Ident | None = None
     config: Config | None = None
 
 
@@ -120,7 +186,7 @@ State = Literal["queued", "running", "cancelling", "succeeded", "failed", "crash
 class ProgressView(BaseModel):
     """How far a running job is."""
 
-    phase: str = Field(description="open, replay, write", examples=["replay"])
+    phase: str = Field(description="fetch, open, prepare, replay, refine, write, store", examples=["replay"])
     done: float = Field(description="seconds of the log (replay), or the part of the work from 0 to 1 (others)")
     total: float
     fraction: float = Field(ge=0.0, le=1.0)
@@ -132,8 +198,9 @@ class ProgressView(BaseModel):
 class JobView(BaseModel):
     """A job.
 
-    `reason` of a failed job: invalid_input, out_of_memory, cpu_limit, wall_limit, output_limit, disk_full,
-    fault_injection; of a crashed one: signal, exit, internal_error, protocol, attempts.
+    `reason` of a failed job: invalid_input, out_of_memory, cpu_limit, wall_limit, output_limit, disk_full, store (the
+    map to extend is in a store that this server is not set to), fault_injection; of a crashed one: signal, exit,
+    internal_error, protocol, attempts.
     """
 
     id: Ident
@@ -224,6 +291,19 @@ class Health(BaseModel):
     """Alive, or ready to work."""
 
     status: Literal["ok"]
+
+
+Request = TypeVar("Request", bound=RunRequest)
+
+
+def checked(kind: type[Request], values: Any) -> Request:
+    """A request that did not come as the body. Raises ServiceError 422 with the place of what is wrong."""
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = "".join(f".{part}" for part in first["loc"])
+        raise ServiceError(422, "invalid", f"request{where}: {first['msg']}") from error
 
 
 def moment(seconds: float | None) -> datetime | None:

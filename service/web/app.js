@@ -12,6 +12,7 @@ let watching = null; // AbortController of its events
 let uploading = null;
 let pages = 1;
 let playing = null;
+const sent = new WeakMap(); // files that were uploaded for a job that is not queued yet, with their ids
 
 function element(tag, text = "", className = "") {
   const made = document.createElement(tag);
@@ -57,7 +58,8 @@ async function about() {
 
 // --- new job ---------------------------------------------------------------------------------------------------------
 function chosenLog() {
-  $("drop-text").textContent = $("log").files.length ? `${$("log").files[0].name} (${bytes($("log").files[0].size)})` : "Choose a log, or drop one here";
+  const files = [...$("log").files];
+  $("drop-text").textContent = files.length ? `${files.map((f) => f.name).join(", ")} (${bytes(files.reduce((n, f) => n + f.size, 0))})` : "Choose a log, or drop one here";
 }
 $("log").addEventListener("change", chosenLog);
 for (const kind of ["dragover", "dragleave", "drop"]) {
@@ -74,6 +76,7 @@ for (const kind of ["dragover", "dragleave", "drop"]) {
 function options() {
   const found = { mode: $("mode").value, preset: $("preset").value, seed: Number($("seed").value), unknown_start: $("unknown").checked };
   if ($("matcher").value) found.matcher = $("matcher").value;
+  if ($("resume").value) found.resume = $("resume").value;
   if ($("pose").value.trim()) {
     found.initial_pose = $("pose").value.trim().split(/[\s,]+/).map(Number);
     if (found.initial_pose.length !== 3 || found.initial_pose.some(Number.isNaN)) throw new SyntaxError("start: three numbers are needed: x, y (metres) and yaw (radians)");
@@ -90,14 +93,23 @@ async function submit() {
     $("upload-bar").value = total ? done / total : 1;
     $("upload-text").textContent = `${bytes(done)} of ${bytes(total)}${note ? `: ${note}` : ""}`;
   };
+  // What is there already is not sent again when a later file was paused or refused.
+  const send = async (file) => {
+    if (!sent.has(file)) sent.set(file, await upload(file, report, uploading.signal));
+    return sent.get(file);
+  };
   const files = [...$("map").files];
   if (files.length) {
     const yaml = files.find((file) => /\.ya?ml$/i.test(file.name)), image = files.find((file) => file !== yaml);
     if (!yaml || !image || files.length !== 2) throw new SyntaxError("a map is two files: its YAML and its image");
-    wanted.map = { yaml: await upload(yaml, report, uploading.signal), image: await upload(image, report, uploading.signal) };
+    wanted.map = { yaml: await send(yaml), image: await send(image) };
   }
-  wanted.log = await upload($("log").files[0], report, uploading.signal);
+  if ($("relations").files.length) wanted.relations = await send($("relations").files[0]);
+  const logs = [];
+  for (const file of $("log").files) logs.push(await send(file));
+  if (logs.length === 1) [wanted.log] = logs; else wanted.logs = logs;
   const job = await post("/v1/jobs", wanted, { "Idempotency-Key": crypto.randomUUID ? crypto.randomUUID() : String(Math.random()) });
+  for (const file of [...$("log").files, ...files, ...$("relations").files]) sent.delete(file);
   await refresh();
   show(job.id, true);
 }
@@ -148,8 +160,19 @@ async function refresh() {
   $("jobs").replaceChildren(...jobs.map(line));
   if (focused) [...$("jobs").querySelectorAll("button")].find((b) => b.dataset.job === focused)?.focus();
   $("no-jobs").hidden = jobs.length > 0;
+  extendable(jobs);
   $("more").hidden = !before;
   return jobs;
+}
+
+// Jobs that drew a map, which another can extend; rebuilt only if they changed, so that an open list stays open.
+function extendable(jobs) {
+  const drew = jobs.filter((job) => job.state === "succeeded" && job.summary?.metrics?.run?.mode === "slam" && job.request.mapper !== "point" && job.request.config?.mapper !== "point");
+  const box = $("resume"), ids = ["", ...drew.map((job) => job.id)], before = box.value;
+  if (ids.join() === [...box.options].map((option) => option.value).join()) return;
+  const option = (value, text) => { const made = element("option", text); made.value = value; return made; };
+  box.replaceChildren(option("", "none: begin a new one"), ...drew.map((job) => option(job.id, `${job.log}, ${when(job.created)}`)));
+  box.value = ids.includes(before) ? before : "";
 }
 $("more").addEventListener("click", () => { pages += 1; guarded(refresh); });
 
@@ -290,6 +313,13 @@ function metrics(job) {
   if (ape?.trans_part) {
     row("APE, position", `rmse ${(100 * ape.trans_part.rmse).toFixed(1)} cm, median ${(100 * ape.trans_part.median).toFixed(1)} cm, max ${(100 * ape.trans_part.max).toFixed(1)} cm`);
     row("APE, heading", `rmse ${ape.angle_deg.rmse.toFixed(3)}°, max ${ape.angle_deg.max.toFixed(3)}°`);
+  }
+  const relations = found.relations;
+  if (relations) {
+    const cm = (value) => value === null ? "–" : (100 * value).toFixed(1), part = relations.trans_part, angle = relations.angle_deg;
+    row("Relations", `${relations.matched} of ${relations.matched + relations.unmatched} are in the path`);
+    row("Relations, position", `mean ${cm(part.mean)} cm, std ${cm(part.std)} cm, max ${cm(part.max)} cm`);
+    row("Relations, heading", `mean ${angle.mean.toFixed(3)}°, std ${angle.std === null ? "–" : angle.std.toFixed(3)}°, max ${angle.max.toFixed(3)}°`);
   }
   if (found.log) row("Log", `${found.log.duration_s.toFixed(1)} s, ${found.log.path_length_m.toFixed(1)} m, ${found.log.odometry_messages} odometry messages`);
   if (found.scans) row("Scans", Object.entries(found.scans.by_status).map(([k, v]) => `${v} ${k}`).join(", "));

@@ -11,6 +11,7 @@ import pytest
 from conftest import settings, submit, upload, wait
 from fastapi.testclient import TestClient
 
+from hsloc.cli.main import main as program
 from service.http.app import create_app
 from service.main import with_tokens
 from service.principal import Tokens
@@ -233,3 +234,33 @@ def test_upload_of_another_tenant_is_no_log_of_mine(world: World) -> None:
     answer = world.client.post("/v1/jobs", json={"log": mine, "map": {"yaml": world.file, "image": mine}})
     del world.client.headers["Authorization"]
     assert answer.status_code == 404
+
+
+def test_tokens_are_listed_and_revoked_while_the_service_runs(
+    make_live: Callable[..., Live], capsys: pytest.CaptureFixture[str]
+) -> None:
+    live = make_live(HSLOC_REQUIRE_TOKEN="1")
+
+    def serve(*options: str) -> tuple[int, str, str]:
+        code = program(["serve", "--data", str(live.data), *options])
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    token = serve("--new-token", "one", "--scopes", "read", "--expires-days", "2")[1].split(": ")[1].strip()
+    code, listed, _ = serve("--list-tokens")
+    ident, tenant, scopes = listed.split()[:3]
+    assert (code, tenant, scopes) == (0, "one", "read")
+    assert "expires 2" in listed
+    assert token not in listed
+    with live.client() as client:
+        client.headers["Authorization"] = f"Bearer {token}"
+        assert client.get("/v1/info").status_code == 200
+        assert serve("--revoke-token", ident)[0] == 0
+        assert client.get("/v1/info").status_code == 401
+    assert serve("--list-tokens")[1].rstrip().endswith("revoked")
+    for options, said in ((["--revoke-token", "nothing"], "no token 'nothing'"), ([], "no data folder")):
+        folder = [] if options else ["--data", str(live.data / "elsewhere"), "--list-tokens"]
+        code, _, err = serve(*options, *folder)
+        assert code == 1
+        assert said in err
+        assert err.count("\n") == 1

@@ -103,3 +103,32 @@ def test_failing_on_purpose(make_live: Callable[..., Live], log: Path) -> None:
     done = submit(live, str(log), "--wait")
     assert done.returncode == 1
     assert "fault_injection" in done.stdout
+
+
+def test_the_command_sends_what_replay_takes(make_live: Callable[..., Live], log: Path, tmp_path: Path) -> None:
+    live = make_live()
+    (tmp_path / "two.mcap").write_bytes(b"second part")
+    (tmp_path / "some.relations").write_text("1 2 0 0 0 0 0 0\n")
+    done = submit(
+        live,
+        *("-q", str(log), str(tmp_path / "two.mcap"), "--relations", str(tmp_path / "some.relations")),
+        *("--alignment", "origin", "--no-odom", "--scan-topic", "/a", "--scan-topic", "/b", "--start", "2"),
+        *("--laser-pose", "1,2,3", "--deskew", "--mode", "slam"),
+    )
+    assert done.returncode == 0, done.stderr
+    client = Client(live.url)
+    job = client.job(done.stdout.strip())
+    request = job["request"]
+    assert job["log"] == "run one.mcap, two.mcap"
+    assert len(request["logs"]) == 2
+    names = [client.request("GET", f"/v1/files/{ident}").json()["name"] for ident in request["logs"]]
+    assert names == ["run one.mcap", "two.mcap"]
+    assert client.request("GET", f"/v1/files/{request['relations']}").json()["name"] == "some.relations"
+    assert (request["alignment"], request["no_odometry"], request["mode"]) == ("origin", True, "slam")
+    read = {key: value for key, value in request["read"].items() if value is not None}
+    assert read == {"scan_topic": "/a,/b", "start_s": 2.0, "laser_pose": [1.0, 2.0, 3.0], "deskew": True}
+    assert client.wait(job["id"], every_s=0.1)["state"] == "succeeded"
+    refused = submit(live, str(log), "--resume", job["id"])
+    assert refused.returncode == 1
+    assert "drew no map" in refused.stderr
+    assert refused.stderr.count("\n") == 1

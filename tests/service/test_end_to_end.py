@@ -138,3 +138,15 @@ def test_a_map_of_two_uploads(make_client: Callable[..., TestClient]) -> None:
     assert ended["summary"]["metrics"]["run"]["map"] == "map.yaml"
     viewer = client.get(f"/v1/jobs/{job}/results/viewer.json").json()
     assert (viewer["map"]["width"], viewer["map"]["height"]) == (100, 100)
+
+
+def test_a_warning_names_the_map_and_not_the_servers_folder(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(worker_command=REAL, job_memory_bytes=2 << 30)
+    yaml = b"image: m.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
+    pixels = b"P5 100 100 255\n" + (b"\x00" * 100 + b"\xcd" * 100) * 50
+    chart = {"yaml": upload(client, yaml, "office.yaml"), "image": upload(client, pixels, "m.pgm")}
+    log = upload(client, (RECORDINGS / "paper.mcap").read_bytes(), "paper.mcap")
+    job = client.post("/v1/jobs", json={"log": log, "map": chart, "read": {"end_s": 1.0}}).json()["id"]
+    ended = wait(client, job, 30.0)
+    assert any(text.startswith("office.yaml: free_thresh") for text in ended["summary"]["warnings"]), ended
+    assert "/data/" not in client.get(f"/v1/jobs/{job}/results/metrics.json").text

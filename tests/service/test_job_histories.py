@@ -16,7 +16,7 @@ from test_leases import Parts
 
 from service.errors import ServiceError
 from service.principal import ANYBODY
-from service.storage import Asset
+from service.results import Asset
 from service.tables import JobRow
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class Histories(RuleBasedStateMachine):
             with pytest.raises(ServiceError, match="there is no job"):
                 self.parts.jobs.rerun(ANYBODY, old, {})
             return multiple()
-        job = self.parts.jobs.rerun(ANYBODY, old, {}).id
+        job = self.parts.jobs.rerun(ANYBODY, old, self.parts.jobs.get(ANYBODY, old).request).id
         assert job not in self.models
         self.models[job] = Model()
         return job

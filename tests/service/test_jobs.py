@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
 import json
 import time
 import uuid
-import zipfile
 from typing import TYPE_CHECKING
 
 import pytest
@@ -17,51 +14,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from fastapi.testclient import TestClient
-
-
-def test_a_job_runs_and_its_results_are_named_by_a_manifest(client: TestClient) -> None:
-    job = submit(client, seed=7)
-    ended = wait(client, job)
-    assert (ended["state"], ended["reason"], ended["attempt"]) == ("succeeded", None, 1)
-    manifest = client.get(f"/v1/jobs/{job}/results").json()
-    assert [each["name"] for each in manifest["assets"]] == ["metrics.json", "trajectory.tum"]
-    for each in manifest["assets"]:
-        answer = client.get(each["href"])
-        assert hashlib.sha256(answer.content).hexdigest() == each["sha256"]
-        assert len(answer.content) == each["size"]
-        assert answer.headers["etag"] == f'"{each["sha256"]}"'
-        assert "sandbox" in answer.headers["content-security-policy"]
-    assert client.get(f"/v1/jobs/{job}/results/trajectory.tum").text == "7 []\n"
-
-
-def test_ranges_and_etags(client: TestClient) -> None:
-    job = submit(client)
-    wait(client, job)
-    path = f"/v1/jobs/{job}/results/trajectory.tum"
-    whole = client.get(path)
-    part = client.get(path, headers={"Range": "bytes=2-3"})
-    assert (part.status_code, part.content) == (206, whole.content[2:4])
-    assert client.get(path, headers={"Range": "bytes=99-"}).status_code == 416
-    assert client.get(path, headers={"If-None-Match": whole.headers["etag"]}).status_code == 304
-    assert client.get(path, headers={"If-Range": '"other"', "Range": "bytes=2-3"}).status_code == 200
-
-
-def test_all_results_in_one_archive(client: TestClient) -> None:
-    job = submit(client)
-    wait(client, job)
-    answer = client.get(f"/v1/jobs/{job}/results.zip")
-    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
-        assert archive.testzip() is None
-        assert archive.read("trajectory.tum") == b"0 []\n"
-
-
-def test_only_plain_files_of_the_output_become_results(client: TestClient) -> None:
-    job = submit(client, b"tricks")
-    wait(client, job)
-    names = [each["name"] for each in client.get(f"/v1/jobs/{job}/results").json()["assets"]]
-    assert names == ["metrics.json", "trajectory.tum"]
-    for name in ("passwd", "..%2f..%2fhsloc.db", "%2e%2e%2fhsloc.db", "%2e%2e", "sub"):
-        assert client.get(f"/v1/jobs/{job}/results/{name}").status_code in (404, 422)
 
 
 def test_the_same_idempotency_key_makes_one_job(client: TestClient) -> None:
@@ -124,23 +76,6 @@ def test_run_again_keeps_the_seed_and_takes_changes(client: TestClient) -> None:
     changed = client.post(f"/v1/jobs/{job}/rerun", json={"seed": 6, "matcher": "icp"}).json()
     assert (changed["request"]["seed"], changed["request"]["matcher"]) == (6, "icp")
     assert wait(client, changed["id"])["state"] == "succeeded"
-
-
-def test_delete_removes_results_but_not_what_is_active(client: TestClient) -> None:
-    job = submit(client)
-    wait(client, job)
-    storage = client.app.state.context.storage  # type: ignore[attr-defined]
-    assert len(list(storage.results.iterdir())) == 1
-    assert client.delete(f"/v1/jobs/{job}").status_code == 204
-    assert client.get(f"/v1/jobs/{job}").status_code == 404
-    assert list(storage.results.iterdir()) == []
-    active = submit(client, b"slow 30")
-    file = client.get(f"/v1/jobs/{active}").json()["request"]["log"]
-    assert client.delete(f"/v1/jobs/{active}").status_code == 409
-    assert client.delete(f"/v1/files/{file}").status_code == 409
-    client.post(f"/v1/jobs/{active}/cancel")
-    wait(client, active)
-    assert client.delete(f"/v1/files/{file}").status_code == 204
 
 
 def test_the_queue_has_an_end(make_client: Callable[..., TestClient]) -> None:

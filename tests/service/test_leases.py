@@ -13,7 +13,8 @@ from service.files import Files
 from service.jobs import Jobs
 from service.leases import Leases
 from service.principal import ANYBODY, Principal
-from service.storage import Asset, Storage
+from service.results import Asset
+from service.storage import Storage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

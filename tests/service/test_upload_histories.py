@@ -128,7 +128,8 @@ class Histories(RuleBasedStateMachine):
     @rule(later=st.floats(0.0, 2.0 * TTL))
     def time_goes_by(self, later: float) -> None:
         now = time.time() + later
-        Housekeeping(self.context.database, self.context.storage, self.context.settings).tidy(now)
+        context = self.context
+        Housekeeping(context.database, context.storage, context.settings, context.stores).tidy(now)
         for model in self.models.values():
             if not model.whole and now > model.born + TTL + 60.0:
                 model.gone = True

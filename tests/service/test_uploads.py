@@ -98,6 +98,37 @@ def test_quota_and_reservation(make_client: Callable[..., TestClient]) -> None:
     begin(client, 300)
 
 
+def test_an_unfinished_upload_that_begins_anew_keeps_to_the_limits(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(max_upload_bytes=2000, tenant_bytes=3000)
+    ident = begin(client, 1500).rsplit("/", 1)[1]
+    refused = client.put(f"/v1/files/{ident}", content=bytes(2001))
+    assert (refused.status_code, refused.json()["code"]) == (413, "too_large")
+    other = begin(client, 1400)
+    full = client.put(f"/v1/files/{ident}", content=bytes(1601))
+    assert (full.status_code, full.json()["code"]) == (507, "no_space")
+    assert client.get(f"/v1/files/{ident}").json()["size"] == 1500  # as it was
+    assert client.put(f"/v1/files/{ident}", content=bytes(1600)).status_code == 201
+    assert offset(client, other) == 0
+
+
+def test_what_was_not_announced_counts_when_it_is_there(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(tenant_bytes=1000)
+    assert client.post("/v1/files", content=iter([bytes(500), bytes(400)])).status_code == 201
+    refused = client.post("/v1/files", content=iter([bytes(60), bytes(60)]))
+    assert (refused.status_code, refused.json()["code"]) == (507, "no_space")
+    assert [each["size"] for each in client.get("/v1/files").json()["files"]] == [900]
+    assert len(list(client.app.state.context.storage.uploads.iterdir())) == 1  # type: ignore[attr-defined]
+
+
+def test_pages_of_uploads(client: TestClient) -> None:
+    files = [upload(client, bytes([k])) for k in range(5)]
+    first = client.get("/v1/files", params={"limit": 3}).json()
+    rest = client.get("/v1/files", params={"limit": 3, "before": first["next"]}).json()
+    assert [each["id"] for each in first["files"] + rest["files"]] == files[::-1]
+    assert rest["next"] is None
+    assert client.get("/v1/files", params={"before": str(uuid.uuid4())}).status_code == 404
+
+
 def test_more_than_the_disk_has_is_refused_when_announced(client: TestClient) -> None:
     answer = client.post("/v1/tus", headers={**TUS, "Upload-Length": str(1 << 36)})
     free = client.get("/v1/info").json()["free_bytes"]
@@ -206,7 +237,7 @@ def test_an_unfinished_upload_expires(make_client: Callable[..., TestClient]) ->
     path, whole = begin(client, 10), upload(client)
     append(client, path, 0, b"12345")
     context = client.app.state.context  # type: ignore[attr-defined]
-    tidy = Housekeeping(context.database, context.storage, context.settings).tidy
+    tidy = Housekeeping(context.database, context.storage, context.settings, context.stores).tidy
     tidy(time.time())
     assert offset(client, path) == 5
     tidy(time.time() + 11.0)

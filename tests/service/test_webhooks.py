@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import http.client
 import json
+import shutil
+import socket
+import ssl
+import subprocess
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -17,6 +22,7 @@ from service import webhooks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from fastapi.testclient import TestClient
 
@@ -94,7 +100,12 @@ def test_given_up_after_some_attempts(make_client: Callable[..., TestClient], re
 
 @pytest.mark.parametrize(
     "host",
-    ["127.0.0.1", "localhost", "[::1]", "10.0.0.1", "169.254.169.254", "[::ffff:127.0.0.1]", "0.0.0.0", "2130706433"],
+    [
+        *("127.0.0.1", "localhost", "[::1]", "10.0.0.1", "169.254.169.254", "[::ffff:127.0.0.1]", "0.0.0.0"),
+        "2130706433",
+        # What a gateway makes an IPv4 address of: NAT64, 6to4, IPv4-compatible, Teredo.
+        *("[64:ff9b::7f00:1]", "[64:ff9b::a9fe:a9fe]", "[2002:a00:1::1]", "[::a00:1]", "[2001:0:7f00:1::]"),
+    ],
 )
 def test_private_addresses_are_refused(host: str) -> None:
     with pytest.raises(webhooks.ForbiddenAddress):
@@ -105,3 +116,49 @@ def test_other_schemes_and_user_names_are_refused() -> None:
     for url in ("file:///etc/passwd", "ftp://x/", "http://user:password@example.com/", "http://"):
         with pytest.raises(ValueError):
             webhooks.post(url, b"", {}, private=False)
+
+
+def test_a_receiver_that_answers_by_drips_is_cut_off() -> None:
+    """It would hold up everybody's webhooks: each byte is within the time-out of the line."""
+    stop = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def drip() -> None:
+            line, _ = listening.accept()
+            with line:
+                line.sendall(b"HTTP/1.1 ")
+                while not stop.wait(0.1):
+                    try:
+                        line.sendall(b" ")
+                    except OSError:
+                        return
+
+        thread = threading.Thread(target=drip)
+        thread.start()
+        begin = time.monotonic()
+        with pytest.raises((OSError, http.client.HTTPException)):
+            webhooks.post(f"http://127.0.0.1:{listening.getsockname()[1]}/", b"{}", {}, private=True, within_s=1.0)
+        assert 0.9 < time.monotonic() - begin < 4.0
+        stop.set()
+        thread.join()
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl to make a certificate with")
+def test_over_tls_to_whom_the_certificate_names(
+    receiver: Receiver, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    key, certificate = tmp_path / "key.pem", tmp_path / "cert.pem"
+    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=localhost"]
+    command += ["-addext", "subjectAltName=DNS:localhost", "-keyout", str(key), "-out", str(certificate)]
+    subprocess.run(command, check=True, capture_output=True)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    receiver.socket = context.wrap_socket(receiver.socket, server_side=True)
+    port = receiver.server_port
+    with pytest.raises(ssl.SSLCertVerificationError):
+        webhooks.post(f"https://localhost:{port}/", b"{}", {}, private=True)
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    assert webhooks.post(f"https://localhost:{port}/x", b"{}", {}, private=True) == 200
+    assert receiver.got[-1][1] == b"{}"
+    with pytest.raises(ssl.SSLCertVerificationError):
+        webhooks.post(f"https://127.0.0.1:{port}/", b"{}", {}, private=True)

@@ -1,0 +1,304 @@
+"""A store that refuses, hangs, loses bytes or dies half-way: accepted jobs are kept, and the API answers."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import threading
+import time
+import uuid
+import zipfile
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import fsspec
+import pytest
+from conftest import settings, submit, wait
+from fastapi.testclient import TestClient
+from fsspec.implementations.memory import MemoryFileSystem
+
+from service import patience
+from service.http import results_routes
+from service.http.app import create_app
+from service.waiting import Desk
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+
+class Faulty(MemoryFileSystem):
+    """Memory, with a fault that a test sets."""
+
+    protocol = "faulty"
+    store: ClassVar[dict[str, Any]] = {}
+    pseudo_dirs: ClassVar[list[str]] = [""]
+    fault = ""
+    puts = 0
+    release = threading.Event()
+
+    def _suffer(self) -> None:
+        if Faulty.fault == "refuse":
+            raise ConnectionError("the bucket does not answer")
+        if Faulty.fault == "forbid":
+            raise PermissionError("access denied")
+        if Faulty.fault == "hang":
+            Faulty.release.wait(60.0)
+
+    def put_file(self, lpath: str, rpath: str, *args: Any, **kwargs: Any) -> None:
+        self._suffer()
+        Faulty.puts += 1
+        if Faulty.fault == "second" and Faulty.puts > 1:
+            raise ConnectionError("the line broke")
+        super().put_file(lpath, rpath, *args, **kwargs)
+        if Faulty.fault == "truncate":
+            self.pipe_file(rpath, self.cat_file(rpath)[:-1])
+
+    def cat_file(self, path: str, start: int | None = None, end: int | None = None, **kwargs: Any) -> bytes:
+        self._suffer()
+        if Faulty.fault == "late" and start:
+            raise ConnectionError("the line broke")
+        content: bytes = super().cat_file(path, start, end, **kwargs)
+        return content[:-1] if Faulty.fault == "short" else content
+
+    def ls(self, *args: Any, **kwargs: Any) -> Any:
+        self._suffer()
+        return super().ls(*args, **kwargs)
+
+    def rm(self, *args: Any, **kwargs: Any) -> None:
+        self._suffer()
+        super().rm(*args, **kwargs)
+
+
+fsspec.register_implementation("faulty", Faulty, clobber=True)
+
+
+@pytest.fixture(autouse=True)
+def _fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(patience, "FIRST_WAIT_S", 0.05)
+    monkeypatch.setattr(patience, "LONGEST_WAIT_S", 0.2)
+    monkeypatch.setattr(Faulty, "store", {})
+    monkeypatch.setattr(Faulty, "pseudo_dirs", [""])
+    monkeypatch.setattr(Faulty, "fault", "")
+    monkeypatch.setattr(Faulty, "puts", 0)
+    monkeypatch.setattr(Faulty, "release", threading.Event())
+    yield
+    Faulty.fault = ""
+    Faulty.release.set()
+    for thread in threading.enumerate():
+        if thread.name == "store":
+            thread.join(10.0)  # what hung must not go on in the next test
+
+
+@pytest.fixture
+def url() -> str:
+    return f"faulty://{uuid.uuid4()}"
+
+
+@pytest.fixture
+def client(make_client: Callable[..., TestClient], url: str) -> TestClient:
+    return make_client(results_url=url, store_timeout_s=0.3)
+
+
+def stored(job: str) -> list[str]:
+    """The objects of a job."""
+    return [path.rsplit("/", 1)[1] for path in Faulty.store if job in path]
+
+
+def wait_for_store(client: TestClient, job: str) -> None:
+    """Until the job's process has ended, and its results are being stored."""
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        progress = client.get(f"/v1/jobs/{job}").json()["progress"]
+        if progress is not None and progress["phase"] == "store":
+            return
+        time.sleep(0.02)
+    raise AssertionError("the job does not wait for the store")
+
+
+def failures() -> float:
+    from service.http.metrics import REGISTRY
+
+    return REGISTRY.get_sample_value("hsloc_store_errors_total") or 0.0
+
+
+@pytest.mark.parametrize("fault", ["refuse", "forbid", "hang", "truncate", "second"])
+def test_a_job_waits_for_its_store_and_nothing_is_seen_before(client: TestClient, fault: str) -> None:
+    before = failures()
+    Faulty.fault = fault
+    job = submit(client, seed=3)
+    wait_for_store(client, job)
+    deadline = time.monotonic() + 10.0
+    while failures() < before + 2 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert failures() >= before + 2  # it was tried again
+    found = client.get(f"/v1/jobs/{job}").json()
+    assert (found["state"], found["attempt"]) == ("running", 1)
+    assert found["heartbeat_age_s"] < 2.0
+    assert client.get(f"/v1/jobs/{job}/results").json()["code"] == "no_results"
+    assert client.get(f"/v1/jobs/{job}/results/metrics.json").status_code == 409
+    Faulty.fault = ""
+    Faulty.release.set()
+    ended = wait(client, job)
+    assert (ended["state"], ended["attempt"]) == ("succeeded", 1)  # what was computed was not thrown away
+    assert client.get(f"/v1/jobs/{job}/results/trajectory.tum").content == b"3 []\n"
+
+
+def test_a_store_that_hangs_holds_up_nobody_else(client: TestClient) -> None:
+    job = submit(client)
+    wait(client, job)
+    Faulty.fault = "hang"
+    answers: list[Any] = []
+
+    def read(path: str) -> None:
+        answers.append(client.get(f"/v1/jobs/{job}/{path}"))
+
+    paths = ["results/metrics.json", "results.zip"]
+    readers = [threading.Thread(target=read, args=(paths[k % 2],)) for k in range(100)]
+    begin = time.monotonic()
+    for reader in readers:
+        reader.start()
+    slowest = 0.0
+    for _ in range(20):
+        at = time.monotonic()
+        assert client.get(f"/v1/jobs/{job}/results").status_code == 200
+        slowest = max(slowest, time.monotonic() - at)
+    for reader in readers:
+        reader.join(20.0)
+    assert slowest < 2.0
+    assert time.monotonic() - begin < 20.0
+    assert {answer.status_code for answer in answers} == {503}
+    assert len(answers) == 100
+    assert answers[0].json()["code"] == "store"
+    assert int(answers[0].headers["retry-after"]) >= 1
+    Faulty.fault = ""
+    Faulty.release.set()
+    deadline = time.monotonic() + 5.0
+    while (answer := client.get(f"/v1/jobs/{job}/results/metrics.json")).status_code != 200:
+        assert time.monotonic() < deadline  # the calls that hung have ended, and there is room for others
+        time.sleep(0.05)
+    assert answer.content == b"{}\n"
+
+
+def test_many_readers_wait_for_their_turn() -> None:
+    busy = most = 0
+    lock = threading.Lock()
+
+    def read(k: int) -> int:
+        nonlocal busy, most
+        with lock:
+            busy += 1
+            most = max(most, busy)
+        time.sleep(0.03)
+        with lock:
+            busy -= 1
+        return k
+
+    async def all_at_once() -> list[int]:
+        desk = Desk(timeout_s=5.0, most=3)
+        return list(await asyncio.gather(*(desk.ask(functools.partial(read, k)) for k in range(30))))
+
+    assert asyncio.run(all_at_once()) == list(range(30))
+    assert most == 3
+
+
+@pytest.mark.parametrize("fault", ["refuse", "short"])
+def test_reading_fails_with_a_type(client: TestClient, fault: str) -> None:
+    job = submit(client)
+    wait(client, job)
+    Faulty.fault = fault
+    for path in ("results/metrics.json", "results.zip"):
+        answer = client.get(f"/v1/jobs/{job}/{path}")
+        assert (answer.status_code, answer.json()["code"]) == (503, "store")
+    assert client.get(f"/v1/jobs/{job}/results").status_code == 200  # the manifest is ours
+    tag = client.get(f"/v1/jobs/{job}/results").json()["assets"][0]["sha256"]
+    same = client.get(f"/v1/jobs/{job}/results/metrics.json", headers={"If-None-Match": f'"{tag}"'})
+    assert same.status_code == 304
+
+
+def test_an_object_that_is_gone_is_not_found(client: TestClient) -> None:
+    job = submit(client)
+    wait(client, job)
+    Faulty.store.clear()
+    assert client.get(f"/v1/jobs/{job}/results/metrics.json").status_code == 404
+    assert client.get(f"/v1/jobs/{job}/results.zip").status_code == 404
+
+
+def test_a_line_that_breaks_in_the_middle_is_no_whole_answer(client: TestClient, monkeypatch: Any) -> None:
+    job = submit(client)
+    wait(client, job)
+    monkeypatch.setattr(results_routes, "BLOCK", 2)
+    Faulty.fault = "late"
+    part = client.get(f"/v1/jobs/{job}/results/trajectory.tum")
+    assert len(part.content) < int(part.headers["content-length"])
+    with pytest.raises(zipfile.BadZipFile):
+        zipfile.ZipFile(BytesIO(client.get(f"/v1/jobs/{job}/results.zip").content))
+
+
+def test_a_job_that_waits_for_its_store_can_be_cancelled(client: TestClient) -> None:
+    Faulty.fault = "hang"
+    job = submit(client)
+    wait_for_store(client, job)
+    client.post(f"/v1/jobs/{job}/cancel")
+    assert wait(client, job, 3.0)["state"] == "cancelled"
+    Faulty.fault = ""
+    Faulty.release.set()
+    assert wait(client, submit(client))["state"] == "succeeded"  # the slot is free
+
+
+def test_a_server_that_is_stopped_meanwhile_keeps_the_job(tmp_path: Path, url: str) -> None:
+    chosen = settings(tmp_path, results_url=url, store_timeout_s=0.3)
+    Faulty.fault = "hang"
+    with TestClient(create_app(chosen)) as client:
+        job = submit(client, seed=5)
+        wait_for_store(client, job)
+        begin = time.monotonic()
+    assert time.monotonic() - begin < 5.0  # the call that hangs does not hold the server
+    Faulty.fault = ""
+    with TestClient(create_app(chosen)) as client:
+        ended = wait(client, job)
+        assert (ended["state"], ended["attempt"]) == ("succeeded", 2)
+        assert client.get(f"/v1/jobs/{job}/results/trajectory.tum").content == b"5 []\n"
+
+
+def test_what_a_broken_attempt_left_behind_is_swept(client: TestClient) -> None:
+    Faulty.fault = "second"
+    job = submit(client)
+    wait_for_store(client, job)
+    deadline = time.monotonic() + 5.0
+    while not stored(job) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert stored(job) == ["metrics.json"]
+    client.post(f"/v1/jobs/{job}/cancel")
+    wait(client, job)
+    Faulty.fault = ""
+    context = client.app.state.context  # type: ignore[attr-defined]
+    assert context.removals.sweep(context.stores.current) == 1
+    assert stored(job) == []
+
+
+def test_deleting_does_not_wait_for_the_store_and_is_not_forgotten(client: TestClient) -> None:
+    job = submit(client)
+    wait(client, job)
+    Faulty.fault = "hang"
+    begin = time.monotonic()
+    assert client.delete(f"/v1/jobs/{job}").status_code == 204
+    assert time.monotonic() - begin < 2.0
+    assert client.get(f"/v1/jobs/{job}/results/metrics.json").status_code == 404
+    removals = client.app.state.context.removals  # type: ignore[attr-defined]
+    assert removals.clear() == 0
+    assert len(stored(job)) == 2
+    Faulty.fault = ""
+    assert removals.clear() == 1
+    assert stored(job) == []
+    assert removals.clear() == 0
+    Faulty.release.set()
+
+
+def test_a_server_starts_while_its_store_is_away(tmp_path: Path, url: str) -> None:
+    Faulty.fault = "hang"
+    begin = time.monotonic()
+    with TestClient(create_app(settings(tmp_path, results_url=url, store_timeout_s=0.3))) as client:
+        assert client.get("/readyz").status_code == 200
+        assert time.monotonic() - begin < 5.0
+        assert client.post("/v1/files", content=b"ok").status_code == 201

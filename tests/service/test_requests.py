@@ -1,0 +1,273 @@
+"""Several logs, relations and maps that are extended: the bytes of `hsloc replay`, and who may name what."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from conftest import submit, upload, wait
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from service.housekeeping import Housekeeping
+from service.principal import Tokens
+from service.results import Asset
+from service.settings import Settings
+from service.tables import AssetRow
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from fastapi.testclient import TestClient
+
+OFFICE = Path(__file__).parents[2] / "recordings" / "office.mcap"
+REAL = Settings().worker_command
+
+
+def cut(path: Path, at_s: float, end_s: float, folder: Path) -> list[Path]:
+    """The messages of a log before and after a moment, as two files of one name."""
+    paths = [folder / part / "run.mcap" for part in ("first", "second")]
+    for k, target in enumerate(paths):
+        target.parent.mkdir()
+        with path.open("rb") as source, target.open("wb") as file:
+            writer = Writer(file)
+            writer.start(profile="ros2")
+            known: dict[int, int] = {}
+            origin: int | None = None
+            for schema, channel, message in make_reader(source).iter_messages():
+                origin = message.log_time if origin is None else origin
+                late = message.log_time - origin >= at_s * 1e9
+                if late != bool(k) or message.log_time - origin > end_s * 1e9:
+                    continue
+                if channel.id not in known:
+                    assert schema is not None
+                    ident = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    known[channel.id] = writer.register_channel(
+                        channel.topic, channel.message_encoding, ident, channel.metadata
+                    )
+                writer.add_message(known[channel.id], message.log_time, message.data, message.publish_time)
+            writer.finish()
+    return paths
+
+
+def replay(folder: Path, *arguments: str) -> None:
+    command = [sys.executable, "-m", "hsloc.cli.main", "replay", "-q", *arguments]
+    subprocess.run(command, check=True, cwd=folder)
+
+
+def same_bytes(client: TestClient, job: str, folder: Path) -> None:
+    ended = wait(client, job, 120.0)
+    assert ended["state"] == "succeeded", ended
+    names = {each["name"] for each in client.get(f"/v1/jobs/{job}/results").json()["assets"]}
+    theirs = {path.name for path in folder.iterdir()}
+    assert theirs <= names
+    for name in sorted(theirs - {"timings.json"}):
+        assert client.get(f"/v1/jobs/{job}/results/{name}").content == (folder / name).read_bytes(), name
+
+
+def test_two_parts_then_an_extended_map_scored_by_relations(
+    make_client: Callable[..., TestClient], tmp_path: Path
+) -> None:
+    client = make_client(worker_command=REAL, job_memory_bytes=4 << 30)
+    parts = cut(OFFICE, 6.0, 14.0, tmp_path)
+    logs = [upload(client, path.read_bytes(), "run.mcap") for path in parts]
+    drawn = client.post("/v1/jobs", json={"logs": logs, "mode": "slam"})
+    assert drawn.status_code == 201, drawn.text
+    assert drawn.json()["log"] == "run.mcap, run.mcap"
+    replay(tmp_path, *map(str, parts), "--mode", "slam", "--out", "drawn")
+    same_bytes(client, drawn.json()["id"], tmp_path / "drawn")
+    lines = (tmp_path / "drawn" / "trajectory.tum").read_text().splitlines()
+    assert float(lines[-1].split()[0]) - float(lines[0].split()[0]) > 12.0  # both parts are in it
+
+    # The next run begins where these end, and is scored by what the first one found for the time of both.
+    first, last = lines[-40].split(), lines[-1].split()
+    (tmp_path / "some.relations").write_text(f"{first[0]} {last[0]} 0.1 0 0 0 0 0\n# seen by nobody\n1 2 0 0 0 0 0 0\n")
+    more = {
+        "log": upload(client, OFFICE.read_bytes(), "office.mcap"),
+        "relations": upload(client, (tmp_path / "some.relations").read_bytes(), "some.relations"),
+        "resume": drawn.json()["id"],
+        "read": {"start_s": 8.0, "end_s": 18.0},
+        "config": {"graph_mapper": {"passes": 2}},  # not those of the map: there is a warning that names its file
+    }
+    (tmp_path / "other.yaml").write_text("graph_mapper: {passes: 2}\n")
+    extended = client.post("/v1/jobs", json=more)
+    assert extended.status_code == 201, extended.text
+    replay(
+        tmp_path / "drawn",
+        *(str(OFFICE), "--resume", "map.npz", "--relations", str(tmp_path / "some.relations")),
+        *("--start", "8", "--end", "18", "--config", str(tmp_path / "other.yaml")),
+        *("--out", str(tmp_path / "extended")),
+    )
+    same_bytes(client, extended.json()["id"], tmp_path / "extended")
+    metrics = json.loads((tmp_path / "extended" / "metrics.json").read_text())
+    assert metrics["run"]["map"] == "map.npz, extended"
+    assert any(text.startswith("map.npz: drawn with other parameters") for text in metrics["warnings"])
+    assert (metrics["relations"]["matched"], metrics["relations"]["unmatched"]) == (1, 1)
+    summary = client.get(f"/v1/jobs/{extended.json()['id']}").json()["summary"]
+    assert summary["metrics"]["relations"] == metrics["relations"]
+
+
+def test_relations_that_cannot_be_read_are_told_at_once(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(worker_command=REAL, job_memory_bytes=4 << 30)
+    log = upload(client, OFFICE.read_bytes(), "office.mcap")
+    relations = upload(client, b"1 2 0 0 0 0 0 0\n1 2 3\n", "wrong.relations")
+    job = client.post("/v1/jobs", json={"log": log, "relations": relations}).json()["id"]
+    ended = wait(client, job, 60.0)
+    assert (ended["state"], ended["reason"]) == ("failed", "invalid_input")
+    assert ended["message"].startswith("wrong.relations, line 2: 3 columns")
+    phases = [row["phase"] for row in events(client, job) if "phase" in row]
+    assert "replay" not in phases
+
+
+def events(client: TestClient, job: str) -> list[dict[str, Any]]:
+    text = client.get(f"/v1/jobs/{job}/events", params={"follow": "false"}).text
+    return [json.loads(line[6:]) for line in text.splitlines() if line.startswith("data: ")]
+
+
+def mapped(client: TestClient, content: bytes = b"ok") -> str:
+    """A job of the fake worker that left a map."""
+    job = submit(client, content)
+    wait(client, job)
+    context = client.app.state.context  # type: ignore[attr-defined]
+    content = b"a saved map"
+    folder = context.storage.results / f"{job}.1"
+    (folder / "map.npz").write_bytes(content)
+    digest = hashlib.sha256(content).hexdigest()
+    with context.database.write() as session:
+        asset = Asset("map.npz", len(content), digest, "application/octet-stream")
+        session.add(AssetRow(job_id=job, **{name: getattr(asset, name) for name in asset.__slots__}))
+    return job
+
+
+def refused(client: TestClient, status: int, **request: Any) -> str:
+    answer = client.post("/v1/jobs", json=request)
+    assert answer.status_code == status, answer.text
+    return str(answer.json()["message"])
+
+
+def test_only_a_job_that_drew_a_map_can_be_extended(client: TestClient) -> None:
+    log = upload(client)
+    localised = submit(client)
+    wait(client, localised)
+    assert "drew no map" in refused(client, 422, log=log, resume=localised)
+    failed = submit(client, b"bad-input")
+    wait(client, failed)
+    assert "is failed; only a succeeded one" in refused(client, 422, log=log, resume=failed)
+    running = submit(client, b"slow 30")
+    wait(client, running, states=("running",))
+    assert "is running; only a succeeded one" in refused(client, 422, log=log, resume=running)
+    client.post(f"/v1/jobs/{running}/cancel")
+    assert "there is no job" in refused(client, 404, log=log, resume=str(uuid.uuid4()))
+    assert "resume" in refused(client, 422, log=log, resume="latest")
+
+
+def test_what_contradicts_itself_is_refused(client: TestClient) -> None:
+    log, other, job = upload(client), upload(client), mapped(client)
+    assert "either `log`, or `logs`" in refused(client, 422)
+    assert "either `log`, or `logs`" in refused(client, 422, log=log, logs=[log, other])
+    assert "named twice" in refused(client, 422, logs=[log, log])
+    assert "logs" in refused(client, 422, logs=[])
+    assert "leave out one" in refused(client, 422, log=log, resume=job, mode="localise")
+    assert "leave out one" in refused(client, 422, log=log, resume=job, map={"yaml": log, "image": other})
+    assert "graph mapper" in refused(client, 422, log=log, resume=job, mapper="point")
+    again = submit(client, b"ok", resume=job)
+    answer = client.post(f"/v1/jobs/{again}/rerun", json={"mode": "localise"})
+    assert (answer.status_code, answer.json()["code"]) == (422, "invalid")
+    assert "leave out one" in answer.json()["message"]
+
+
+def test_what_belongs_to_others_is_not_there(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(require_token=True)
+    tokens = Tokens(client.app.state.context.database)  # type: ignore[attr-defined]
+    owner, other = tokens.issue("one"), tokens.issue("two")
+    client.headers["Authorization"] = f"Bearer {owner}"
+    theirs, job = upload(client), mapped(client)
+    client.headers["Authorization"] = f"Bearer {other}"
+    mine = upload(client)
+    assert "there is no job" in refused(client, 404, log=mine, resume=job)
+    assert "relations: there is no file" in refused(client, 404, log=mine, relations=theirs)
+    assert "log: there is no file" in refused(client, 404, logs=[mine, theirs])
+    assert client.get("/v1/jobs").json()["jobs"] == []
+    begun = client.post("/v1/tus", headers={"Tus-Resumable": "1.0.0", "Upload-Length": "9"}).headers["location"]
+    assert "not finished" in refused(client, 409, log=mine, relations=begun.rsplit("/", 1)[1])
+
+
+def test_what_an_active_job_reads_stays(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(retention_s=100.0)
+    drawn = mapped(client)
+    logs, relations = [upload(client, b"slow 30"), upload(client)], upload(client)
+    job = client.post("/v1/jobs", json={"logs": logs, "relations": relations, "resume": drawn}).json()["id"]
+    wait(client, job, states=("running",))
+    for file in (*logs, relations):
+        assert client.delete(f"/v1/files/{file}").json()["code"] == "in_use"
+    assert client.delete(f"/v1/jobs/{drawn}").json()["code"] == "in_use"
+    context = client.app.state.context  # type: ignore[attr-defined]
+    Housekeeping(context.database, context.storage, context.settings, context.stores).tidy(time.time() + 150.0)
+    assert client.get(f"/v1/jobs/{drawn}/results/map.npz").content == b"a saved map"
+    assert len(client.get("/v1/files").json()["files"]) == 3
+    client.post(f"/v1/jobs/{job}/cancel")
+    wait(client, job)
+    assert client.delete(f"/v1/jobs/{drawn}").status_code == 204
+    assert client.post(f"/v1/jobs/{job}/rerun").status_code == 404  # what it extended is gone
+
+
+def test_a_saved_map_that_was_changed_is_not_extended(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(max_attempts=2)
+    drawn = mapped(client)
+    storage = client.app.state.context.storage  # type: ignore[attr-defined]
+    for content in (b"another map", b"short"):
+        (storage.results / f"{drawn}.1" / "map.npz").write_bytes(content)
+        ended = wait(client, submit(client, b"ok", resume=drawn))
+        assert (ended["state"], ended["reason"]) == ("crashed", "attempts")
+        assert "map.npz" in ended["message"]
+
+
+def test_the_folder_of_an_attempt_has_what_was_asked_for(client: TestClient) -> None:
+    drawn = mapped(client)
+    logs = [upload(client, b"slow 30", "run.mcap"), upload(client, b"part two", "run.mcap")]
+    relations = upload(client, b"1 2 0 0 0 0 0 0", "../a relation")
+    job = client.post("/v1/jobs", json={"logs": logs, "relations": relations, "resume": drawn}).json()["id"]
+    wait(client, job, states=("running",))
+    storage = client.app.state.context.storage  # type: ignore[attr-defined]
+    folder = storage.work / f"{job}.1"
+    found = json.loads((folder / "job.json").read_text())
+    assert found["logs"] == ["input/run.mcap", "input-2/run.mcap"]
+    assert [(folder / place).read_bytes() for place in found["logs"]] == [b"slow 30", b"part two"]
+    assert (folder / "relations" / found["relations"]).read_bytes() == b"1 2 0 0 0 0 0 0"
+    assert (folder / found["resume"]).read_bytes() == b"a saved map"
+    client.post(f"/v1/jobs/{job}/cancel")
+    wait(client, job)
+
+
+def test_all_of_it_in_one_request(client: TestClient) -> None:
+    drawn = mapped(client)
+    files = [("log", ("a.mcap", b"ok")), ("log", ("b.mcap", b"ok")), ("relations", ("r", b"1 2 0 0 0 0 0 0"))]
+    answer = client.post("/v1/run", files=files, data={"request": json.dumps({"resume": drawn})})
+    assert answer.status_code == 201, answer.text
+    job = answer.json()
+    assert (job["log"], job["request"]["resume"]) == ("a.mcap, b.mcap", drawn)
+    assert len(job["request"]["logs"]) == 2
+    assert wait(client, job["id"])["state"] == "succeeded"
+    for data in ({"request": '{"logs": []}'}, {"request": '{"resume": "x"}'}, {"request": "[]"}):
+        assert client.post("/v1/run", files=files, data=data).status_code == 422
+    twice = [*files, ("relations", ("r", b"x"))]
+    assert client.post("/v1/run", files=twice).status_code == 422
+    assert len(client.get("/v1/files").json()["files"]) == 4  # none of the refused
+
+
+def test_every_example_of_the_api_fits_it(client: TestClient) -> None:
+    from service.http.schemas import JobRequest
+
+    schema = client.get("/openapi.json").json()["components"]["schemas"]["JobRequest"]
+    assert len(schema["examples"]) >= 2
+    named = set()
+    for example in schema["examples"]:
+        JobRequest.model_validate(example)
+        named |= set(example)
+    assert {"log", "logs", "relations", "resume"} <= named

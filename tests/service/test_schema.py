@@ -1,0 +1,170 @@
+"""The database's schema: an old one is brought up to date, a foreign one is refused in one line."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from conftest import settings, wait
+from fastapi.testclient import TestClient
+
+from service import database, migrations
+from service.database import Database
+from service.http.app import create_app
+from service.settings import SettingsError
+from service.tables import SCHEMA_VERSION
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sqlalchemy import Connection
+
+FIRST = Path(__file__).parent / "schema1.sql"
+"""The database of hsloc at schema 1 after kill -9: jobs that succeeded, failed, were cancelled, ran and waited."""
+TOKEN = "a-token-of-the-first-schema"
+SUCCEEDED, RUNNING = "4f84f19f-5047-474b-b70d-c4002dffa5c1", "19135a1f-f827-49d2-8d2f-f7bc60789f8e"
+FAILED, WAITING = "3205ac20-a13a-4d97-a473-8c533be90110", "d54c5710-86d2-4cac-b0bb-de504833e55d"
+
+
+def version(path: Path) -> int:
+    with sqlite3.connect(path) as connection:
+        found = int(connection.execute("PRAGMA user_version").fetchone()[0])
+    connection.close()
+    return found
+
+
+def columns(path: Path, table: str) -> set[str]:
+    with sqlite3.connect(path) as connection:
+        found = {row[1] for row in connection.execute(f"PRAGMA table_info({table})")}
+    connection.close()
+    return found
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    """A data folder as schema 1 left it; the path of its database."""
+    data = tmp_path / "data"
+    for folder in ("uploads", f"results/{SUCCEEDED}.1", f"work/{RUNNING}.1"):
+        (data / folder).mkdir(parents=True)
+    path = data / "hsloc.db"
+    with sqlite3.connect(path) as connection:
+        connection.executescript(FIRST.read_text())
+        for row in connection.execute("SELECT id FROM file WHERE state = 'complete'").fetchall():
+            (data / "uploads" / row[0]).write_bytes(b"ok")
+    connection.close()
+    (data / "results" / f"{SUCCEEDED}.1" / "metrics.json").write_text("{}\n")
+    (data / "results" / f"{SUCCEEDED}.1" / "trajectory.tum").write_text("7 []\n")
+    return path
+
+
+@pytest.fixture
+def client(old: Path, tmp_path: Path) -> Iterator[TestClient]:
+    assert version(old) == 1
+    with TestClient(create_app(settings(tmp_path)), raise_server_exceptions=False) as made:
+        made.headers["Authorization"] = f"Bearer {TOKEN}"
+        yield made
+
+
+def test_a_data_folder_of_schema_1_opens_with_everything_in_it(client: TestClient, old: Path) -> None:
+    assert version(old) == SCHEMA_VERSION
+    jobs = {job["id"]: job for job in client.get("/v1/jobs").json()["jobs"]}
+    assert len(jobs) == 5
+    assert (jobs[SUCCEEDED]["state"], jobs[SUCCEEDED]["request"]["seed"]) == ("succeeded", 7)
+    assert jobs[FAILED]["message"] == "run.mcap: no scan"
+    answer = client.get(f"/v1/jobs/{SUCCEEDED}/results/trajectory.tum")
+    assert answer.content == b"7 []\n"
+    assert answer.headers["etag"] == '"bb3bf29c29d099503eba622ca7c090b8d1b77d3f785141830ba9c199c8086e5b"'
+    assert len(client.get(f"/v1/jobs/{SUCCEEDED}/events").text.split("\n\n")) > 3
+    # What ran and what waited when the old server died runs now.
+    assert wait(client, RUNNING)["state"] == "succeeded"
+    assert wait(client, WAITING)["state"] == "succeeded"
+    assert len(client.get("/v1/files").json()["files"]) == 5
+
+
+def test_what_was_asked_of_schema_1_may_be_asked_again(client: TestClient) -> None:
+    log = client.get(f"/v1/jobs/{SUCCEEDED}").json()["request"]["log"]
+    body = {"log": log, "seed": 7, "webhook": "http://127.0.0.1:9/x"}
+    same = client.post("/v1/jobs", json=body, headers={"Idempotency-Key": "office-1"})
+    assert (same.status_code, same.json()["id"]) == (200, SUCCEEDED)
+    again = client.post(f"/v1/jobs/{SUCCEEDED}/rerun", json={"seed": 9})
+    assert again.status_code == 201, again.text
+    assert wait(client, again.json()["id"])["state"] == "succeeded"
+    assert client.delete(f"/v1/jobs/{SUCCEEDED}").status_code == 204
+
+
+def test_the_version_is_stored_and_opening_again_changes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "hsloc.db"
+    for _ in range(2):
+        Database(path).close()
+        assert version(path) == SCHEMA_VERSION
+    assert {"store", "resume_of"} <= columns(path, "job")
+
+
+def test_old_and_new_databases_have_the_same_columns(old: Path, tmp_path: Path) -> None:
+    Database(old).close()
+    Database(tmp_path / "new.db").close()
+    for table in migrations.Base.metadata.tables:
+        assert columns(old, table) == columns(tmp_path / "new.db", table) != set()
+
+
+def test_a_migration_that_fails_leaves_the_old_database(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = columns(old, "job")
+    monkeypatch.setitem(migrations.STEPS, 1, (*migrations.STEPS[1], "ALTER TABLE absent ADD COLUMN x"))
+    with pytest.raises(SettingsError, match="cannot be used as database: no such table: absent"):
+        Database(old)
+    assert (version(old), columns(old, "job")) == (1, before)
+    monkeypatch.undo()
+    Database(old).close()
+    assert version(old) == SCHEMA_VERSION
+
+
+@pytest.mark.parametrize(
+    ("statements", "said"),
+    [
+        (f"PRAGMA user_version={SCHEMA_VERSION + 1}", f"newer hsloc .schema {SCHEMA_VERSION + 1}, known up to"),
+        (
+            "; ".join((*migrations.STEPS[1], "DROP TABLE asset", "PRAGMA user_version=2")),
+            "table asset has no column job_id, media_type, name",
+        ),
+        ("PRAGMA user_version=2", "table job has no column resume_of, store"),
+        ("PRAGMA user_version=0", "not a database of hsloc"),
+    ],
+)
+def test_a_database_that_does_not_fit_is_refused_in_one_line(old: Path, statements: str, said: str) -> None:
+    with sqlite3.connect(old) as connection:
+        connection.executescript(statements)
+    connection.close()
+    before = old.read_bytes()
+    with pytest.raises(SettingsError, match=said) as error:
+        Database(old)
+    assert "\n" not in str(error.value)
+    assert str(old) in str(error.value)
+    assert old.read_bytes()[100:] == before[100:]  # but for the header, where the journal's mode is noted
+
+
+def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "hsloc.db"
+    path.write_bytes(b"not a database, but long enough to be read as one" * 100)
+    with pytest.raises(SettingsError, match="file is not a database"):
+        Database(path)
+
+
+def test_a_full_disk_does_not_keep_a_server_from_starting(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ballast = old.with_name("ballast")
+    ballast.write_bytes(bytes(10))
+
+    def migrate(connection: Connection, path: Path) -> tuple[int, int]:
+        if ballast.exists() or full:
+            raise sqlite3.OperationalError("database or disk is full")
+        return migrations.migrate(connection, path)
+
+    full = False
+    monkeypatch.setattr(database, "migrate", migrate)
+    Database(old).close()
+    assert not ballast.exists()
+    assert version(old) == SCHEMA_VERSION
+    full = True
+    with pytest.raises(SettingsError, match="disk is full; make room on its disk"):
+        Database(old)

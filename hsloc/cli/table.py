@@ -47,7 +47,7 @@ def summary_lines(metrics: Mapping[str, Any], timings: Mapping[str, Any], folder
     lines.append(f"scans: {scans['used']} of {scans['total']} matched" + (f" ({others})" if others else ""))
     if residuals["points"]:
         lines.append(
-            f"scan to map: median {residuals['median']:.3f} m, 95 % below {residuals['p95']:.3f} m, "
+            f"scan to map: median {_distance(residuals['median'])}, 95 % {_distance(residuals['p95'], 'below ')}, "
             f"{100 * residuals['within_0.15_m']:.1f} % of the points within 0.15 m of a wall"
         )
     if "mapping" in metrics["map"]:
@@ -67,3 +67,8 @@ def summary_lines(metrics: Mapping[str, Any], timings: Mapping[str, Any], folder
 def _row(label: str, statistics: Mapping[str, Any]) -> str:
     cells = "".join(f"{'-':>10}" if statistics[name] is None else f"{statistics[name]:>10.4f}" for name in _COLUMNS)
     return f"{label:<16}{cells}"
+
+
+def _distance(metres: float, before: str = "") -> str:
+    """A distance of returns from the nearest occupied cell; none is what lies in one."""
+    return "in the wall's cell" if metres == 0.0 else f"{before}{metres:.3f} m"

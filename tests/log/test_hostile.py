@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import time
 from typing import TYPE_CHECKING
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 ALL = ReadOptions(require_scan=False, require_odometry=False)
 LIMIT_S = 2.0
+EXAMPLES = int(os.environ.get("HSLOC_MUTATIONS", "400"))
+"""HSLOC_MUTATIONS=10000 pytest tests/log/test_hostile.py -k mutated: for the long run."""
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +66,7 @@ def read_all(path: Path) -> int:
     return count
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=EXAMPLES, deadline=None)
 @given(data=st.data())
 def test_mutated_bytes(tmp_path_factory: pytest.TempPathFactory, seeds: list[bytes], data: st.DataObject) -> None:
     content = bytearray(data.draw(st.sampled_from(seeds)))
@@ -90,7 +93,7 @@ def test_mutated_bytes(tmp_path_factory: pytest.TempPathFactory, seeds: list[byt
 
 
 @settings(max_examples=100, deadline=None)
-@given(body=st.binary(max_size=400), seed=st.integers(0, 4))
+@given(body=st.binary(max_size=400), seed=st.integers(0, 7))
 def test_random_records_behind_a_good_start(
     tmp_path_factory: pytest.TempPathFactory, seeds: list[bytes], body: bytes, seed: int
 ) -> None:

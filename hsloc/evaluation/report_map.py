@@ -11,6 +11,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from matplotlib.transforms import Affine2D
 
 from hsloc.evaluation import report_style as style
+from hsloc.evaluation.report_paths import joined, pieces_of
 from hsloc.evaluation.report_picture import line_width, picture_of
 from hsloc.model import Status
 
@@ -36,7 +37,7 @@ def draw_map(
         _draw_grid(axes, grid, pixels)
     if points is not None and len(points):
         axes.plot(points[:, 0], points[:, 1], ".", color=style.WALL, markersize=2.2, label="map points", zorder=2)
-    _draw_paths(axes, data, line_width(data, extent))
+    _draw_paths(axes, data, line_width(data, extent), max(extent.width, extent.height) / pixels)
     _draw_marks(axes, data)
     _draw_ends(axes, data, extent)
     _draw_scale_bar(axes, extent)
@@ -69,20 +70,26 @@ def _draw_grid(axes: Axes, grid: OccupancyGrid, pixels: float) -> None:
     image.set_transform(Affine2D().rotate(pose.theta).translate(pose.x, pose.y) + axes.transData)
 
 
-def _draw_paths(axes: Axes, data: ReportData, width: float) -> None:
-    """In the order of the legend; what lies over what is said by zorder."""
+def _draw_paths(axes: Axes, data: ReportData, width: float, pixel: float) -> None:
+    """In the order of the legend; what lies over what is said by zorder. Nothing finer than half a pixel is drawn."""
+
+    def seen(xy: Floats) -> Floats:
+        return joined(pieces_of(xy, 0.5 * pixel))
+
     if len(data.path):
-        known = np.where(data.believed[:, None], data.path, np.nan)
+        known = seen(np.where(data.believed[:, None], data.path, np.nan))
         axes.plot(*known.T, color=style.BLUE, linewidth=width, label="trajectory", zorder=5, solid_capstyle="round")
     if data.reference is not None and len(data.reference):
-        axes.plot(*data.reference.T, color="black", linewidth=1.0, linestyle=(0, (5, 3)), label="reference", zorder=6)
+        axes.plot(
+            *seen(data.reference).T, color="black", linewidth=1.0, linestyle=(0, (5, 3)), label="reference", zorder=6
+        )
     if data.odometry is not None and len(data.odometry):
         axes.plot(
-            *data.odometry.T, color=style.VERMILLION, alpha=0.7, linewidth=1.3, linestyle=(0, (1, 1.2)),
+            *seen(data.odometry).T, color=style.VERMILLION, alpha=0.7, linewidth=1.3, linestyle=(0, (1, 1.2)),
             label="odometry alone", zorder=3,
         )  # fmt: skip
     if not data.believed.all():
-        guessed = np.where(data.believed[:, None], np.nan, data.path)
+        guessed = seen(np.where(data.believed[:, None], np.nan, data.path))
         axes.plot(
             *guessed.T, color=style.PURPLE, linewidth=2.0, linestyle=(0, (0.8, 1.2)), label="pose unknown", zorder=4
         )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
+from hsloc.evaluation.report_paths import pieces_of
 from hsloc.evaluation.report_picture import line_width, picture_of, shown_extent
 from hsloc.model import Status
 
@@ -88,34 +89,10 @@ def _local(xy: Floats, middle: Floats) -> Floats:
 def _path(xy: Floats, middle: Floats, finest: float) -> str:
     """A path's `d`; NaN breaks the line, and points nearer than `finest` to the last one drawn are left out."""
     local = _local(xy, middle)
-    while True:
-        pieces, count = _thinned(local, finest), 0
-        count = sum(len(piece) for piece in pieces)
-        if count <= MOST_VERTICES:
-            break
+    while sum(map(len, pieces := pieces_of(local, finest))) > MOST_VERTICES:
         finest *= 2.0
     decimals = max(0, ceil(-np.log10(finest)) + 1)
-    return "".join("M" + "L".join(f"{x:.{decimals}f} {y:.{decimals}f}" for x, y in piece) for piece in pieces if piece)
-
-
-def _thinned(local: Floats, finest: float) -> list[list[tuple[float, float]]]:
-    pieces: list[list[tuple[float, float]]] = [[]]
-    last: tuple[float, float] | None = None
-    for x, y in local.tolist():
-        if x != x or y != y:
-            if last is not None and pieces[-1][-1] != last:
-                pieces[-1].append(last)
-            if pieces[-1]:
-                pieces.append([])
-            last = None
-            continue
-        last = (x, y)
-        piece = pieces[-1]
-        if not piece or abs(x - piece[-1][0]) + abs(y - piece[-1][1]) >= finest:
-            piece.append(last)
-    if last is not None and pieces[-1][-1] != last:
-        pieces[-1].append(last)
-    return pieces
+    return "".join("M" + "L".join(f"{x:.{decimals}f} {y:.{decimals}f}" for x, y in piece.tolist()) for piece in pieces)
 
 
 def _image(grid: OccupancyGrid, middle: Floats) -> str:

@@ -153,7 +153,7 @@ def _single_rows(data: ReportData, metrics: Mapping[str, object]) -> list[Row]:
     if median is not None and p95 is not None:
         # The distance is that from cell to cell: what falls into a wall's own cell is no nearer than that.
         near = ["in the cell" if value == 0.0 else format_length(value) for value in (median, p95)]
-        rows.append(Row("scan to map, median, 95 %", (", ".join(near),)))
+        rows.append(Row("scan to map, median, 95 %", (", ".join(dict.fromkeys(near)),)))
     thickness = number(metrics, "map", "crispness", "wall_thickness_median")
     if thickness is not None:
         rows.append(Row("wall thickness", (format_length(thickness),)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import signal
 import time
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
 from hsloc.replay.engine import replay
+from hsloc.replay.garbage import seldom_collected
 from hsloc.replay.recording import Recording
 from hsloc.replay.references import read_reference
 from hsloc.replay.saved_maps import load_grid, load_state, maps_beside, unread_maps
@@ -48,8 +48,6 @@ if TYPE_CHECKING:
 
 _LONGEST_S = 1e9
 """No log takes so many seconds; in nanoseconds it fits 64 bits."""
-_COLLECT_AFTER = 50_000
-"""Objects more than before, until the garbage collector looks at the youngest; Python's own limit is 700."""
 MODES = ("auto", "localise", "slam")
 
 
@@ -178,7 +176,7 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
     first = None if spec.no_odometry else first_odometry(log.events())
     prepared = time.perf_counter()
     recording = Recording()
-    with _seldom_collected():
+    with seldom_collected():
         for event, estimate in replay(
             _reported(log, _events(spec, log), recording, progress), estimator, deskew=spec.read.deskew, first=first
         ):
@@ -293,18 +291,6 @@ def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:
     window = Window(likelihood.T_map_field, 0.1, 0.1, 0.1)
     with _uninterrupted():
         matcher.match(points, likelihood, window, np.random.default_rng(0))
-
-
-@contextmanager
-def _seldom_collected() -> Iterator[None]:
-    """Have the garbage collector look seldom: events are many, and none of them is part of a cycle."""
-    before = gc.get_threshold()
-    if before[0] > 0:  # 0 is never, by somebody's own will.
-        gc.set_threshold(max(before[0], _COLLECT_AFTER), *before[1:])
-    try:
-        yield
-    finally:
-        gc.set_threshold(*before)
 
 
 @contextmanager

@@ -91,18 +91,7 @@ def _values(log: Log, losses: Losses, counts: dict[str, int]) -> dict[str, Any]:
         "frames": {"odom": summary.odom_frame, "base": summary.base_frame, "laser": summary.laser_frame},
         "laser_pose": {"x": pose.x, "y": pose.y, "yaw": pose.theta, "upside_down": summary.laser_flipped},
         "extrinsics": summary.extrinsics,
-        "lasers": [
-            {
-                "topic": laser.topic,
-                "frame": laser.frame,
-                "x": laser.T_base_laser.x,
-                "y": laser.T_base_laser.y,
-                "yaw": laser.T_base_laser.theta,
-                "upside_down": laser.flipped,
-                "extrinsics": laser.extrinsics,
-            }
-            for laser in summary.lasers
-        ],
+        "lasers": [laser.to_dict() for laser in summary.lasers],
         "order": summary.order,
         "map": None
         if grid is None

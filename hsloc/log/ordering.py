@@ -88,7 +88,9 @@ class TopicClock:
 
     def runs_on(self, stamps: Sequence[int]) -> bool:
         """Whether the topic's next messages are what they should be: `effective` would leave all of them alone."""
-        before = stamps[0] if self.last_ns is None else max(self.last_ns, self._last_own_ns)
+        if self._suspect:  # The next one decides whether the clock was set.
+            return False
+        before = stamps[0] if self.last_ns is None else self.last_ns
         steps: list[int] = list(map(sub, stamps, (before, *stamps[:-1])))
         return min(steps) >= 0 and max(steps) <= JUMP_NS
 
@@ -96,7 +98,6 @@ class TopicClock:
         """Take messages of which `runs_on` is true."""
         self.last_ns = self._last_own_ns = stamps[-1]
         self._last_log_ns = log_times[-1]
-        self._suspect = False
 
 
 class Arrivals(NamedTuple):
@@ -135,14 +136,13 @@ class Reorder:
         self._clocks = clocks
         self._losses = losses
         self._pending: list[Keyed] = []
-        self._before_reset: list[Keyed] = []
+        self._before_resets: list[list[Keyed]] = []
         self._number = 0
         self._released_ns: int | None = None
 
     def take(self, arrivals: Sequence[Arrivals], size: int) -> None:
-        """Take the events of a batch of `size` messages; topic by topic where all their stamps run on quietly."""
-        calm = len({id(run.clock) for run in arrivals}) == len(arrivals)
-        if not (calm and all(run.clock.runs_on(run.stamps) for run in arrivals)):
+        """Take the events of a batch of `size` messages, each clock at most once; topic by topic where all run on."""
+        if not all(run.clock.runs_on(run.stamps) for run in arrivals):
             for _, clock, log_time, event in one_by_one(arrivals):
                 self.push(clock, event, log_time)
             return
@@ -160,7 +160,7 @@ class Reorder:
         last = clock.last_ns
         effective, raised = clock.effective(event.stamp_ns, log_time_ns)
         if last is not None and effective < last:  # The clock was set back: what waits is of the time before.
-            self._before_reset += sorted(self._pending)
+            self._before_resets.append(sorted(self._pending))
             self._pending = []
         kind = 0 if raised else clock.kind
         self._pending.append((effective, raised, kind, self._number, 0, log_time_ns, event))
@@ -182,9 +182,9 @@ class Reorder:
         yield from self._released(released)
 
     def _reset(self) -> Iterator[tuple[int, Event]]:
-        """What was left of the time before a clock was set back."""
-        if self._before_reset:
-            released, self._before_reset = self._before_reset, []
+        """What was left of the times before a clock was set back, each of which has its own order."""
+        before, self._before_resets = self._before_resets, []
+        for released in before:
             yield from self._released(released)
             self._released_ns = None
 

@@ -28,6 +28,8 @@ SAME_TIME_NS = 2 * NANOSECONDS
 """So long may two parts of one run overlap: a recorder that splits its files writes some messages late."""
 SHORT_PART = 0.5
 """Or so large a part of the shorter one, whichever is less."""
+EDGE_NS = NANOSECONDS // 2
+"""But so long they always may: the last part may be hardly more than what was written late."""
 GAP_NS = 60 * NANOSECONDS
 """A longer time without scan or odometry between two parts is told."""
 POSSIBLE_SPEED, LIKELY_SPEED = 15.0, 2.0
@@ -88,7 +90,7 @@ def _span(container: Container, topics: Sequence[str]) -> PartSummary | None:
 def _refuse_same_time(a: PartSummary, b: PartSummary, topic: str) -> None:
     overlap = min(a.end_ns, b.end_ns) - max(a.start_ns, b.start_ns)
     shorter = min(a.end_ns - a.start_ns, b.end_ns - b.start_ns)
-    if shorter > 0 and overlap > min(SAME_TIME_NS, SHORT_PART * shorter):
+    if overlap > max(EDGE_NS, min(SAME_TIME_NS, SHORT_PART * shorter)):
         raise LogError(
             f"{a.path} and {b.path}: both hold {topic} of the same {overlap / NANOSECONDS:.1f} s, so they are not "
             f"parts of one run; run each by itself, or all with `hsloc sweep {a.path} {b.path}`"

@@ -21,7 +21,7 @@ from hsloc.log.topics import TF, of_type
 from hsloc.model import Pose2
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from hsloc.log.container import Container, RawMessage
     from hsloc.log.feeds import Feed
@@ -58,8 +58,8 @@ class RosSource:
         for batch in _batches(self._stream(routes, losses)):
             arrivals = [
                 found
-                for key, places in _by_channel(batch)
-                for found in routes[key].read([batch[place] for place in places], places, losses)
+                for route, places in _by_route(batch, routes)
+                for found in route.read([batch[place] for place in places], places, losses)
             ]
             if self.summary.order == "log":
                 for _, clock, log_time, event in one_by_one(arrivals):
@@ -111,12 +111,15 @@ class RosSource:
         return feeds
 
     def _routes(self, feeds: Sequence[Feed]) -> dict[int, Route]:
-        """The route of each channel that is read, by its key in `_stream`."""
-        return {
-            _key(number, channel.id): Route(feed, self._survey.decoder(number, channel), channel)
-            for feed in feeds
-            for number, channel in self._survey.channels(feed.topic, feed.typename)
-        }
+        """The route of each channel that is read, by its key in `_stream`: one for all channels of a feed."""
+        routes: dict[int, Route] = {}
+        for feed in feeds:
+            channels = {
+                _key(number, channel.id): (channel, self._survey.decoder(number, channel))
+                for number, channel in self._survey.channels(feed.topic, feed.typename)
+            }
+            routes.update(dict.fromkeys(channels, Route(feed, channels)))
+        return routes
 
     def _stream(self, routes: Iterable[int], losses: Losses) -> Iterator[list[RawMessage]]:
         """Raw messages of all files in the order of the log, their channels told by keys."""
@@ -184,11 +187,11 @@ def _batches(runs: Iterator[list[RawMessage]]) -> Iterator[list[RawMessage]]:
             size = _BATCH
 
 
-def _by_channel(batch: list[RawMessage]) -> Iterable[tuple[int, list[int]]]:
-    """The places in a batch of the messages of each channel."""
-    found: defaultdict[int, list[int]] = defaultdict(list)
+def _by_route(batch: list[RawMessage], routes: Mapping[int, Route]) -> Iterable[tuple[Route, list[int]]]:
+    """The places in a batch of the messages of each route, in the order of the log."""
+    found: defaultdict[Route, list[int]] = defaultdict(list)
     for place, message in enumerate(batch):
-        found[message[2]].append(place)
+        found[routes[message[2]]].append(place)
     return found.items()
 
 

@@ -89,6 +89,18 @@ class LaserSummary:
     flipped: bool
     extrinsics: str
 
+    def to_dict(self) -> dict[str, object]:
+        """The same for JSON: x, y in metres, yaw in radians."""
+        return {
+            "topic": self.topic,
+            "frame": self.frame,
+            "x": self.T_base_laser.x,
+            "y": self.T_base_laser.y,
+            "yaw": self.T_base_laser.theta,
+            "upside_down": self.flipped,
+            "extrinsics": self.extrinsics,
+        }
+
 
 @dataclass(frozen=True, slots=True)
 class PartSummary:

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
     Paired = Odometry | PairedScan | Truth
 
-_PART = 0.6
-"""Scans at most this part of the slowest laser's period apart are one cloud: of two lasers that turn equally fast, each
-scan has one of the other within half of it, and stamps jitter."""
+_JITTER = 0.1
+"""Scans of n lasers are one cloud within (n - 1) / n of the slowest one's period and this part of it: where all turn
+equally fast, (n - 1) / n of it always hold a scan of each, and stamps jitter."""
 _USUAL_NS, _LONGEST_NS = 100_000_000, 400_000_000
 """A laser's period before it is known, and at most."""
 _SILENT_NS = 500_000_000
@@ -42,31 +42,32 @@ def clouds(events: Iterable[Paired]) -> Iterator[Paired]:
 
 
 class _Lasers:
-    """When each laser was heard of last, and which scans wait to be carried."""
+    """When each laser was heard of and matched last, and which scans wait to be carried."""
 
     def __init__(self) -> None:
         self._last: dict[str, int] = {}
         self._period: dict[str, int] = {}
         self._held: dict[str, PairedScan] = {}
-        self._carried_ns = 0
+        self._matched: dict[str, int] = {}
 
     def joined(self, paired: PairedScan) -> PairedScan:
         """The scan, held or with its companions."""
         frame, stamp = paired.scan.frame_id, paired.scan.stamp_ns
         self._hear(frame, stamp)
         if len(self._last) == 1:
-            self._carried_ns = stamp
+            self._matched[frame] = stamp
             return paired
-        reach = round(_PART * max(self._period.values()))
+        lasers, period = len(self._last), max(self._period.values())
+        reach = round(((lasers - 1) / lasers + _JITTER) * period)
         self._held = {name: held for name, held in self._held.items() if abs(stamp - held.scan.stamp_ns) <= reach}
         self._held.pop(frame, None)
         awake = {name for name, last in self._last.items() if abs(stamp - last) < _SILENT_NS}
-        # Lasers whose scans never come near each other must not wait for ever.
-        starved = abs(stamp - self._carried_ns) > 2 * max(self._period.values())
+        # A laser whose scans never come near the others' must not wait for ever.
+        starved = abs(stamp - self._matched[frame]) > 2 * period
         if awake <= {frame, *self._held} or starved:
             companions = tuple(self._held.values())
+            self._matched |= dict.fromkeys((frame, *self._held), stamp)
             self._held = {}
-            self._carried_ns = stamp
             return replace(paired, companions=companions)
         self._held[frame] = paired
         return replace(paired, is_held=True)
@@ -75,6 +76,7 @@ class _Lasers:
         last = self._last.get(frame)
         if last is None:
             self._period[frame] = _USUAL_NS
+            self._matched[frame] = stamp_ns
         elif 0 < stamp_ns - last < _LONGEST_NS:
             self._period[frame] = stamp_ns - last
         self._last[frame] = stamp_ns

@@ -16,6 +16,15 @@ from hsloc.evaluation.metrics import compare
 from hsloc.log.summary import LaserSummary
 from hsloc.model.trajectory import Trajectory
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from hsloc.replay.residuals import Residuals
+    from hsloc.replay.run import Result
+
 _MOST = 0.5
 """Of the sparser trajectory's poses, the part that must have a partner nearby."""
 
@@ -25,16 +34,6 @@ class Pairing(TypedDict, total=False):
 
     association: AssociationMethod
     max_difference_s: float
-
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from hsloc.replay.residuals import Residuals
-    from hsloc.replay.run import Result
 
 
 def metrics(
@@ -113,18 +112,7 @@ def _read(result: Result) -> dict[str, object]:
         "first_stamp_ns": int(stamps.min()) if len(stamps) else None,
         "odometry": None if result.spec.no_odometry else summary.odom_topic,
         "reference": None if result.reference is None else truth,
-        "lasers": [
-            {
-                "topic": laser.topic,
-                "frame": laser.frame,
-                "x": laser.T_base_laser.x,
-                "y": laser.T_base_laser.y,
-                "yaw": laser.T_base_laser.theta,
-                "upside_down": laser.flipped,
-                "extrinsics": laser.extrinsics,
-            }
-            for laser in lasers
-        ],
+        "lasers": [laser.to_dict() for laser in lasers],
     }
 
 

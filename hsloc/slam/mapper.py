@@ -95,6 +95,7 @@ class Mapper:
         covariance = predict_covariance(self._covariance, self._T_map_key, found.motion, found.covariance)
         T_odom_base = event.T_odom_base if self._parameters.use_odometry else found.pose
         local = self._keep_companions(event, found) if found.is_keyscan else found
+        self._held = []  # No later scan carries them: a robot that waits for hours has no keyscans.
         self._track.add(T_odom_base, is_scan=True, is_key=found.is_keyscan)
         if found.is_keyscan:
             self._covariance, self._T_map_key = covariance, found.pose
@@ -122,7 +123,6 @@ class Mapper:
         From scan to scan of one cloud the odometry tells the motion: each keeps its own beams, for each has an origin.
         """
         numbers = {id(held.scan): number for number, held in self._held}
-        self._held = []
         motion, covariance = found.motion, found.covariance
         previous = event
         for companion in event.companions:

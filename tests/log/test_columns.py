@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_builders import SECOND, START, write_run
+from mcap.writer import Writer
 
 from hsloc.log import columns, decode, definitions, encode, ros_source, route
 from hsloc.log.reader import open_log
@@ -120,6 +121,31 @@ def test_events_do_not_depend_on_how_they_are_batched(
     monkeypatch.setattr(ros_source, "_BATCH", batch)
     monkeypatch.setattr(route, "_FEW", 0 if by_columns else 10**9)
     assert events_of(path) == expected
+
+
+@pytest.mark.parametrize("batch", [1, 1024])
+def test_transforms_of_two_publishers_are_taken_in_the_order_of_the_log(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, batch: int
+) -> None:
+    """As in a ROS 1 bag, where each publisher of /tf has a channel: the localiser's, and the base's."""
+    monkeypatch.setattr(ros_source, "_BATCH", batch)
+    definition = definitions.definition_text(definitions.TF_MESSAGE).encode()
+    path = tmp_path / "two.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="test")
+        schema = writer.register_schema(definitions.TF_MESSAGE, "ros2msg", definition)
+        base, localiser = (writer.register_channel("/tf", "cdr", schema) for _ in range(2))
+        for n in range(200):
+            stamp = START + n * SECOND // 50
+            if n % 10 == 0:
+                moved = encode.transforms(stamp, [("map", "odom", Pose2(float(n), 0.0, 0.0))])
+                writer.add_message(localiser, stamp, moved, stamp)
+            writer.add_message(base, stamp + 1, encode.transforms(stamp, [("odom", "base_link", Pose2())]), stamp + 1)
+        writer.finish()  # type: ignore[no-untyped-call]
+    log = open_log(path, ReadOptions(require_scan=False, truth_topic="/tf"))
+    found = [event.T_map_base.x for event in log.events() if isinstance(event, Truth)]
+    assert found == [float(n - n % 10) for n in range(200)]
 
 
 def test_unusable_and_unstamped_poses_among_usable_ones(tmp_path: Path) -> None:

@@ -99,6 +99,29 @@ def test_a_clock_that_is_set_goes_on_from_there(step: int) -> None:
         assert [s for k, s in found if k == kind] == [s for k, s, _ in arrivals if k == kind]
 
 
+@pytest.mark.parametrize("size", [1, 7, 10, 11, 400])
+def test_a_clock_that_is_set_is_counted_alike_however_messages_are_batched(size: int) -> None:
+    # With batches of 10 and 11 the first stamp that jumps is a batch's last one.
+    arrivals = [("odometry", START + n * 20 * MS + (n >= 109) * 3600 * SECOND, START + n * 20 * MS) for n in range(300)]
+    found, losses = order(arrivals, size)
+    assert found == [(kind, stamp) for kind, stamp, _ in arrivals]
+    assert losses == Losses(stamp_jumps={"/odom": 2})
+
+
+def test_a_clock_that_is_set_back_twice_at_once_makes_nothing_late() -> None:
+    # As where a log is played again and again: each round is in order, and none is late for the one before.
+    rounds = [0] * 100 + [1] * 20 + [2] * 100
+    arrivals = [
+        (kind, START + n * 20 * MS - turn * 60 * SECOND, START + n * 20 * MS)
+        for n, turn in enumerate(rounds)
+        for kind in ("odometry", "scan")
+    ]
+    found, losses = order(arrivals, 180)  # both in the second batch
+    assert len(found) == len(arrivals)
+    assert losses.stamp_jumps == {"/odom": 4, "/scan": 4}
+    assert losses.late_messages == 0
+
+
 def test_a_gap_in_the_recording_is_no_jump() -> None:
     arrivals = [("odometry", START + n * SECOND + (n > 5) * 1000 * SECOND, 0) for n in range(10)]
     arrivals = [(kind, stamp, stamp + 5) for kind, stamp, _ in arrivals]

@@ -96,6 +96,13 @@ def test_the_edges_of_parts_may_overlap_but_little_more(tmp_path: Path) -> None:
         open_log([early, brief])
 
 
+def test_a_last_part_that_is_hardly_more_than_an_edge_is_one(tmp_path: Path) -> None:
+    source = RECORDINGS / "hall.mcap"
+    early = copy(source, tmp_path / "early.mcap", lambda topic, seconds: seconds < 20.0)
+    last = copy(source, tmp_path / "last.mcap", lambda topic, seconds: 19.6 <= seconds < 20.1)
+    assert open_log([last, early]).summary.warnings == ()
+
+
 def test_without_odometry_the_scans_tell(tmp_path: Path) -> None:
     only_scans = [
         copy(RECORDINGS / f"{name}.mcap", tmp_path / f"{name}.mcap", lambda topic, seconds: topic == "/scan")

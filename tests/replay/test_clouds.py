@@ -51,6 +51,21 @@ def test_the_last_of_each_pair_carries_the_other(offset):
         assert any(entry[0] == other and entry[2] == "held" and abs(entry[1] - ms) <= 60 for entry in found)
 
 
+@pytest.mark.parametrize("frames", ["abc", "abcd"])
+def test_lasers_that_take_turns_are_one_cloud_each_period(frames):
+    found = told(*(scan(frame, 100 * k + 100 / len(frames) * at) for k in range(20) for at, frame in enumerate(frames)))
+    carried = [entry for entry in found[2 * len(frames) :] if entry[2] != "held"]
+    assert all({frame, *companions} == {*frames} for frame, _, companions in carried)
+    assert len(carried) == 18
+
+
+def test_two_slow_lasers_that_never_meet_are_both_heard():
+    scans = [entry for k in range(20) for entry in (scan("a", 450 * k), scan("b", 450 * k + 110))]
+    frames = [frame for frame, _, what in told(*scans) if what != "held"]
+    assert frames.count("a") == 20
+    assert frames.count("b") >= 18
+
+
 def test_the_slower_of_two_lasers_sets_the_pace():
     fast, slow = [("a", 25 * k) for k in range(20)], [("b", 10 + 100 * k) for k in range(5)]
     found = told(*(scan(*entry) for entry in sorted(fast + slow, key=lambda entry: entry[1])))

@@ -1,3 +1,4 @@
+import weakref
 from dataclasses import replace
 from itertools import pairwise
 
@@ -5,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import ape_rmse, drive
 
-from hsloc.model import IDENTITY, Odometry, PairedScan, Pose2, Status
+from hsloc.model import IDENTITY, Odometry, PairedScan, Pose2, Scan, Status
 from hsloc.slam.mapper import GraphMapperParameters, Mapper
 
 
@@ -159,3 +160,24 @@ def test_next_to_nothing_is_no_error(office, what):
     assert len(result.scan_poses) + len(result.odometry_poses) == len(told)
     assert result.quality.keyscans == (1 if what in ("one scan", "standing") else 0)
     assert result.quality.to_dict()["loop_max"] is None
+
+
+def test_a_robot_that_waits_keeps_no_scan_of_its_lasers():
+    """Scans that are held for the next laser's are let go when that has come, keyscan or not."""
+    mapper = Mapper(GraphMapperParameters(), np.random.default_rng(0))
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 181)
+    ranges = (2.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))).astype(np.float32)
+    held = []
+    for n in range(6):
+        first, second = (
+            PairedScan(
+                Scan(n * 10**8 + k, ranges.copy(), -np.pi / 2, np.pi / 180.0, 0.05, 20.0, frame_id="ab"[k]), IDENTITY
+            )
+            for k in range(2)
+        )
+        held.append(weakref.ref(first.scan.ranges))
+        mapper.update(replace(first, is_held=True))
+        mapper.update(replace(second, companions=(first,)))
+    del first, second
+    # The first pair makes the first keyscans, which are kept in a shorter form.
+    assert [reference() is None for reference in held] == [True] * 6

@@ -92,8 +92,8 @@ def _refuse_same_time(a: PartSummary, b: PartSummary, topic: str) -> None:
     shorter = min(a.end_ns - a.start_ns, b.end_ns - b.start_ns)
     if overlap > max(EDGE_NS, min(SAME_TIME_NS, SHORT_PART * shorter)):
         raise LogError(
-            f"{a.path} and {b.path}: both hold {topic} of the same {overlap / NANOSECONDS:.1f} s, so they are not "
-            f"parts of one run; run each by itself, or all with `hsloc sweep {a.path} {b.path}`"
+            f"{a.path} and {b.path}: both hold {topic} of the same {overlap / NANOSECONDS:.1f} s, so they are of two "
+            f"drives, or of two recorders of one; run each by itself, or all with `hsloc sweep {a.path} {b.path}`"
         )
 
 
@@ -134,14 +134,13 @@ def _jump(a: PartSummary, end: _Edge, b: PartSummary, begin: _Edge) -> list[str]
     # Where the edges overlap, too, the robot was at either end of so much time.
     seconds = abs(begin.log_time_ns - end.log_time_ns) / NANOSECONDS
     way = hypot(begin.pose.x - end.pose.x, begin.pose.y - end.pose.y)
+    if hypot(begin.pose.x, begin.pose.y) < _RESET and hypot(end.pose.x, end.pose.y) > _AWAY:
+        return [f"the odometry begins anew with {b.path}: if that is another drive, run each by itself"]
     what = f"the odometry is {way:.1f} m away when {b.path} goes on, {seconds:.1f} s from the end of {a.path}"
     if way > POSSIBLE_JUMP + POSSIBLE_SPEED * seconds:
         raise LogError(
             f"{what}, so they are not parts of one run; run each by itself, or all with `hsloc sweep {a.path} {b.path}`"
         )
-    reset = hypot(begin.pose.x, begin.pose.y) < _RESET and hypot(end.pose.x, end.pose.y) > _AWAY
-    if reset:
-        return [f"the odometry begins anew with {b.path}: if that is another drive, run each by itself"]
     if way > LIKELY_JUMP + LIKELY_SPEED * seconds:
         return [f"{what}: if that is another drive, run each by itself"]
     return []

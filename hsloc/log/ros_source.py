@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 _CHANNELS = 1 << 32
 """More channels than a file can have."""
 _FIRST_BATCH = 16
+_CUT_BATCH = 64
+"""Where the end of a log is left out: what is damaged there is not looked at."""
 _BATCH = 1024
 """Messages that are decoded together."""
 
@@ -55,7 +57,8 @@ class RosSource:
         feeds = self._feeds(losses)
         reorder = Reorder([clock for feed in feeds for clock in feed.clocks], losses)
         routes = self._routes(feeds)
-        for batch in _batches(self._stream(routes, losses)):
+        size = _BATCH if self._survey.options.end_s is None else _CUT_BATCH
+        for batch in _batches(self._stream(routes, losses), size):
             arrivals = [
                 found
                 for route, places in _by_route(batch, routes)
@@ -172,19 +175,19 @@ def _keyed(container: Container, number: int, channels: Sequence[int], losses: L
 
 
 def _runs(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
-    while run := list(islice(messages, _BATCH)):
+    while run := list(islice(messages, _CUT_BATCH)):
         yield run
 
 
-def _batches(runs: Iterator[list[RawMessage]]) -> Iterator[list[RawMessage]]:
+def _batches(runs: Iterator[list[RawMessage]], most: int) -> Iterator[list[RawMessage]]:
     """Messages in short lists; a very short one first, for those who want to see the beginning alone."""
-    size = _FIRST_BATCH
+    size = min(_FIRST_BATCH, most)
     for run in runs:
         at = 0
         while at < len(run):
             yield run[at : at + size]
             at += size
-            size = _BATCH
+            size = most
 
 
 def _by_route(batch: list[RawMessage], routes: Mapping[int, Route]) -> Iterable[tuple[Route, list[int]]]:

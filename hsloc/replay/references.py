@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
     Stamped = tuple[int, Pose2]
 
+_OF_FILES = (".tum", ".csv", ".txt", ".gz", ".mcap", ".bag", ".db3")
+"""Names of topics do not end like this: who writes it means a file."""
 _ANY = ReadOptions(require_scan=False, require_odometry=False)
 
 
@@ -50,16 +52,18 @@ def read_reference(text: str, logs: Sequence[Path] = ()) -> Trajectory:
 
 def _split(text: str) -> tuple[Path | None, str | None]:
     """(file, topic): either may be missing."""
-    if Path(text).exists():
+    if text and Path(text).exists():
         return Path(text), None
     at = text.find(":")
     while at > 0:
         if Path(text[:at]).exists():
             return Path(text[:at]), text[at + 1 :]
         at = text.find(":", at + 1)
-    if text in TF_NAMES or text.startswith("/"):
+    if (text in TF_NAMES or text.startswith("/")) and Path(text).suffix not in _OF_FILES:
         return None, text
-    raise EvaluationError(f"{text}: no such file; a reference is a TUM or CSV file, a LOG, LOG:TOPIC, or a topic")
+    raise EvaluationError(
+        f"{text or repr(text)}: no such file; a reference is a TUM or CSV file, a LOG, LOG:TOPIC, or a topic"
+    )
 
 
 def _of_log(text: str, logs: Sequence[Path], topic: str | None) -> Trajectory:

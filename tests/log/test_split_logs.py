@@ -173,3 +173,18 @@ def test_latched_topics_that_are_repeated_in_each_part_say_nothing_of_its_time(t
     log = open_log([late, early])
     assert log.summary.warnings == ()
     assert [part.path for part in log.summary.parts] == [early, late]
+
+
+def test_odometry_that_begins_anew_far_away_is_a_driver_that_was_started_again(tmp_path: Path) -> None:
+    parts = []
+    for number, begin in enumerate((50.0, 0.0)):
+        parts.append(tmp_path / f"{number}.mcap")
+        with LogWriter(parts[-1]) as log:
+            for n in range(30):
+                stamp = START + (30 * number + n) * SECOND // 10
+                log.odometry(stamp, Pose2(begin + n / 10.0, 0.0, 0.0))
+                log.scan(make_scan(stamp, n))
+    warnings = open_log(parts).summary.warnings
+    assert [line for line in warnings if "odometry" in line] == [
+        f"the odometry begins anew with {parts[1]}: if that is another drive, run each by itself"
+    ]

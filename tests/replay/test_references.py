@@ -140,3 +140,9 @@ def test_a_csv_whose_quaternions_begin_with_w_is_refused(tmp_path):
         read_tum(path)
     path.write_text("t,x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,0,1\n")
     assert read_tum(path).poses.tolist() == [[2.0, 3.0, 0.0]]
+
+
+@pytest.mark.parametrize("text", ["/typo.tum", "/no/such/run.mcap", ""])
+def test_a_file_that_is_not_there_is_not_taken_for_a_topic(text: str) -> None:
+    with pytest.raises(EvaluationError, match="no such file; a reference is"):
+        read_reference(text, [HALL])

@@ -29,11 +29,16 @@ _MIN_POINTS = 30
 class ConvergenceSample:
     """Takes the believed scans of a run with their poses; about `SCANS` of them are searched for anew."""
 
-    def __init__(self, grid: OccupancyGrid, matcher: Matcher, sigma: float, scans: int) -> None:
-        """Nothing is sampled for a matcher that does not search (ICP), or on a map without walls."""
+    def __init__(
+        self, grid: OccupancyGrid, likelihood: LikelihoodField | None, matcher: Matcher, sigma: float, scans: int
+    ) -> None:
+        """The map's field is made where it is not given: of a large map it takes seconds.
+
+        Nothing is sampled for a matcher that does not search (ICP), or on a map without walls.
+        """
         usable = isinstance(matcher, HarmonySearch) and grid.occupied().any()
         self._matcher = replace(matcher, restarts=1) if usable and isinstance(matcher, HarmonySearch) else None
-        self._field = LikelihoodField.from_grid(grid, sigma) if usable else None
+        self._field = (likelihood or LikelihoodField.from_grid(grid, sigma)) if usable else None
         self._every = max(scans // SCANS, 1)
         self._seen = -1
         self._rng = np.random.default_rng(0)

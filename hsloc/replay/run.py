@@ -126,7 +126,7 @@ class Result:
 
     `trajectory` has one pose for each odometry message; where there are none, one for each scan. `localised` says
     which of them are believed. `grid` is the map that was used, or, in `mode` "slam", the one that was drawn; then
-    `true_grid` is the one that the log carries, if any.
+    `true_grid` is the one that the log carries, if any. `likelihood` is the field that was matched on, of a given map.
     """
 
     spec: RunSpec
@@ -144,6 +144,7 @@ class Result:
     mode: str = "localise"
     mapping: MappingResult | None = None
     true_grid: OccupancyGrid | None = None
+    likelihood: LikelihoodField | None = None
 
     @property
     def follows_scans(self) -> bool:
@@ -170,9 +171,12 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
     if localise:
         start, doubts = find_start(spec, log, _must(grid))
         warnings = (*warnings, *doubts)
-        estimator: Estimator = _localiser(spec, _must(grid), start)
+        likelihood = LikelihoodField.from_grid(
+            _must(grid), spec.config.likelihood_field.sigma, spec.config.likelihood_field.margin
+        )
+        estimator: Estimator = _localiser(spec, _must(grid), likelihood, start)
     else:
-        estimator = _mapper(spec, state)
+        likelihood, estimator = None, _mapper(spec, state)
     first = None if spec.no_odometry else first_odometry(log.events())
     prepared = time.perf_counter()
     recording = Recording()
@@ -214,6 +218,7 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
         mode="localise" if localise else "slam",
         mapping=mapping,
         true_grid=true_grid,
+        likelihood=likelihood,
     )
 
 
@@ -275,11 +280,10 @@ def _mapper(spec: RunSpec, state: MapState | None) -> Mapper | PointMapper:
     return Mapper(spec.mapping(), np.random.default_rng(spec.seed), resume)
 
 
-def _localiser(spec: RunSpec, grid: OccupancyGrid, start: Pose2 | None) -> Estimator:
+def _localiser(spec: RunSpec, grid: OccupancyGrid, likelihood: LikelihoodField, start: Pose2 | None) -> Estimator:
     from hsloc.localisation.localiser import Localiser
 
     config = spec.config
-    likelihood = LikelihoodField.from_grid(grid, config.likelihood_field.sigma, config.likelihood_field.margin)
     rng = np.random.default_rng(spec.seed)
     _warm_up(config.make_matcher(), likelihood)
     return Localiser(grid, likelihood, config.make_matcher(), config.localiser, rng, start)

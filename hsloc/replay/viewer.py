@@ -50,7 +50,11 @@ def write_recording(result: Result, path: Path, progress: Callable[[float], None
     check = MountingCheck(result.grid, len(result.diagnostics), len(result.summary.lasers))
     config = result.spec.config
     sample = ConvergenceSample(
-        result.grid, config.make_matcher(), config.likelihood_field.sigma, len(result.diagnostics)
+        result.grid,
+        result.likelihood,
+        config.make_matcher(),
+        config.likelihood_field.sigma,
+        len(result.diagnostics),
     )
     places = _Places(result)
     mountings: set[str] = set()

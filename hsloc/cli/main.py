@@ -8,9 +8,12 @@ stand inside `run`, so that `hsloc --help` answers at once.
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
+import os
 import signal
 import sys
+from io import TextIOWrapper
 from typing import TYPE_CHECKING
 
 from hsloc import __version__
@@ -38,6 +41,7 @@ COMMANDS = (
 
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_DATA_LOST = 0, 1, 2, 3
 """Exit codes: done; failed; wrong use; done, but part of the input was lost."""
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -60,7 +64,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code. Errors of `HslocError` are one line on stderr."""
     try:
         arguments = build_parser().parse_args(argv)
-        return int(arguments.run(arguments))
+        status = int(arguments.run(arguments))
+        sys.stdout.flush()
+        return status
     except HslocError as error:
         print(f"hsloc: error: {error}", file=sys.stderr)
         return EXIT_FAILED
@@ -70,12 +76,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return EXIT_FAILED
+    except OSError as error:
+        if error.errno not in _NO_SPACE:
+            raise
+        where = error.filename or "standard output"
+        print(f"hsloc: error: {where}: cannot be written ({error.strerror}); check the free space", file=sys.stderr)
+        return EXIT_FAILED
 
 
 def program() -> None:
-    """The program `hsloc`. Once the work is done, or given up, a Ctrl-C comes too late to matter."""
+    """The program `hsloc`. Once the work is done, or given up, a Ctrl-C comes too late to matter.
+
+    Names that the terminal has no letters for are printed escaped, as on stderr: no result is lost for want of a font.
+    """
+    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
     status = main()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        sys.stdout.flush()
+    except OSError:  # Told already; what is left would be told once more by Python itself, with another exit code.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(status)
 
 

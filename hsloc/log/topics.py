@@ -140,6 +140,7 @@ def _pick(
         problem += f", or take all with {flag} {','.join(candidates[:_LISTED])}" if kind == "scan" else ""
     else:
         problem = f"{where}: no {what} topic ({typename}); the log holds {listed(channels)}"
+        problem += "; without odometry a map can be drawn (--no-odom)" if kind == "odom" and required else ""
     if required:
         raise TopicError(problem)
     problems.append(problem)

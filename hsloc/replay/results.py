@@ -15,6 +15,7 @@ from hsloc.evaluation import write_json, write_tum
 from hsloc.evaluation.report_html import write_report_html
 from hsloc.evaluation.report_png import draw_report
 from hsloc.maps import save_map
+from hsloc.replay.doubts import doubts
 from hsloc.replay.metrics import metrics, timings
 from hsloc.replay.provenance import config_text, provenance
 from hsloc.replay.viewer import write_recording
@@ -83,7 +84,7 @@ def _write(
     progress: Callable[[float], None] | None,
 ) -> dict[str, object]:
     review = write_recording(result, folder / "run.mcap", progress)
-    values = metrics(result, review.residuals, alignment, relations, review.doubts)
+    values = metrics(result, review.residuals, alignment, relations, [*doubts(result), *review.doubts])
     write_tum(folder / "trajectory.tum", result.trajectory)
     if len(result.odometry):
         write_tum(folder / "odometry.tum", result.odometry)

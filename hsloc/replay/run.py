@@ -6,6 +6,7 @@ import signal
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from os import fsencode
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -105,9 +106,13 @@ class RunSpec:
         """The graph mapper's parameters as this run uses them."""
         return replace(self.config.graph_mapper, use_odometry=not self.no_odometry)
 
+    def reading(self) -> ReadOptions:
+        """How this run reads its logs, each time it does: odometry may be missing where it is not looked at."""
+        return replace(self.read, require_odometry=not self.no_odometry)
+
     def names(self) -> tuple[str, ...]:
-        """What to call the logs in reports."""
-        return self.labels or tuple(path.name for path in self.logs)
+        """What to call the logs in reports; of a name that is no text (UTF-8) the odd bytes as `\\xfc`."""
+        return self.labels or tuple(fsencode(path.name).decode("utf-8", "backslashreplace") for path in self.logs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +163,7 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
     Raises an `HslocError` for a log, map or configuration that cannot be used.
     """
     begin = time.perf_counter()
-    log = open_log(spec.logs, replace(spec.read, require_odometry=not spec.no_odometry))
+    log = open_log(spec.logs, spec.reading())
     reference = None if spec.reference is None else read_reference(spec.reference, spec.logs)
     grid, warnings = find_map(spec, log)
     state, remarks = load_state(spec)

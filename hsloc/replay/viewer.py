@@ -45,7 +45,7 @@ def write_recording(result: Result, path: Path, progress: Callable[[float], None
 
     The scans come from the log, read once more, so that memory does not grow with it. The map is that of the result.
     """
-    log = open_log(result.spec.logs, result.spec.read)
+    log = open_log(result.spec.logs, result.spec.reading())
     residuals = Residuals(result.grid)
     check = MountingCheck(result.grid, len(result.diagnostics), len(result.summary.lasers))
     config = result.spec.config

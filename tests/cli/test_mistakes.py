@@ -44,6 +44,36 @@ def empty(folder):
     return not [path for path in folder.rglob("*") if path.is_file() and path.suffix not in (".yaml", ".txt", ".mcap")]
 
 
+@pytest.mark.parametrize("argv", [["info", OFFICE, "--json"], ["config"], ["record", "--list"], ["completion", "bash"]])
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_full_disk_behind_stdout_is_one_line(argv, unbuffered):
+    command = [sys.executable, "-m", "hsloc.cli.main", *argv]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": unbuffered}
+        )
+    assert done.returncode == 1
+    assert done.stderr.splitlines() == [
+        "hsloc: error: standard output: cannot be written (No space left on device); check the free space"
+    ]
+
+
+def test_a_name_that_the_terminal_cannot_show_is_escaped(here):
+    (here / "Büro.mcap").write_bytes(Path(OFFICE).read_bytes())
+    command = [sys.executable, "-m", "hsloc.cli.main", "info", "--quick", "Büro.mcap"]
+    done = subprocess.run(command, capture_output=True, env=os.environ | {"PYTHONIOENCODING": "ascii"}, check=True)
+    assert rb"B\xfcro.mcap" in done.stdout
+
+
+def test_a_name_that_is_no_text_is_read_and_reported(here, capsys):
+    name = os.fsdecode(b"B\xfcro.mcap")
+    (here / name).write_bytes(Path(OFFICE).read_bytes())
+    assert main(["replay", name, "--end", "2", "--out", "out", "-q"]) == 0
+    assert capsys.readouterr().err == ""
+    assert r"B\xfcro.mcap" in (here / "out" / "config.yaml").read_text()
+    assert r"B\xfcro.mcap" in (here / "out" / "report.html").read_text()
+
+
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [

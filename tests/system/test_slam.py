@@ -7,9 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hsloc.cli.main import main
 from hsloc.evaluation import evaluate, evaluate_relations, read_relations
 from hsloc.evaluation.alignment import umeyama
+from hsloc.log.reader import open_log
+from hsloc.log.summary import ReadOptions
+from hsloc.log.writer import LogWriter
 from hsloc.maps import load_map
+from hsloc.model import Scan
 from hsloc.replay.results import write_results
 from hsloc.replay.run import RunSpec, run
 
@@ -46,6 +51,21 @@ def test_without_odometry_the_scans_alone_must_do():
     assert len(found.odometry) == 0
     assert len(found.trajectory) == len(found.diagnostics)
     assert ape(found).rmse < 0.03
+
+
+def test_a_log_that_has_no_odometry_at_all_is_mapped_and_written(tmp_path, capsys):
+    bare = tmp_path / "bare.mcap"
+    with LogWriter(bare) as writer:
+        for event in open_log(RECORDINGS / "office.mcap", ReadOptions(end_s=5.0)).events():
+            if isinstance(event, Scan):
+                writer.scan(event)
+    out = tmp_path / "out"
+    assert main(["replay", str(bare), "--no-odom", "--out", str(out), "-q"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert len((out / "trajectory.tum").read_text().splitlines()) == 50
+    assert (out / "map.pgm").is_file()
+    assert main(["replay", str(bare), "--out", str(tmp_path / "other")]) == 1
+    assert "--no-odom" in capsys.readouterr().err
 
 
 @pytest.mark.data

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from sqlalchemy import select
+from sqlalchemy import select, update
 from sqlalchemy.exc import OperationalError
 
 from service.logs import log
@@ -177,6 +177,9 @@ def sweep(database: Database, storage: Storage) -> None:
 
     Only at start-up, when nothing runs.
     """
+    for file_id in reopen(database):
+        with suppress(OSError):
+            storage.upload_path(file_id).chmod(0o600)
     with database.read() as session:
         files = set(session.scalars(select(FileRow.id)))
     for kind, path in storage.leftovers():
@@ -184,3 +187,17 @@ def sweep(database: Database, storage: Storage) -> None:
             log("sweep", kind=kind, name=path.name)
             with suppress(OSError):
                 shutil.rmtree(path) if path.is_dir() else os.unlink(path)
+
+
+def reopen(database: Database) -> list[str]:
+    """Ask for the last byte again of uploads that have all their bytes, but are not complete; their ids.
+
+    A server of an older hsloc that died at that moment left such; to a client they look finished, to a job they do not.
+    """
+    whole = (FileRow.state == "receiving", FileRow.size == FileRow.received, FileRow.received > 0)
+    with database.read() as session:
+        found = list(session.scalars(select(FileRow.id).where(*whole)))
+    if found:  # else nothing is written: a server must start on a full disk, too
+        with database.write() as session:
+            session.execute(update(FileRow).where(*whole).values(received=FileRow.received - 1))
+    return found

@@ -148,7 +148,9 @@ class LocalDispatcher:
                 self._stop.wait(IDLE_S)
 
     def _one(self) -> bool:
-        """Run the next job; False if there is none."""
+        """Run the next job; False if there is none, or none may start: without room each would end as `disk_full`."""
+        if self._storage.free_bytes() < self._storage.min_free_bytes:
+            return False
         claim = self._leases.claim(self._owner)
         if claim is None:
             self._leases.recover()
@@ -166,10 +168,10 @@ class LocalDispatcher:
                 cancel=cancel,
                 store_failed=self._store_failed,
             )
-            self._ended(attempt.run())
+            self._ended(state := attempt.run())
         finally:
             self._running.pop(claim.job_id, None)
-        return True
+        return state != "queued"  # what could not be started now will not a millisecond later: it has a breath
 
 
 def sweep(database: Database, storage: Storage) -> None:

@@ -105,6 +105,7 @@ class Leases:
             if job is None or job.cancel:
                 return False
             job.folder, job.store, job.summary = folder, store, summary
+            job.bytes = sum(asset.size for asset in assets)
             for asset in assets:
                 session.add(
                     AssetRow(

@@ -225,7 +225,9 @@ def test_the_token_is_not_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert token.startswith("hsl_")
     with_tokens(chosen, "0.0.0.0", False, True, None)
     assert capsys.readouterr().out == ""  # the first start only
-    for path in chosen.data.iterdir():
+    files = [path for path in chosen.data.rglob("*") if path.is_file()]
+    assert chosen.data / "hsloc.db" in files
+    for path in files:
         assert token.encode() not in path.read_bytes()
         assert token.rsplit("_", 1)[1].encode() not in path.read_bytes()
 

@@ -105,9 +105,9 @@ def test_given_up_after_some_attempts(make_client: Callable[..., TestClient], re
     [
         *("127.0.0.1", "localhost", "[::1]", "10.0.0.1", "169.254.169.254", "[::ffff:127.0.0.1]", "0.0.0.0"),
         "2130706433",
-        # What a gateway makes an IPv4 address of: NAT64, 6to4, IPv4-compatible, Teredo.
         # Reserved, but public to some versions of Python.
         *("192.0.0.8", "[64:ff9b:1::7f00:1]", "[::ffff:0:7f00:1]", "[fec0::1]"),
+        # What a gateway makes an IPv4 address of: NAT64, 6to4, IPv4-compatible, Teredo.
         *("[64:ff9b::7f00:1]", "[64:ff9b::a9fe:a9fe]", "[2002:a00:1::1]", "[::a00:1]", "[2001:0:7f00:1::]"),
     ],
 )

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from sqlalchemy import select
+from sqlalchemy import select, update
 from sqlalchemy.exc import OperationalError
 
 from service.logs import log
@@ -148,7 +148,9 @@ class LocalDispatcher:
                 self._stop.wait(IDLE_S)
 
     def _one(self) -> bool:
-        """Run the next job; False if there is none."""
+        """Run the next job; False if there is none, or none may start: without room each would end as `disk_full`."""
+        if self._storage.free_bytes() < self._storage.min_free_bytes:
+            return False
         claim = self._leases.claim(self._owner)
         if claim is None:
             self._leases.recover()
@@ -166,10 +168,10 @@ class LocalDispatcher:
                 cancel=cancel,
                 store_failed=self._store_failed,
             )
-            self._ended(attempt.run())
+            self._ended(state := attempt.run())
         finally:
             self._running.pop(claim.job_id, None)
-        return True
+        return state != "queued"  # what could not be started now will not a millisecond later: it has a breath
 
 
 def sweep(database: Database, storage: Storage) -> None:
@@ -177,6 +179,9 @@ def sweep(database: Database, storage: Storage) -> None:
 
     Only at start-up, when nothing runs.
     """
+    for file_id in reopen(database):
+        with suppress(OSError):
+            storage.upload_path(file_id).chmod(0o600)
     with database.read() as session:
         files = set(session.scalars(select(FileRow.id)))
     for kind, path in storage.leftovers():
@@ -184,3 +189,17 @@ def sweep(database: Database, storage: Storage) -> None:
             log("sweep", kind=kind, name=path.name)
             with suppress(OSError):
                 shutil.rmtree(path) if path.is_dir() else os.unlink(path)
+
+
+def reopen(database: Database) -> list[str]:
+    """Ask for the last byte again of uploads that have all their bytes, but are not complete; their ids.
+
+    A server of an older hsloc that died at that moment left such; to a client they look finished, to a job they do not.
+    """
+    whole = (FileRow.state == "receiving", FileRow.size == FileRow.received, FileRow.received > 0)
+    with database.read() as session:
+        found = list(session.scalars(select(FileRow.id).where(*whole)))
+    if found:  # else nothing is written: a server must start on a full disk, too
+        with database.write() as session:
+            session.execute(update(FileRow).where(*whole).values(received=FileRow.received - 1))
+    return found

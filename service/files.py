@@ -11,7 +11,7 @@ from sqlalchemy import case, func, select, tuple_
 
 from service.errors import ServiceError, conflict, no_space, not_found
 from service.requests import files_of
-from service.tables import ACTIVE, AssetRow, FileRow, JobRow
+from service.tables import ACTIVE, FileRow, JobRow
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -139,12 +139,8 @@ def need_quota(session: Session, who: Principal, most: int, size: int = 0) -> No
     size_or_none = func.coalesce(FileRow.size, 0)
     announced = case((FileRow.received > size_or_none, FileRow.received), else_=size_or_none)
     uploads = session.scalar(select(func.coalesce(func.sum(announced), 0)).where(FileRow.tenant == who.tenant)) or 0
-    results = session.scalar(
-        select(func.coalesce(func.sum(AssetRow.size), 0))
-        .join(JobRow, JobRow.id == AssetRow.job_id)
-        .where(JobRow.tenant == who.tenant)
-    )
-    if uploads + (results or 0) + size > most:
+    results = session.scalar(select(func.coalesce(func.sum(JobRow.bytes), 0)).where(JobRow.tenant == who.tenant)) or 0
+    if uploads + results + size > most:
         raise no_space(f"your uploads take {uploads} and your results {results} of {most} bytes; delete some")
 
 

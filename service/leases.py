@@ -11,7 +11,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 
 from service.events import record
 from service.inputs import STATE
@@ -65,7 +65,7 @@ class Leases:
     max_attempts: int
 
     def claim(self, owner: str) -> Claim | None:
-        """Take the oldest waiting job of the tenant that has the fewest running; None if none waits."""
+        """Take the oldest waiting job of the tenant whose turn it is; None if none waits."""
         with self.database.write() as session:
             job = session.scalar(_next())
             if job is None:
@@ -105,6 +105,7 @@ class Leases:
             if job is None or job.cancel:
                 return False
             job.folder, job.store, job.summary = folder, store, summary
+            job.bytes = sum(asset.size for asset in assets)
             for asset in assets:
                 session.add(
                     AssetRow(
@@ -161,8 +162,11 @@ class Leases:
 
 
 def _next() -> Any:
-    """The next job, tenants in turn: who has least running comes first. One statement, so portable as it stands."""
-    from sqlalchemy import func
+    """The next job, tenants in turn: who has least running comes first, then who was served longest ago.
+
+    One statement, so portable as it stands. A tenant's jobs are begun in the order of `seq`, so that its last start is
+    found at the end of its index, whatever number of jobs it has.
+    """
     from sqlalchemy.orm import aliased
 
     other = aliased(JobRow)
@@ -172,10 +176,18 @@ def _next() -> Any:
         .correlate(JobRow)
         .scalar_subquery()
     )
+    served = (
+        select(other.started)
+        .where(other.tenant == JobRow.tenant, other.started.is_not(None))
+        .order_by(other.seq.desc())
+        .limit(1)
+        .correlate(JobRow)
+        .scalar_subquery()
+    )
     return (
         select(JobRow)
         .where(JobRow.state == "queued")
-        .order_by(running, JobRow.seq)
+        .order_by(running, func.coalesce(served, 0.0), JobRow.seq)
         .limit(1)
         .with_for_update(skip_locked=True)
     )

@@ -19,6 +19,7 @@ from service.http.protocol import protocol_class
 from service.logs import configure
 from service.principal import SCOPES, Tokens
 from service.settings import Settings, SettingsError
+from service.storage import Storage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -86,13 +87,15 @@ def serve(
 def with_tokens(settings: Settings, host: str, open_to_all: bool, first_token: bool, secret: str | None) -> Settings:
     """The settings, with tokens required where they must be. Raises SettingsError where none is there."""
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+    # A server that holds the folder must not find its database migrated, or its token gone, by one that may not start.
+    Storage(settings.data, settings.min_free_bytes).close()
     database = Database(settings.data / "hsloc.db")
     try:
         tokens = Tokens(database)
         if secret is not None:
             if len(secret) < 24:
                 raise SettingsError(f"the token has {len(secret)} characters; it must have 24 or more")
-            tokens.issue("default", label="operator's", secret=secret)
+            tokens.issue_operators("default", secret)
         elif first_token and not tokens.any():
             show_token(tokens.issue("default", label="first"))
         required = settings.require_token or tokens.any()

@@ -21,6 +21,14 @@ STEPS: dict[int, tuple[str, ...]] = {
         "ALTER TABLE job ADD COLUMN resume_of VARCHAR",
         "CREATE INDEX ix_job_resume_of ON job (resume_of)",
     ),
+    # The quota without reading every asset of a tenant; indexes that answer what is asked under the write lock.
+    2: (
+        "ALTER TABLE job ADD COLUMN bytes INTEGER NOT NULL DEFAULT 0",
+        "UPDATE job SET bytes = (SELECT coalesce(sum(size), 0) FROM asset WHERE asset.job_id = job.id)",
+        "CREATE INDEX job_by_tenant ON job (tenant, state, bytes)",
+        "CREATE INDEX file_by_tenant ON file (tenant, size, received)",
+        "CREATE INDEX file_by_state ON file (state, size, received)",
+    ),
 }
 """What leads from a version to the next one; tables that are new are made afterwards, by `create_all`."""
 

@@ -19,7 +19,7 @@ from service.settings import SettingsError
 from service.storage import sync_folder
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from service.results import Asset
@@ -56,6 +56,8 @@ class ObjectStore:
         self._flat = parts.scheme in FLAT
         self._url = url if url.endswith("://") else url.rstrip("/")
         self._root = f"{str(root).rstrip('/')}/{instance}"
+        self._there = False
+        """Whether our folder was seen to be there."""
 
     @property
     def url(self) -> str:
@@ -67,7 +69,10 @@ class ObjectStore:
         folder = f"{self._root}/{checked_result(name)}"
         with _typed(f"writing {name}", missing=True):
             if not self._flat:
+                if self._there:
+                    self._need_root()
                 self._fs.makedirs(folder, exist_ok=True)
+                self._there = True
             for asset in assets:
                 target = f"{folder}/{checked_asset(asset.name)}"
                 self._fs.put_file(str(output / asset.name), target)
@@ -98,7 +103,7 @@ class ObjectStore:
             return b""
         place = f"{self._root}/{checked_result(name)}/{checked_asset(asset)}"
         with _typed(f"reading {asset}"):
-            block: bytes = self._fs.cat_file(place, start=start, end=start + size)
+            block: bytes = self._unless_away(lambda: self._fs.cat_file(place, start=start, end=start + size))
             if len(block) != size:
                 raise StoreError(f"{asset}: {len(block)} of {size} bytes came")
             return block
@@ -107,7 +112,21 @@ class ObjectStore:
         """Remove all objects of the results `name`."""
         place = f"{self._root}/{checked_result(name)}"
         with suppress(FileNotFoundError), _typed(f"removing {name}"):
-            self._fs.rm(place, recursive=True)
+            self._unless_away(lambda: self._fs.rm(place, recursive=True))
+
+    def _unless_away(self, work: Callable[[], Any]) -> Any:
+        """The result of `work`. What is not there because nothing is, is not gone: a disk that is not mounted."""
+        try:
+            return work()
+        except FileNotFoundError:
+            if not self._flat:
+                self._need_root()
+            raise
+
+    def _need_root(self) -> None:
+        """Raises StoreError if the folder that held results is away; written to, it would be made on another disk."""
+        if not self._fs.exists(self._root):
+            raise StoreError(f"{self._root} is away; is its disk mounted?")
 
     def names(self) -> list[str]:
         """What has the name of results."""

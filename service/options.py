@@ -11,6 +11,7 @@ import functools
 import json
 import subprocess
 import sys
+import threading
 import types
 import typing
 from typing import Any
@@ -21,11 +22,17 @@ _KINDS = {float: "number", int: "integer", bool: "boolean", str: "string"}
 _LARGEST: dict[str, float] = {"number": 1e300, "integer": (1 << 63) - 1}
 """What the schema allows; the ranges that make sense are the job's to check."""
 _ITEMS = 1000
+_making = threading.Lock()
+
+
+def options() -> dict[str, Any]:
+    """`config_schema` and `presets`; whoever asks while they are being made waits for the same process."""
+    with _making:
+        return _options()
 
 
 @functools.cache
-def options() -> dict[str, Any]:
-    """`config_schema` and `presets`."""
+def _options() -> dict[str, Any]:
     command = [sys.executable, "-P", "-m", "service.options"]
     done = subprocess.run(command, capture_output=True, check=True, timeout=120)
     return typing.cast("dict[str, Any]", json.loads(done.stdout))

@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sqlalchemy import select
+from sqlalchemy import select, update
 
 from service.errors import ServiceError
 from service.tables import TokenRow
@@ -36,6 +36,9 @@ class Principal:
         if scope not in self.scopes:
             raise ServiceError(403, "scope", f"this token lacks the scope {scope!r}")
 
+
+OPERATORS = "operator's"
+"""Label of the token of HSLOC_TOKEN."""
 
 ANYBODY = Principal("local", frozenset(SCOPES))
 """Who asks where no token is required: a server on loopback."""
@@ -76,6 +79,14 @@ class Tokens:
             if known is None:
                 session.add(row)
         return token
+
+    def issue_operators(self, tenant: str, secret: str) -> None:
+        """The token that the operator chose; the one that he chose before is worth nothing from now on."""
+        self.issue(tenant, label=OPERATORS, secret=secret)
+        digest = _sha256(secret)
+        with self._database.write() as session:
+            older = (TokenRow.label == OPERATORS, TokenRow.sha256 != digest, TokenRow.revoked.is_(None))
+            session.execute(update(TokenRow).where(*older).values(revoked=time.time()))
 
     def revoke(self, ident: str) -> bool:
         """Whether there was such a token."""

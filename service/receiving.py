@@ -61,7 +61,7 @@ class Receiver:
         """Append a body at `offset`, which must be the upload's; completes the upload when its last byte is there.
 
         With a checksum (algorithm, digest) the body is taken whole or not at all (460). A broken connection keeps what
-        arrived, and raises ClientDisconnect.
+        arrived, and raises ClientDisconnect; an upload whose last byte came that way is complete all the same.
         """
         row = await to_thread.run_sync(self._files.get, who, file_id)
         if row.state != "receiving":
@@ -71,11 +71,14 @@ class Receiver:
         limit = self._settings.max_upload_bytes if row.size is None else row.size
         taking = _Taking(self._files, who, row, limit, self._hash(file_id, offset), checksum)
         try:
-            received = await taking.run(body, drop=random.random() < self._settings.fault_drop_uploads)
+            await taking.run(body, drop=random.random() < self._settings.fault_drop_uploads)
+        except ClientDisconnect:
+            if taking.safe != row.size:
+                raise
         finally:
             self._hashes[file_id] = (taking.digest, taking.safe)
-        row.received = received
-        if row.size is not None and received == row.size:
+        row.received = taking.safe
+        if taking.safe == row.size:
             return await self.finish(file_id)
         return row
 
@@ -91,9 +94,10 @@ class Receiver:
         )
 
         def done() -> FileRow:
-            path.chmod(0o400)
             sync_folder(path.parent)
-            return self._files.complete(file_id, size, sha256)
+            row = self._files.complete(file_id, size, sha256)
+            path.chmod(0o400)  # not before: a server that died in between could not go on with the upload
+            return row
 
         row = await to_thread.run_sync(done)
         log("upload.complete", file=file_id, tenant=row.tenant, size=size)
@@ -114,7 +118,11 @@ class Receiver:
 
 
 class _Taking:
-    """One body being appended. `safe` is the offset that is on the disk and in the database."""
+    """One body being appended. `safe` is the offset that is on the disk and in the database.
+
+    The offset of the last byte comes into the database by `Files.complete` alone: an upload that says that it has all
+    bytes, and is not complete, would be finished to its client, and to nobody else.
+    """
 
     def __init__(
         self, files: Files, who: Principal, row: FileRow, limit: int, digest: Any, checksum: tuple[str, bytes] | None
@@ -127,8 +135,8 @@ class _Taking:
         self._check = None if checksum is None else hashlib.new(checksum[0])
         self._wanted = None if checksum is None else checksum[1]
 
-    async def run(self, body: AsyncIterable[bytes], drop: bool) -> int:
-        """Write the body; the new offset."""
+    async def run(self, body: AsyncIterable[bytes], drop: bool) -> None:
+        """Write the body, and move `safe` on."""
         descriptor = await to_thread.run_sync(self._open)
         try:
             buffer = bytearray()
@@ -150,7 +158,6 @@ class _Taking:
             await to_thread.run_sync(self._commit, descriptor, bytes(buffer))
         finally:
             await to_thread.run_sync(self._close, descriptor, abandon_on_cancel=False)
-        return self.safe
 
     def _open(self) -> int:
         """Open at the offset; bytes beyond it were never acknowledged and go."""
@@ -194,7 +201,8 @@ class _Taking:
         if self._at == self.safe:
             return
         os.fdatasync(descriptor)
-        self._files.advance(self._row.id, self._at)
+        if self._at != self._row.size:
+            self._files.advance(self._row.id, self._at)
         self.safe = self._at
         self.digest = None if self._running is None else self._running.copy()
 

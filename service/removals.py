@@ -6,11 +6,11 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sqlalchemy import select
+from sqlalchemy import or_, select
 
 from service.logs import log
 from service.results import StoreError
-from service.tables import ACTIVE, JobRow, RemovalRow
+from service.tables import JobRow, RemovalRow
 from service.waiting import wait
 
 if TYPE_CHECKING:
@@ -51,14 +51,16 @@ class Removals:
     def sweep(self, store: ResultStore) -> int:
         """Remove results that no job names: of attempts that died, or were fenced off, between storing and commit.
 
-        May run at any time: what an attempt is storing just now belongs to a job that is active. Raises StoreError.
+        May run at any time: what an attempt is storing just now belongs to a job that runs. Raises StoreError.
         """
         names = self._names(store)  # before the rows are read: what is named by a row now was stored earlier
         with self.database.read() as session:
             query = select(JobRow.folder).where(JobRow.folder.is_not(None))
             here = JobRow.store.is_(None) if store.url is None else JobRow.store == store.url
             kept = set(session.scalars(query.where(here)))
-            active = session.execute(select(JobRow.id, JobRow.attempt).where(JobRow.state.in_(ACTIVE))).all()
+            # A waiting job's attempt is one that died; the next has another number.
+            running = (JobRow.state == "running", JobRow.state == "cancelling")
+            active = session.execute(select(JobRow.id, JobRow.attempt).where(or_(*running))).all()
         kept |= {f"{row.id}.{row.attempt}" for row in active}
         doomed = [name for name in names if name not in kept]
         for name in doomed:

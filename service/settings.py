@@ -108,6 +108,9 @@ class Settings:
         for name in ("slots", "max_upload_bytes", "max_queued", "max_attempts", "job_memory_bytes", "job_output_bytes"):
             if getattr(self, name) < 1:
                 raise SettingsError(f"{name} is {getattr(self, name)}; it must be 1 or more")
+        for name in ("requests_per_s", "refusals_per_s", "store_timeout_s", "body_timeout_s", "header_timeout_s"):
+            if not getattr(self, name) > 0.0:
+                raise SettingsError(f"{name} is {getattr(self, name)}; it must be above 0")
         if not 0.0 < self.heartbeat_s < self.lease_s:
             raise SettingsError(
                 f"heartbeat_s is {self.heartbeat_s}; it must be above 0 and below lease_s {self.lease_s}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import random
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from service.inputs import fetch, prepare
+from service.lines import plain_line
 from service.logs import log
 from service.patience import BYTES_PER_S, Interrupted, Patience
 from service.processes import end_job, start_job
@@ -179,8 +179,8 @@ class Attempt:
             return False
         *lines, self._buffer = (self._buffer + block).split(b"\n")
         for line in lines:
-            with suppress(ValueError, KeyError, TypeError):
-                self._take(json.loads(line))
+            with suppress(ValueError, KeyError, TypeError, RecursionError):
+                self._take(plain_line(line))
         return bool(block) and len(self._buffer) <= _LINE_BYTES
 
     def _take(self, line: dict[str, Any]) -> None:
@@ -197,7 +197,9 @@ class Attempt:
     def _judge(self, code: int) -> Outcome:
         """What the exit of the process means. Its own words count, but not its claim of success over its exit code."""
         final = self._final or {}
-        if code == 0 and isinstance(final.get("done"), dict) and (self._folder / "output").is_dir():
+        output = self._folder / "output"
+        # A link would have us publish, and tidy up, a folder elsewhere.
+        if code == 0 and isinstance(final.get("done"), dict) and output.is_dir() and not output.is_symlink():
             return Outcome("done", summary=final["done"])
         if "failed" in final:
             reason = str(final["failed"])[:40]

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from sqlalchemy import JSON, Index, Text, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 """Stored in the database; what leads from one to the next is in `migrations`."""
 
 JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
@@ -52,6 +52,10 @@ class FileRow(Base):
     sha256: Mapped[str | None]
     created: Mapped[float]
     expires: Mapped[float | None]
+    __table_args__ = (
+        Index("file_by_tenant", "tenant", "size", "received"),  # the quota
+        Index("file_by_state", "state", "size", "received"),  # what was announced and has not come yet
+    )
 
 
 class JobRow(Base):
@@ -93,7 +97,12 @@ class JobRow(Base):
     """Where that folder is: the URL of an object store; None is the data folder."""
     summary: Mapped[dict[str, Any] | None]
     webhook: Mapped[str | None]
-    __table_args__ = (Index("job_by_state", "state", "seq"),)
+    bytes: Mapped[int] = mapped_column(default=0)
+    """What the results take, by their manifest."""
+    __table_args__ = (
+        Index("job_by_state", "state", "seq"),
+        Index("job_by_tenant", "tenant", "state", "bytes"),  # the quota, and how many wait: asked at every submission
+    )
 
 
 class AssetRow(Base):

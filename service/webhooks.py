@@ -35,6 +35,9 @@ WITHIN_S = 15.0
 """One delivery takes no longer, however slowly the receiver answers."""
 LONGEST_WAIT_S = 3600.0
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
+_RESERVED = [ipaddress.ip_network(text) for text in ("192.0.0.0/24", "64:ff9b:1::/48", "::ffff:0:0:0/96", "fec0::/10")]
+"""Not public by IANA's registries, whatever `is_global` of an older Python says: protocol assignments, NAT64 for local
+use, IPv4 translated, site-local."""
 _EMBEDDING = [ipaddress.IPv6Network(text) for text in ("64:ff9b::/96", "::/96")]
 
 
@@ -63,6 +66,8 @@ class Deliverer:
     def __init__(self, database: Database, settings: Settings) -> None:
         self._database, self._settings = database, settings
         self._stop = threading.Event()
+        self._last = ""
+        """The tenant that had its turn."""
         self._thread = threading.Thread(target=self._run, name="webhooks", daemon=True)
 
     def start(self) -> None:
@@ -83,15 +88,18 @@ class Deliverer:
                 log("webhook.error", error=f"{type(error).__name__}: {error}")
 
     def deliver_next(self) -> bool:
-        """Try the next delivery that is due; False if none is."""
-        now = time.time()
+        """Try the next delivery that is due, tenants in turn; False if none is.
+
+        A thousand webhooks of one tenant, whose receiver does not answer, would else hold up everybody's for hours.
+        """
+        is_due = (DeliveryRow.state == "pending", DeliveryRow.next_at <= time.time())
         with self._database.read() as session:
-            due = session.scalar(
-                select(DeliveryRow)
-                .where(DeliveryRow.state == "pending", DeliveryRow.next_at <= now)
-                .order_by(DeliveryRow.next_at)
-                .limit(1)
-            )
+            tenants = session.scalars(select(DeliveryRow.tenant).where(*is_due).distinct()).all()
+            if not tenants:
+                return False
+            self._last = min((each for each in tenants if each > self._last), default=min(tenants))
+            query = select(DeliveryRow).where(*is_due, DeliveryRow.tenant == self._last)
+            due = session.scalar(query.order_by(DeliveryRow.next_at).limit(1))
         if due is None:
             return False
         with self._database.write() as session:
@@ -177,12 +185,13 @@ def _resolve(host: str, port: int, private: bool) -> tuple[str, int]:
     addresses = [str(each[4][0]) for each in found]
     for text in addresses:
         if not private and not all(_is_public(each) for each in _meant(ipaddress.ip_address(text.split("%")[0]))):
-            raise ForbiddenAddress(f"{host} leads to {text}, which is not a public address")
+            # Not which one: the error is shown to the tenant, and the names of our network are none of his business.
+            raise ForbiddenAddress(f"{host} leads to an address that is not public")
     return addresses[0], port
 
 
 def _is_public(address: Address) -> bool:
-    return address.is_global and not address.is_multicast
+    return address.is_global and not address.is_multicast and not any(address in network for network in _RESERVED)
 
 
 def _meant(address: Address) -> list[Address]:

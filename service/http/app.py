@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 from contextlib import asynccontextmanager
 from copy import deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from anyio import to_thread
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.openapi.utils import get_openapi
-from fastapi.responses import FileResponse
+from fastapi.responses import FileResponse, JSONResponse
 from fastapi.staticfiles import StaticFiles
 from sqlalchemy.exc import OperationalError
 from starlette.exceptions import HTTPException
@@ -117,7 +119,8 @@ def create_app(settings: Settings) -> FastAPI:
         version=__version__,
         summary="Upload a log of a robot, get to know where it was.",
         lifespan=lifespan,
-        docs_url=None,  # its page loads scripts from elsewhere; /openapi.json is there
+        docs_url=None,  # its page loads scripts from elsewhere
+        openapi_url=None,  # FastAPI's route makes it on the event loop: see below
         redoc_url=None,
         license_info={"name": "Apache-2.0"},
     )
@@ -141,6 +144,16 @@ def _add_page(app: FastAPI) -> None:
     @app.get("/favicon.ico", include_in_schema=False)
     def icon() -> FileResponse:
         return FileResponse(WEB / "icon.svg", media_type="image/svg+xml")
+
+    making = asyncio.Lock()
+
+    @app.get("/openapi.json", include_in_schema=False)
+    async def description() -> JSONResponse:
+        """Made when first asked for, which takes seconds: in one thread, while all else goes on."""
+        async with making:
+            if app.openapi_schema is None:
+                await to_thread.run_sync(app.openapi)
+        return JSONResponse(app.openapi())
 
 
 def _add_errors(app: FastAPI, storage: Storage) -> None:

@@ -17,7 +17,9 @@ from service.http.jobs_routes import JobId
 from service.tables import ENDED
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
+
+    from starlette.types import Receive, Scope, Send
 
     from service.principal import Principal
 
@@ -48,29 +50,40 @@ async def events(
     if ctx.streams[who.tenant] >= ctx.settings.max_streams:
         raise busy("too many event streams at the same time", 5.0)
     cursor = int(last_event_id) if last_event_id is not None else after
-    return StreamingResponse(_stream(ctx, who, job_id, cursor, follow), media_type="text/event-stream")
+    ctx.streams[who.tenant] += 1
+    return _Counted(_stream(ctx, who, job_id, cursor, follow), lambda: ctx.streams.subtract([who.tenant]))
+
+
+class _Counted(StreamingResponse):
+    """Counted from the moment it is granted: many that come at once would all be let in before the first has begun."""
+
+    def __init__(self, content: AsyncIterator[str], ended: Callable[[], None]) -> None:
+        super().__init__(content, media_type="text/event-stream")
+        self._ended = ended
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._ended()
 
 
 async def _stream(ctx: Context, who: Principal, job_id: str, cursor: int, follow: bool) -> AsyncIterator[str]:
-    ctx.streams[who.tenant] += 1
     spoke = time.monotonic()
-    try:
-        yield "retry: 2000\n\n"
-        while True:
-            job, rows = await to_thread.run_sync(ctx.jobs.events, who, job_id, cursor)
-            for row in rows:
-                cursor = row.id
-                data = json.dumps({"at": row.at, **row.data}, separators=(",", ":"))
-                yield f"id: {row.id}\nevent: {row.kind}\ndata: {data}\n\n"
-            now = time.monotonic()
-            if rows:
-                spoke = now
-            elif not follow or job.state in ENDED or ctx.stopping.is_set():
-                return
-            elif now - spoke > BREATH_S:
-                spoke = now
-                yield ": still here\n\n"
-            if not rows:
-                await asyncio.sleep(POLL_S)
-    finally:
-        ctx.streams[who.tenant] -= 1
+    yield "retry: 2000\n\n"
+    while True:
+        job, rows = await to_thread.run_sync(ctx.jobs.events, who, job_id, cursor)
+        for row in rows:
+            cursor = row.id
+            data = json.dumps({"at": row.at, **row.data}, separators=(",", ":"))
+            yield f"id: {row.id}\nevent: {row.kind}\ndata: {data}\n\n"
+        now = time.monotonic()
+        if rows:
+            spoke = now
+        elif not follow or job.state in ENDED or ctx.stopping.is_set():
+            return
+        elif now - spoke > BREATH_S:
+            spoke = now
+            yield ": still here\n\n"
+        if not rows:
+            await asyncio.sleep(POLL_S)

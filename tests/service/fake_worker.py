@@ -66,6 +66,24 @@ def main() -> int:
     elif word == "nonsense":
         os.write(fd, b"\x00\xff not json\n" + b"x" * (1 << 20))
         time.sleep(60)
+    elif word == "mad":  # JSON, of which a part cannot be kept, or read by others
+        for text in ("[" * 3000, '["done"]', '"failed"', "1" * 5000, "\xff", '{"phase": 1}'):
+            os.write(fd, text.encode("latin-1") + b"\n")
+        for part in ("NaN", "1e999", "-Infinity", '"x"', "[]"):
+            os.write(fd, f'{{"phase": "\\ud800", "part": {part}, "total": 1, "scans": {part}}}\n'.encode())
+        os.write(fd, b'{"phase": "replay", "part": 0.5, "total": 1, "scans": 123456789012345678901234567890}\n')
+        os.write(fd, b'{"phase": "\\ud800", "part": 0.5, "total": 1, "scans": 7}\n')
+        time.sleep(1.5)
+        os.write(fd, b'{"failed": "mad\\ud800", "message": "NaN: \\udcff"}\n')
+        return 1
+    elif word == "mad-end":
+        (folder / "output").mkdir()
+        os.write(fd, b'{"done": {"warnings": ["\\udcff"], "metrics": {"ape": [NaN, 1e999, 1.5]}}}\n')
+        return 0
+    elif word == "link":
+        (folder / "output").symlink_to(rest[0])
+        tell({"done": {}})
+        return 0
     elif word == "silent":
         os.close(fd)
         time.sleep(60)

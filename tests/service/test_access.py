@@ -12,10 +12,12 @@ from conftest import settings, submit, upload, wait
 from fastapi.testclient import TestClient
 
 from hsloc.cli.main import main as program
+from service.database import Database
 from service.http.app import create_app
 from service.main import with_tokens
 from service.principal import Tokens
 from service.settings import SettingsError
+from service.storage import Storage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -223,7 +225,9 @@ def test_the_token_is_not_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert token.startswith("hsl_")
     with_tokens(chosen, "0.0.0.0", False, True, None)
     assert capsys.readouterr().out == ""  # the first start only
-    for path in chosen.data.iterdir():
+    files = [path for path in chosen.data.rglob("*") if path.is_file()]
+    assert chosen.data / "hsloc.db" in files
+    for path in files:
         assert token.encode() not in path.read_bytes()
         assert token.rsplit("_", 1)[1].encode() not in path.read_bytes()
 
@@ -264,3 +268,34 @@ def test_tokens_are_listed_and_revoked_while_the_service_runs(
         assert code == 1
         assert said in err
         assert err.count("\n") == 1
+
+
+def test_another_token_of_the_operator_ends_the_one_before(tmp_path: Path) -> None:
+    chosen = settings(tmp_path)
+    for secret in ("a" * 32, "b" * 32, "b" * 32):
+        with_tokens(chosen, "127.0.0.1", False, False, secret)
+    database = Database(chosen.data / "hsloc.db")
+    tokens = Tokens(database)
+    made = tokens.issue("default")
+    assert tokens.principal("a" * 32) is None
+    assert tokens.principal("b" * 32) is not None
+    assert tokens.principal(made) is not None
+    database.close()
+
+
+def test_a_server_that_may_not_start_changes_nothing(tmp_path: Path) -> None:
+    """Its folder is held by another, perhaps an older one, whose database it would migrate."""
+    chosen = settings(tmp_path)
+    storage = Storage(chosen.data)
+    with pytest.raises(SettingsError, match="another hsloc service"):
+        with_tokens(chosen, "127.0.0.1", False, False, "a" * 32)
+    assert not (chosen.data / "hsloc.db").exists()
+    storage.close()
+
+
+def test_made_up_methods_are_one_series(client: TestClient) -> None:
+    for k in range(50):
+        client.request(f"MADE{k}", "/nowhere", headers={"Authorization": "Bearer wrong"})
+    lines = client.get("/metrics").text.splitlines()
+    assert not [line for line in lines if "MADE" in line]
+    assert [line for line in lines if 'hsloc_requests_total{method="other"' in line]

@@ -302,3 +302,27 @@ def test_a_server_starts_while_its_store_is_away(tmp_path: Path, url: str) -> No
         assert client.get("/readyz").status_code == 200
         assert time.monotonic() - begin < 5.0
         assert client.post("/v1/files", content=b"ok").status_code == 201
+
+
+def test_a_disk_that_is_not_mounted_is_away_and_nothing_is_gone(
+    make_client: Callable[..., TestClient], tmp_path: Path
+) -> None:
+    mounted, aside = tmp_path / "mounted", tmp_path / "aside"
+    client = make_client(results_url=f"file://{mounted}", store_timeout_s=5.0)
+    first, doomed = submit(client, seed=1), submit(client, seed=2)
+    assert {wait(client, job)["state"] for job in (first, doomed)} == {"succeeded"}
+    mounted.rename(aside)
+    answer = client.get(f"/v1/jobs/{first}/results/metrics.json")
+    assert (answer.status_code, answer.json()["code"]) == (503, "store")
+    assert client.get(f"/v1/jobs/{first}/results.zip").status_code == 503
+    waiting = submit(client, seed=3)
+    wait_for_store(client, waiting)
+    assert client.delete(f"/v1/jobs/{doomed}").status_code == 204
+    removals = client.app.state.context.removals  # type: ignore[attr-defined]
+    assert removals.clear() == 0
+    assert not mounted.exists()  # made anew, it would be on another disk, and hidden when the right one is there again
+    aside.rename(mounted)
+    assert wait(client, waiting)["state"] == "succeeded"
+    assert client.get(f"/v1/jobs/{first}/results/metrics.json").status_code == 200
+    assert removals.clear() == 1
+    assert sorted(path.name for path in next(mounted.iterdir()).iterdir()) == sorted([f"{first}.1", f"{waiting}.1"])

@@ -137,3 +137,17 @@ def test_the_journal_is_durable(parts: Parts) -> None:
         connection = session.connection()
         assert connection.exec_driver_sql("PRAGMA journal_mode").scalar_one() == "wal"
         assert connection.exec_driver_sql("PRAGMA synchronous").scalar_one() == 2
+
+
+def test_tenants_take_turns_in_a_single_slot(parts: Parts) -> None:
+    """Where nothing runs between two claims, who was served longest ago comes first."""
+    many = [parts.submit() for _ in range(4)]
+    others = [parts.submit(OTHER) for _ in range(2)]
+    leases = parts.leases()
+    order = []
+    for _ in range(6):
+        claim = leases.claim("a")
+        assert claim is not None
+        order.append(claim.job_id)
+        leases.succeed(claim, f"{claim.job_id}.1", ASSET, {})
+    assert order == [many[0], others[0], many[1], others[1], many[2], many[3]]

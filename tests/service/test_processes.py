@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import threading
@@ -12,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from conftest import free_port, submit, wait
 
+from service import supervisor
 from service.processes import marked
+from service.storage import Storage
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -157,3 +160,54 @@ def test_the_process_sees_no_secret_of_the_server(make_live: Callable[..., Live]
     for path in live.data.rglob("*"):
         if path.is_file() and os.access(path, os.R_OK):
             assert token.encode() not in path.read_bytes()
+
+
+def test_what_a_mad_process_says_hurts_nobody(client: TestClient) -> None:
+    """Neither the slot, which must note it, nor the readers of the list, which must get JSON."""
+    job = submit(client, b"mad")
+    deadline = time.monotonic() + 10.0
+    while (shown := client.get(f"/v1/jobs/{job}").json())["progress"] is None:
+        assert time.monotonic() < deadline, shown
+        time.sleep(0.02)
+    assert (shown["progress"]["phase"], shown["progress"]["done"], shown["progress"]["scans"]) == ("?", 0.5, 7)
+    ended = wait(client, job)
+    assert (ended["state"], ended["reason"], ended["message"], ended["attempt"]) == ("failed", "mad?", "NaN: ?", 1)
+    good = wait(client, submit(client, b"mad-end"))
+    assert good["summary"] == {"warnings": ["?"], "metrics": {"ape": [None, None, 1.5]}}
+    assert len(client.get("/v1/jobs").json()["jobs"]) == 2
+
+
+def test_an_output_that_is_a_link_is_no_output(client: TestClient, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "folder").mkdir(parents=True)
+    (elsewhere / "secret.txt").write_text("of somebody else")
+    ended = wait(client, submit(client, f"link {elsewhere}".encode()))
+    assert (ended["state"], ended["reason"]) == ("crashed", "exit")
+    assert sorted(path.name for path in elsewhere.iterdir()) == ["folder", "secret.txt"]
+
+
+def test_jobs_wait_while_the_disk_is_full(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who would start them now would see each of them fail, one after the other, until none is left."""
+    active = submit(client, b"slow 0.5")
+    jobs = [submit(client) for _ in range(3)]
+    monkeypatch.setattr(
+        Storage, "free_bytes", lambda _: (1 << 20) - 1
+    )  # above half of the floor: the active one goes on
+    assert wait(client, active)["state"] == "succeeded"
+    time.sleep(1.5)
+    assert {client.get(f"/v1/jobs/{job}").json()["state"] for job in jobs} == {"queued"}
+    monkeypatch.undo()
+    assert {wait(client, job)["state"] for job in jobs} == {"succeeded"}
+
+
+def test_what_cannot_be_started_is_not_tried_again_at_once(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    tries: list[float] = []
+
+    def refused(*_: object) -> None:
+        tries.append(time.monotonic())
+        raise OSError(errno.EAGAIN, "no more processes")
+
+    monkeypatch.setattr(supervisor, "start_job", refused)
+    ended = wait(client, submit(client))
+    assert (ended["state"], ended["reason"], len(tries)) == ("crashed", "attempts", 3)
+    assert tries[2] - tries[0] > 1.5

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import select
 import socket
+import threading
 import time
 from typing import TYPE_CHECKING
 
 import httpx2 as httpx
 import pytest
-from conftest import Live
+from conftest import Live, submit
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 QUICK = {"HSLOC_HEADER_TIMEOUT_S": "1", "HSLOC_BODY_TIMEOUT_S": "1", "HSLOC_WRITE_TIMEOUT_S": "2"}
 
@@ -114,3 +116,49 @@ def test_a_client_that_takes_nothing_is_cut_off(live: Live) -> None:
         except ConnectionError:
             pass
     assert got < 400  # only what the kernel had taken before
+
+
+def test_event_streams_that_come_at_once_are_counted_all(make_live: Callable[..., Live]) -> None:
+    live = make_live(HSLOC_MAX_STREAMS="8")
+    with live.client() as client, contextlib.ExitStack() as lines:
+        job = submit(client, b"slow 30")
+        opened = [lines.enter_context(socket.create_connection(("127.0.0.1", live.port))) for _ in range(60)]
+        for line in opened:
+            line.sendall(f"GET /v1/jobs/{job}/events HTTP/1.1\r\nHost: 127.0.0.1:{live.port}\r\n\r\n".encode())
+        codes = [line.recv(12)[-3:] for line in opened]
+        assert (codes.count(b"200"), codes.count(b"429")) == (8, 52)
+        for line in opened:
+            line.close()
+        deadline = time.monotonic() + 10.0
+        while True:  # their places are free again
+            with client.stream("GET", f"/v1/jobs/{job}/events") as answer:
+                if answer.status_code == 200:
+                    return
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+
+
+def test_the_description_is_made_beside_all_else(make_live: Callable[..., Live]) -> None:
+    """It takes seconds when it is asked for the first time, and anybody may ask."""
+    live = make_live()
+    longest, done = 0.0, threading.Event()
+
+    def ask() -> None:
+        with live.client() as client:
+            assert client.get("/openapi.json").json()["openapi"]
+        done.set()
+
+    with live.client() as client:
+        client.get("/healthz")
+        asking = [threading.Thread(target=ask) for _ in range(50)]  # more than there are threads for all routes
+        for thread in asking:
+            thread.start()
+        begin = time.monotonic()
+        while not done.is_set() and time.monotonic() - begin < 30.0:
+            before = time.monotonic()
+            client.get("/v1/info")
+            longest = max(longest, time.monotonic() - before)
+        took = time.monotonic() - begin
+        for thread in asking:
+            thread.join()
+    assert longest < 0.5 * took

@@ -17,6 +17,7 @@ from fastapi import HTTPException
 from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
+from sqlalchemy import select
 
 from service.errors import ServiceError
 from service.files import need_quota
@@ -243,7 +244,14 @@ def test_what_no_job_names_is_swept_and_nothing_else(client: TestClient, tmp_pat
         copy.mkdir()
         (copy / "a").write_bytes((place / "a").read_bytes())
         context.stores.current.publish(copy, name, assets)
-    assert context.removals.sweep(context.stores.current) == 2
+    waiting = submit(client)
+    with context.database.write() as session:  # a server died when it had stored what its first attempt computed
+        session.scalars(select(JobRow).where(JobRow.id == waiting)).one().attempt = 1
+    copy = tmp_path / f"{waiting}.1"
+    copy.mkdir()
+    (copy / "a").write_bytes((place / "a").read_bytes())
+    context.stores.current.publish(copy, copy.name, assets)
+    assert context.removals.sweep(context.stores.current) == 3
     assert sorted(kept(client)) == sorted([f"{job}.1", f"{active}.1"])
     assert client.get(f"/v1/jobs/{job}/results/metrics.json").status_code == 200
     client.post(f"/v1/jobs/{active}/cancel")

@@ -15,6 +15,9 @@ import httpx2 as httpx
 import pytest
 from conftest import upload
 
+from service.dispatcher import sweep
+from service.files import Files
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
@@ -283,3 +286,58 @@ def test_an_independent_tus_client(make_live: Callable[..., Live]) -> None:
     again.upload()
     found = httpx.get(first.url.replace("tus", "files")).json()
     assert (found["state"], found["sha256"]) == ("complete", hashlib.sha256(content).hexdigest())
+
+
+def test_a_line_that_breaks_after_the_last_byte_leaves_a_complete_upload(make_live: Callable[..., Live]) -> None:
+    """Chunked: all bytes came, the end of the body did not. To the client, offset = length means that it is done."""
+    live = make_live()
+    with live.client() as client:
+        place = begin(client, 10)
+    head = (
+        f"PATCH {place} HTTP/1.1\r\nHost: 127.0.0.1:{live.port}\r\nTus-Resumable: 1.0.0\r\nUpload-Offset: 0\r\n"
+        "Content-Type: application/offset+octet-stream\r\nTransfer-Encoding: chunked\r\n\r\na\r\n0123456789\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", live.port)) as line:
+        line.sendall(head.encode())
+        time.sleep(0.3)
+    ident, deadline = place.rsplit("/", 1)[1], time.monotonic() + 10.0
+    with live.client() as client:
+        while (found := client.get(f"/v1/files/{ident}").json())["state"] != "complete":
+            assert time.monotonic() < deadline, found
+            time.sleep(0.05)
+        assert found["sha256"] == hashlib.sha256(b"0123456789").hexdigest()
+        assert client.post("/v1/jobs", json={"log": ident}).status_code == 201
+
+
+def test_no_offset_says_that_all_is_there_before_the_upload_is_complete(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A server that dies between the last byte and the commit: the client must see that there is something to do."""
+
+    def dies(*_: Any) -> None:
+        raise KeyError("kill -9")
+
+    place = begin(client, 10)
+    with monkeypatch.context() as patch:
+        patch.setattr(Files, "complete", dies)
+        assert client.patch(place, headers={**PATCH, "Upload-Offset": "0"}, content=b"0123456789").status_code == 500
+    at = offset(client, place)
+    assert at < 10
+    answer = client.patch(place, headers={**PATCH, "Upload-Offset": str(at)}, content=b"0123456789"[at:])
+    assert (answer.status_code, answer.headers["upload-offset"]) == (204, "10")
+    assert stored(client, place.rsplit("/", 1)[1]) == b"0123456789"
+
+
+def test_an_upload_that_an_older_server_left_whole_but_not_complete_goes_on(client: TestClient) -> None:
+    place = begin(client, 10)
+    client.patch(place, headers={**PATCH, "Upload-Offset": "0"}, content=b"012345678")
+    context: Any = client.app.state.context  # type: ignore[attr-defined]
+    ident = place.rsplit("/", 1)[1]
+    path = context.storage.upload_path(ident)
+    path.write_bytes(b"0123456789")
+    path.chmod(0o400)
+    context.files.advance(ident, 10)
+    sweep(context.database, context.storage)
+    assert (offset(client, place), path.stat().st_mode & 0o777) == (9, 0o600)
+    assert client.patch(place, headers={**PATCH, "Upload-Offset": "9"}, content=b"9").status_code == 204
+    assert client.get(f"/v1/files/{ident}").json()["sha256"] == hashlib.sha256(b"0123456789").hexdigest()

@@ -16,9 +16,11 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from conftest import submit, wait
+from conftest import settings, submit, wait
 
 from service import webhooks
+from service.database import Database
+from service.tables import DeliveryRow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -103,13 +105,16 @@ def test_given_up_after_some_attempts(make_client: Callable[..., TestClient], re
     [
         *("127.0.0.1", "localhost", "[::1]", "10.0.0.1", "169.254.169.254", "[::ffff:127.0.0.1]", "0.0.0.0"),
         "2130706433",
+        # Reserved, but public to some versions of Python.
+        *("192.0.0.8", "[64:ff9b:1::7f00:1]", "[::ffff:0:7f00:1]", "[fec0::1]"),
         # What a gateway makes an IPv4 address of: NAT64, 6to4, IPv4-compatible, Teredo.
         *("[64:ff9b::7f00:1]", "[64:ff9b::a9fe:a9fe]", "[2002:a00:1::1]", "[::a00:1]", "[2001:0:7f00:1::]"),
     ],
 )
 def test_private_addresses_are_refused(host: str) -> None:
-    with pytest.raises(webhooks.ForbiddenAddress):
+    with pytest.raises(webhooks.ForbiddenAddress) as error:
         webhooks.post(f"http://{host}:1/", b"", {}, private=False)
+    assert str(error.value) == f"{host.strip('[]')} leads to an address that is not public"
 
 
 def test_other_schemes_and_user_names_are_refused() -> None:
@@ -162,3 +167,28 @@ def test_over_tls_to_whom_the_certificate_names(
     assert receiver.got[-1][1] == b"{}"
     with pytest.raises(ssl.SSLCertVerificationError):
         webhooks.post(f"https://127.0.0.1:{port}/", b"{}", {}, private=True)
+
+
+def test_a_tenant_with_many_webhooks_does_not_hold_up_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    database = Database(tmp_path / "other.db")
+    now = time.time()
+    with database.write() as session:
+        for k, tenant in enumerate(["many"] * 20 + ["single"] * 2):
+            session.add(
+                DeliveryRow(
+                    id=f"{tenant}-{k}", tenant=tenant, job_id="x", url="x", body="", next_at=now - 100 + k, created=now
+                )
+            )
+    order: list[str] = []
+
+    def dead(url: str, body: bytes, headers: dict[str, str], private: bool) -> int:
+        order.append(headers["Hsloc-Event-Id"].partition("-")[0])
+        raise TimeoutError
+
+    monkeypatch.setattr(webhooks, "post", dead)
+    deliverer = webhooks.Deliverer(database, settings(tmp_path))
+    while deliverer.deliver_next():
+        assert len(order) <= 22
+    database.close()
+    assert len(order) == 22
+    assert order[:4] in (["many", "single"] * 2, ["single", "many"] * 2)

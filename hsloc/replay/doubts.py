@@ -1,27 +1,20 @@
-"""What makes a finished run doubtful as a whole: scans that found no place, and odometry that jumps."""
+"""What makes a finished run doubtful as a whole: scans that found no place."""
 
 from __future__ import annotations
 
 from collections import Counter
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from hsloc.log.check_topics import MAX_SPEED
-
 if TYPE_CHECKING:
-    from hsloc.model.trajectory import Trajectory
     from hsloc.replay.run import Result
 
 _MOST = 0.5
 """Of the scans; where more than this part found no place, what the others say is not to be taken on trust."""
-_LEAST_JUMP, _LONGEST_S = 0.5, 1.0
-"""A step of odometry is a jump as `hsloc check` tells it: farther than this (m), within this time (s), and too fast."""
 
 
 def doubts(result: Result) -> list[str]:
     """A line for each doubt, with what to do about it."""
-    return [*_unplaced(result), *_jumps(result.odometry, result.summary.odom_topic)]
+    return _unplaced(result)
 
 
 def _unplaced(result: Result) -> list[str]:
@@ -37,21 +30,5 @@ def _unplaced(result: Result) -> list[str]:
     line = (
         f"{without} of {scans} scans found no place on the map, so {told}: check map, mounting (--laser-pose) and "
         "odometry (hsloc check), or give the start (--initial-pose)"
-    )
-    return [line]
-
-
-def _jumps(odometry: Trajectory, topic: str | None) -> list[str]:
-    """Odometry that was reset while the log ran: at the jump, and where no scan mends it, poses are wrong."""
-    seconds = np.diff(odometry.stamps_ns) / 1e9
-    way = np.hypot(*np.diff(odometry.poses[:, :2], axis=0).T)
-    jumps = (seconds > 0.0) & (seconds < _LONGEST_S) & (way > np.maximum(MAX_SPEED * seconds, _LEAST_JUMP))
-    if not jumps.any():
-        return []
-    first = int(np.argmax(jumps))
-    at = (int(odometry.stamps_ns[first + 1]) - int(odometry.stamps_ns[0])) / 1e9
-    line = (
-        f"odometry ({topic}) jumps ({int(jumps.sum())} times, first by {way[first]:.2f} m at {at:.3f} s): poses there "
-        "may be wrong; was it reset, or do two publishers share the topic?"
     )
     return [line]

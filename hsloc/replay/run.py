@@ -20,6 +20,7 @@ from hsloc.matching.window import Window
 from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
+from hsloc.replay.continuity import Joined
 from hsloc.replay.engine import replay
 from hsloc.replay.garbage import seldom_collected
 from hsloc.replay.recording import Recording
@@ -184,10 +185,10 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
         likelihood, estimator = None, _mapper(spec, state)
     first = None if spec.no_odometry else first_odometry(log.events())
     prepared = time.perf_counter()
-    recording = Recording()
+    recording, events = Recording(), Joined(_events(spec, log), log.summary.odom_topic)
     with seldom_collected():
         for event, estimate in replay(
-            _reported(log, _events(spec, log), recording, progress), estimator, deskew=spec.read.deskew, first=first
+            _reported(log, events, recording, progress), estimator, deskew=spec.read.deskew, first=first
         ):
             recording.add(event, estimate)
     replayed = time.perf_counter()
@@ -218,7 +219,7 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
         grid=_must(grid),
         diagnostics=recording.diagnostics(),
         losses=log.losses,
-        warnings=(*log.summary.warnings, *warnings),
+        warnings=(*log.summary.warnings, *warnings, *events.doubt()),
         seconds=seconds,
         mode="localise" if localise else "slam",
         mapping=mapping,

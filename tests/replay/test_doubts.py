@@ -1,10 +1,11 @@
-"""A run that is doubtful as a whole says so: most scans without a place, odometry that jumps."""
+"""A run that is doubtful as a whole says so: most scans without a place, odometry that jumps and is mended."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hsloc.log.reader import open_log
@@ -50,13 +51,39 @@ def test_a_log_too_short_to_be_sure_is_all_guesses():
     assert "every pose is a guess" in doubts(found)[0]
 
 
-@pytest.mark.parametrize("mode", ["localise", "slam"])
-def test_odometry_that_is_reset_is_told_with_place_and_length(tmp_path, mode):
-    def reset(event):
-        if isinstance(event, Odometry) and event.stamp_ns >= 1_700_000_010_000_000_000:
-            return replace(event, T_odom_base=Pose2(5.0, 0.0, 0.0) @ event.T_odom_base)
+def test_odometry_that_is_told_in_millimetres_is_not_mended(tmp_path):
+    def in_millimetres(event):
+        if isinstance(event, Odometry):
+            pose = event.T_odom_base
+            return replace(event, T_odom_base=Pose2(1000.0 * pose.x, 1000.0 * pose.y, pose.theta))
         return event
 
-    log = rewritten(tmp_path / "run.mcap", reset, end=12.0)
-    (line,) = doubts(run(RunSpec(logs=(log,), mode=mode, initial_pose=Pose2(2.6, 8.1, 1.5708))))
-    assert line.startswith("odometry (/odom) jumps (1 times, first by 4.98 m at 10.000 s)")  # 5 m, less what it drove
+    log = rewritten(tmp_path / "run.mcap", in_millimetres, end=6.0)
+    found = run(RunSpec(logs=(log,), initial_pose=Pose2(2.6, 8.1, 1.5708)))
+    (line,) = (text for text in found.warnings if "jumps" in text)
+    assert "too often to be mended" in line
+    assert found.odometry.length() > 1000.0  # as it is, but for the first few jumps
+
+
+@pytest.mark.parametrize("mode", ["localise", "slam"])
+@pytest.mark.parametrize("reset", [Pose2(5.0, 0.0, 0.0), Pose2(0.1, 0.0, 3.0), Pose2(-40.0, 7.0, -2.0)])
+def test_odometry_that_begins_anew_goes_on_where_it_was_and_is_told(tmp_path, mode, reset):
+    def begun_anew(event):
+        if isinstance(event, Odometry) and event.stamp_ns >= 1_700_000_010_000_000_000:
+            return replace(event, T_odom_base=reset @ event.T_odom_base)
+        return event
+
+    start = Pose2(2.6, 8.1, 1.5708)
+    spec = RunSpec(logs=(rewritten(tmp_path / "run.mcap", begun_anew, end=14.0),), mode=mode, initial_pose=start)
+    found = run(spec)
+    whole = run(replace(spec, logs=(rewritten(tmp_path / "whole.mcap", lambda event: event, end=14.0),)))
+    (line,) = (text for text in found.warnings if "jumps" in text)
+    assert line.startswith("odometry (/odom) jumps (1 times, first by ")
+    assert " at 10.000 s); it goes on there" in line
+    assert not any("jumps" in text for text in whole.warnings)
+    # But for the one step in which it jumped, 2 cm at 1 m/s.
+    for name in ("odometry", "trajectory"):
+        a, b = getattr(found, name), getattr(whole, name)
+        assert np.array_equal(a.stamps_ns, b.stamps_ns)
+        assert np.abs(a.poses - b.poses)[:, :2].max() < 0.05
+    assert found.localised.all()

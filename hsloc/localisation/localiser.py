@@ -14,7 +14,7 @@ import numpy as np
 
 from hsloc.errors import ConfigError
 from hsloc.localisation.motion import OdometryNoise, fuse, predict_covariance
-from hsloc.localisation.relocaliser import REMEMBERED, Relocaliser, RelocaliserParameters, Verdict
+from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters, Verdict
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
@@ -241,8 +241,8 @@ class Localiser:
         )
 
     def _revision(self, verdict: Verdict) -> tuple[tuple[int, Pose2], ...]:
-        """The winner's way since the search began; its first pose holds back to that moment, if it is remembered."""
-        if not verdict.track or len(verdict.track) >= REMEMBERED:
+        """The winner's way since the search began; its first pose holds back to that moment, if it goes back so far."""
+        if not verdict.track or not verdict.track_is_whole:
             return verdict.track
         (_, first), *rest = verdict.track
         return ((self._search_began, first), *rest)

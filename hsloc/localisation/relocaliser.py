@@ -96,6 +96,8 @@ class Verdict:
     reason: str
     track: tuple[tuple[int, Pose2], ...] = ()
     """Once it is sure: the way since the search began, as (odometry messages before, T_map_odom)."""
+    track_is_whole: bool = False
+    """Whether the track goes back to the first scan of the search."""
 
 
 @dataclass(slots=True, eq=False)
@@ -114,6 +116,10 @@ class _Hypothesis:
 _NEAR = 0.5
 _NEAR_ANGLE = radians(15.0)
 _STEP_WINDOW = (0.25, radians(8.0))
+_FITS = 0.5
+"""Going backwards, a scan fits with so large a part of the winner's fitness."""
+_TRACE_LOST = 5
+"""Scans in a row that fit nowhere near, going backwards: before them the robot was elsewhere, or is not known."""
 REMEMBERED = 1000
 """Scans of a search that are kept to retrace the way; older ones are forgotten, so that memory is bounded."""
 
@@ -233,13 +239,19 @@ class Relocaliser:
         reason = f"{len(self._hypotheses)} hypotheses, best {best.mean:.2f}, lead {lead:.2f}, {best.scans} scans"
         covariance = best.covariance if sure else None
         fitness = best.fitness if fresh else None
-        track = self._retrace(best.pose @ motion, best.covariance) if sure else ()
-        return Verdict(best.pose @ motion, covariance, fitness, evaluations, sure, reason, track)
+        track, whole = self._retrace(best, motion) if sure else ((), False)
+        return Verdict(best.pose @ motion, covariance, fitness, evaluations, sure, reason, track, whole)
 
-    def _retrace(self, pose: Pose2, covariance: F64) -> tuple[tuple[int, Pose2], ...]:
-        """The scans seen while searching, localised backwards from where the robot is now known to be."""
+    def _retrace(self, winner: _Hypothesis, motion: Pose2) -> tuple[tuple[tuple[int, Pose2], ...], bool]:
+        """The scans seen while searching, localised backwards from where the robot is now known to be.
+
+        As far as they fit, and whether that is all of them: where several in a row do not, the trace is lost.
+        """
         half, half_angle = _STEP_WINDOW
+        pose, covariance = winner.pose @ motion, winner.covariance
+        fits = max(self._parameters.min_fitness, _FITS * winner.fitness)
         track: list[tuple[int, Pose2]] = []
+        misses = 0
         T_odom_next: Pose2 | None = None
         for count, points, T_odom_base in reversed(self._seen):
             if T_odom_next is not None:
@@ -248,10 +260,14 @@ class Relocaliser:
                 pose = pose @ motion
             T_odom_next = T_odom_base
             match = self._matcher.match(points, self._field, Window(pose, half, half, half_angle), self._rng)
-            if match.fitness >= self._parameters.min_fitness:
+            misses += 1
+            if match.fitness >= fits:
                 pose, covariance = fuse(pose, covariance, match.pose, match.covariance)
+                misses = 0
             track.append((count, pose @ T_odom_base.inverse()))
-        return tuple(reversed(track))
+            if misses == _TRACE_LOST:
+                return tuple(reversed(track[:-misses])), False
+        return tuple(reversed(track)), len(self._seen) < REMEMBERED
 
     def _quick_matcher(self) -> HarmonySearch | Matcher:
         """The matcher with a small budget and one restart; a matcher without a budget stays as it is."""

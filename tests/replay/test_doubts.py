@@ -11,7 +11,7 @@ import pytest
 from hsloc.log.reader import open_log
 from hsloc.log.summary import ReadOptions
 from hsloc.log.writer import LogWriter
-from hsloc.model import Odometry, Pose2, Scan
+from hsloc.model import Odometry, Pose2, Scan, Truth
 from hsloc.replay.doubts import doubts
 from hsloc.replay.run import RunSpec, run
 
@@ -87,3 +87,23 @@ def test_odometry_that_begins_anew_goes_on_where_it_was_and_is_told(tmp_path, mo
         assert np.array_equal(a.stamps_ns, b.stamps_ns)
         assert np.abs(a.poses - b.poses)[:, :2].max() < 0.05
     assert found.localised.all()
+
+
+def test_the_way_is_retraced_as_far_as_the_scans_fit_and_no_farther(tmp_path):
+    """For eight seconds the lidar sees nothing of the map, so that nobody can say where the robot was at first."""
+    rng = np.random.default_rng(0)
+
+    def blind(event):
+        if isinstance(event, Scan) and event.stamp_ns < 1_700_000_008_000_000_000:
+            clutter = rng.uniform(0.3, 6.0, len(event.ranges)).astype(np.float32)
+            return replace(event, ranges=clutter)
+        return event
+
+    found = run(RunSpec(logs=(rewritten(tmp_path / "run.mcap", blind, end=25.0),), unknown_start=True))
+    seconds = (found.trajectory.stamps_ns - 1_700_000_000_000_000_000) / 1e9
+    assert not found.localised[seconds < 6.5].any()
+    assert found.localised[seconds > 20.0].all()
+    truth = open_log(OFFICE, ReadOptions(end_s=25.0))
+    known = {e.stamp_ns: e.T_map_base for e in truth.events() if isinstance(e, Truth)}
+    for stamp, pose, sure in zip(found.trajectory.stamps_ns, found.trajectory.poses, found.localised, strict=True):
+        assert not sure or np.hypot(*(pose[:2] - known[int(stamp)].to_array()[:2])) < 0.3

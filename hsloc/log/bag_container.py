@@ -125,7 +125,11 @@ class BagContainer:
             raise
         except Exception as error:
             reason = (str(error).splitlines() or [""])[0][:160]
-            line = f"{self.path}: cannot be read as a {self.format} ({type(error).__name__}: {reason})"
+            remedy = "rosbag reindex" if self.is_ros1 else f"sqlite3 {self.path.name} .recover"
+            line = (
+                f"{self.path}: cannot be read as a {self.format} ({reason}); if its recorder was stopped hard, "
+                f"`{remedy}` saves what is whole"
+            )
             if losses is None:
                 raise LogFormatError(line) from error
             losses.truncated_files += 1

@@ -194,7 +194,7 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
     replayed = time.perf_counter()
     if recording.scans == 0:
         where = "between --start and --end" if _cut(spec) else f"on {log.summary.scan_topic} that could be read"
-        lost = f": {'; '.join(log.losses.lines())}" if log.losses.data_lost else ""
+        lost = "".join(f": {line}" for line in ["; ".join(log.losses.lines())] if line)
         raise LogError(f"{spec.logs[0]}: no scan {where}{lost}")
     if first is None and not spec.no_odometry:
         where = "between --start and --end" if _cut(spec) else f"on {log.summary.odom_topic} that could be read"

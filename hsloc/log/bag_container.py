@@ -65,7 +65,9 @@ class BagContainer:
             if not connections:
                 return
             for position, (connection, log_time, data) in enumerate(reader.messages(connections)):
-                yield max(log_time, 0), position, numbers[self._key(connection)], data
+                number = numbers[self._key(connection)]
+                if number in chosen:  # A damaged bag yields messages of connections that were not asked for.
+                    yield max(log_time, 0), position, number, data
 
     def verify(self) -> Losses:
         """Read everything and count what is damaged."""

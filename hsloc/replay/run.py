@@ -296,7 +296,7 @@ def _localiser(spec: RunSpec, grid: OccupancyGrid, likelihood: LikelihoodField, 
 
 
 def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:
-    """Have the kernels compiled (once after an installation, ten seconds) before the clock of the replay starts."""
+    """Have the kernels compiled (once after an installation, up to a minute) before the clock of the replay starts."""
     points = np.zeros((1, 2))
     window = Window(likelihood.T_map_field, 0.1, 0.1, 0.1)
     with _uninterrupted():

@@ -198,7 +198,11 @@ def test_wrong_use_ends_with_2(here, capsys, argv):
 
 def test_interrupted_runs_leave_nothing_behind(here):
     command = [sys.executable, "-m", "hsloc.cli.main", "replay", OFFICE, "--out", "out"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
+        # Whoever runs the tests in the background has interrupts ignored, which children inherit.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
     time.sleep(1.2)
     os.killpg(process.pid, signal.SIGINT)
     _, stderr = process.communicate(timeout=120)

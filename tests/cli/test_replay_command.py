@@ -114,6 +114,6 @@ def test_the_progress_bar_can_be_left_out(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     command = ["replay", SLIP, "--end", "2", "--overwrite", "--out", str(tmp_path / "a")]
     assert main(command) == 0
-    assert "writing   [" in capsys.readouterr().err
+    assert "prepare   [" in capsys.readouterr().err
     assert main([*command, "--no-progress"]) == 0
     assert capsys.readouterr().err == ""

@@ -205,6 +205,8 @@ def test_interrupted_sweeps_keep_what_is_finished(tmp_path, capsys):
     process = subprocess.Popen(
         [sys.executable, "-m", "hsloc.cli.main", "sweep", *map(str, words)],
         stderr=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
+        # Whoever runs the tests in the background has interrupts ignored, which children inherit.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     limit = time.monotonic() + 60
     while not (tmp_path / "out" / "office-default-seed0" / "sweep_key.json").exists() and time.monotonic() < limit:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from hsloc.errors import HslocError, LogFormatError
-from hsloc.log.container import Channel, RawMessage
+from hsloc.log.container import Channel, RawMessage, in_runs
 from hsloc.log.definitions import long_name
 from hsloc.log.summary import Losses, TopicStatistics
 
@@ -52,9 +51,7 @@ class BagContainer:
 
     def runs(self, wanted: Collection[int], losses: Losses) -> Iterator[list[RawMessage]]:
         """As `Container.runs`."""
-        messages = self.messages(wanted, losses)
-        while run := list(islice(messages, _RUN)):
-            yield run
+        return in_runs(self.messages(wanted, losses), _RUN)
 
     def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
         """As `Container.messages`; rosbags yields in the order of time."""

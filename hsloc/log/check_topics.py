@@ -23,6 +23,8 @@ LONGEST_SWEEP_S = 2.0
 """Seconds; a lidar that turns more slowly is an error of the log."""
 MAX_SPEED = 15.0
 """m/s; odometry that moves faster has jumped."""
+LEAST_JUMP, LONGEST_JUMP_S = 0.5, 1.0
+"""If it is farther than this (m), within less than this (s)."""
 _BEAMS_TOLERATED = 0.1
 
 
@@ -216,7 +218,7 @@ class OdometryCheck(TopicCheck):
             stamp, x, y = self._position
             seconds = (message.stamp_ns - stamp) / NANOSECONDS
             way = hypot(pose.x - x, pose.y - y)
-            if 0.0 < seconds < 1.0 and way > max(MAX_SPEED * seconds, 0.5):
+            if 0.0 < seconds < LONGEST_JUMP_S and way > max(MAX_SPEED * seconds, LEAST_JUMP):
                 self._findings.add(
                     Severity.WARNING, "odometry_jumps", place,
                     f"odometry jumps (the first by {way:.2f} m in {seconds:.3f} s)",

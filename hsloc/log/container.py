@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
@@ -29,6 +30,12 @@ class Channel:
     message_encoding: str
     schema_encoding: str = ""
     schema: bytes = b""
+
+
+def in_runs(messages: Iterator[RawMessage], size: int) -> Iterator[list[RawMessage]]:
+    """Messages in lists of `size`; the last may be shorter."""
+    while run := list(islice(messages, size)):
+        yield run
 
 
 class Container(Protocol):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import OutputError
+from hsloc.log.decode import PLANE
 from hsloc.log.transforms import Transform3
 
 if TYPE_CHECKING:
@@ -31,7 +32,6 @@ _SCAN = Struct("<7f")
 _POSE = Struct("<7d")
 _MAP_INFO = Struct("<iIfII")
 
-_PLANE = np.array((0, 1, 5, 6, 7, 11, 30, 31, 35))
 """Where the 3 x 3 of (x, y, yaw) stands in the 6 x 6 of (x, y, z, roll, pitch, yaw), both row by row."""
 
 
@@ -94,7 +94,7 @@ def _pose(pose: Pose2) -> bytes:
 def _covariance(covariance: NDArray[np.float64] | None) -> bytes:
     full = np.zeros(36, dtype="<f8")
     if covariance is not None:
-        full[_PLANE] = np.asarray(covariance, dtype=np.float64).reshape(9)
+        full[PLANE] = np.asarray(covariance, dtype=np.float64).reshape(9)
     return full.tobytes()
 
 

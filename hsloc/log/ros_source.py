@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import heapq
 from collections import defaultdict
-from itertools import islice
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
 from hsloc.log import definitions
+from hsloc.log.container import in_runs
 from hsloc.log.decoders import Undecodable, canonical_type, is_decodable
 from hsloc.log.feeds import OdometryFeed, PoseFeed, ScanFeed, TransformFeed
 from hsloc.log.frames import BASE_FRAMES
@@ -133,7 +133,7 @@ class RosSource:
         if [*wanted] == [0]:
             return self._containers[0].runs(wanted[0], losses)
         streams = [_keyed(self._containers[number], number, channels, losses) for number, channels in wanted.items()]
-        return _runs(heapq.merge(*streams, key=itemgetter(0)))
+        return in_runs(heapq.merge(*streams, key=itemgetter(0)), _CUT_BATCH)
 
     def map(self) -> OccupancyGrid | None:
         """The last map of /map, or of the only topic with maps."""
@@ -172,11 +172,6 @@ def _key(number: int, channel: int) -> int:
 def _keyed(container: Container, number: int, channels: Sequence[int], losses: Losses) -> Iterator[RawMessage]:
     for log_time, position, channel, data in container.messages(channels, losses):
         yield log_time, position, _key(number, channel), data
-
-
-def _runs(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
-    while run := list(islice(messages, _CUT_BATCH)):
-        yield run
 
 
 def _batches(runs: Iterator[list[RawMessage]], most: int) -> Iterator[list[RawMessage]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from math import hypot
 from typing import TYPE_CHECKING
 
-from hsloc.log.check_topics import MAX_SPEED
+from hsloc.log.check_topics import LEAST_JUMP, LONGEST_JUMP_S, MAX_SPEED
 from hsloc.model.events import Odometry
 from hsloc.model.pose2 import Pose2, wrap_angle
 
@@ -18,11 +18,8 @@ if TYPE_CHECKING:
 
     from hsloc.model.events import Event
 
-_LEAST_JUMP, _LEAST_TURN, _LONGEST_S = 0.5, 0.8, 1.0
-"""A step is a jump as `hsloc check` tells it: farther than this (m), within this time (s), and too fast; or it turns by
-more than this (rad), and too fast."""
-_MAX_TURN = 10.0
-"""rad/s; no robot with a lidar turns faster."""
+_LEAST_TURN, _MAX_TURN = 0.8, 10.0
+"""A step is a jump as `hsloc check` tells it, or if it turns by more than this (rad), and faster than this (rad/s)."""
 _MOST = 20
 """So many jumps are mended; after more of them the odometry is taken for broken."""
 
@@ -59,11 +56,11 @@ class Joined:
     def _has_jumped(self, before: Odometry, after: Odometry) -> bool:
         a, b = before.T_odom_base, after.T_odom_base
         way, turn = hypot(b.x - a.x, b.y - a.y), abs(b.theta - a.theta)
-        if way <= _LEAST_JUMP and turn <= _LEAST_TURN:
+        if way <= LEAST_JUMP and turn <= _LEAST_TURN:
             return False
         seconds, turn = (after.stamp_ns - before.stamp_ns) / 1e9, abs(wrap_angle(turn))
-        fast = way > max(MAX_SPEED * seconds, _LEAST_JUMP) or turn > max(_MAX_TURN * seconds, _LEAST_TURN)
-        if not (fast and 0.0 < seconds < _LONGEST_S):
+        fast = way > max(MAX_SPEED * seconds, LEAST_JUMP) or turn > max(_MAX_TURN * seconds, _LEAST_TURN)
+        if not (fast and 0.0 < seconds < LONGEST_JUMP_S):
             return False
         self._jumps += 1
         if self._jumps == 1:

@@ -13,8 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import ConfigError
-from hsloc.localisation.motion import OdometryNoise, fuse, predict_covariance
-from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters, Verdict
+from hsloc.localisation.match_gate import MatchGate, MatchLimits
+from hsloc.localisation.motion import fuse, predict_covariance
+from hsloc.localisation.motion_gate import MotionGate
+from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, OdometryNoise, OmnidirectionalNoise
+from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
+    from hsloc.localisation.global_search import GlobalSearch, RelocaliserResult
+    from hsloc.localisation.motion_models import MotionModel
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Match, Matcher
     from hsloc.model.occupancy_grid import OccupancyGrid
@@ -61,7 +66,11 @@ class LocaliserParameters:
     """Standard deviation of a given start in x and y (m)."""
     initial_sigma_angle: float = radians(15.0)
     """And in theta (rad)."""
+    motion_model: str = "differential"
+    """How the base moves, which chooses the noise of its odometry: one of differential, ackermann, omnidirectional."""
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
+    ackermann_noise: AckermannNoise = field(default_factory=AckermannNoise)
+    omnidirectional_noise: OmnidirectionalNoise = field(default_factory=OmnidirectionalNoise)
     relocaliser: RelocaliserParameters = field(default_factory=RelocaliserParameters)
 
     def __post_init__(self) -> None:
@@ -74,30 +83,53 @@ class LocaliserParameters:
         for name in ("window_sigmas", "window_min", "window_min_angle", "initial_sigma", "initial_sigma_angle"):
             if not getattr(self, name) > 0.0:
                 raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be positive")
+        if self.motion_model not in MOTION_MODELS:
+            raise ConfigError(
+                f"localiser: motion_model is {self.motion_model!r}; it must be one of {', '.join(MOTION_MODELS)}"
+            )
+
+    def noise(self) -> MotionModel:
+        """The noise of the motion model that is chosen."""
+        models: dict[str, MotionModel] = {
+            "differential": self.odometry_noise,
+            "ackermann": self.ackermann_noise,
+            "omnidirectional": self.omnidirectional_noise,
+        }
+        return models[self.motion_model]
+
+    def match_limits(self) -> MatchLimits:
+        """The limits of the match gate."""
+        return MatchLimits(
+            min_fitness=self.min_fitness,
+            min_fitness_ratio=self.usual_fraction,
+            recovery_fitness_ratio=self.convincing_fraction,
+        )
 
 
 _WIDER = (0.5, radians(20.0))
 """Half-widths (m, rad) of the window tried after a refused match: what a wheel may slip."""
-_BETTER = 0.1
-"""So much fitter must a match outside the window of the prediction be: ambiguous places look alike."""
-_FORGET = 0.05
-"""Weight of a new match in the usual fitness."""
 
 
 class Localiser:
-    """State: `T_map_odom`, the covariance, and the odometry at the last match. An `Estimator`."""
+    """State: `T_map_odom`, the covariance, and the odometry at the last match. An `Estimator`.
+
+    Matcher, motion model and global search are what their protocols ask for; `from_parameters` makes the usual ones.
+    """
 
     def __init__(
         self,
-        grid: OccupancyGrid,
         likelihood: LikelihoodField,
         matcher: Matcher,
+        search: GlobalSearch,
+        motion_model: MotionModel,
         parameters: LocaliserParameters,
         rng: Generator,
         initial_pose: Pose2 | None = None,
     ) -> None:
         self._field = likelihood
         self._matcher = matcher
+        self._global_search = search
+        self._motion_model = motion_model
         self._parameters = parameters
         self._rng = rng
         self._count = 0
@@ -108,13 +140,24 @@ class Localiser:
         self._covariance = np.diag(
             (parameters.initial_sigma**2, parameters.initial_sigma**2, parameters.initial_sigma_angle**2)
         )
-        self._usual: float | None = None
-        self._rejected = 0
-        self._start_given = initial_pose is not None
-        self._relocaliser = Relocaliser(
-            grid, likelihood, matcher, parameters.relocaliser, parameters.odometry_noise, rng
-        )
+        self._motion_gate = MotionGate(parameters.update_min_d, parameters.update_min_a)
+        self._match_gate = MatchGate(parameters.match_limits())
         self._searching = initial_pose is None
+
+    @classmethod
+    def from_parameters(
+        cls,
+        grid: OccupancyGrid,
+        likelihood: LikelihoodField,
+        matcher: Matcher,
+        parameters: LocaliserParameters,
+        rng: Generator,
+        initial_pose: Pose2 | None = None,
+    ) -> Localiser:
+        """With the relocaliser and the motion model that the parameters name; `initial_pose` None is unknown."""
+        noise = parameters.noise()
+        search = Relocaliser(grid, likelihood, matcher, parameters.relocaliser, noise, rng)
+        return cls(likelihood, matcher, search, noise, parameters, rng, initial_pose)
 
     @property
     def T_map_odom(self) -> Pose2:
@@ -147,25 +190,23 @@ class Localiser:
         p = self._parameters
         motion = (self._T_odom_match or T_odom_base).between(T_odom_base)
         predicted = self._T_map_match @ motion
-        first = self._usual is None and self._rejected == 0
-        if not first and np.hypot(motion.x, motion.y) < p.update_min_d and abs(motion.theta) < p.update_min_a:
+        if not self._match_gate.is_fresh and not self._motion_gate.is_open(motion):
             return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
         covariance = predict_covariance(
-            self._covariance, self._T_map_match, motion, p.odometry_noise.covariance(motion)
+            self._covariance, self._T_map_match, motion, self._motion_model.covariance(motion)
         )
         points = paired.points_base()
         if len(points) < p.min_points:
             self._take(predicted, covariance, T_odom_base)
             return Estimate(scan.stamp_ns, predicted, Status.NO_RETURNS, covariance, reason=f"{len(points)} returns")
         match, evaluations = self._match(points, predicted, covariance)
-        reason = self._refusal(match)
+        reason = self._match_gate.refusal(match.fitness)
         if reason:
             return self._refuse(paired, predicted, covariance, match, evaluations, reason)
         pose, covariance = (
             fuse(predicted, covariance, match.pose, match.covariance) if p.fuse else (match.pose, match.covariance)
         )
-        self._rejected = 0
-        self._usual = match.fitness if self._usual is None else self._usual + _FORGET * (match.fitness - self._usual)
+        self._match_gate.accept(match.fitness)
         self._take(pose, covariance, T_odom_base)
         return Estimate(scan.stamp_ns, pose, Status.MATCHED, covariance, match.fitness, evaluations)
 
@@ -175,7 +216,7 @@ class Localiser:
         window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
         best = self._matcher.match(points, self._field, window, self._rng)
         evaluations = best.evaluations
-        if self._usual is not None and self._refusal(best):
+        if self._match_gate.usual is not None and self._match_gate.refusal(best.fitness):
             wide = Window(
                 predicted,
                 max(window.half_x, _WIDER[0]),
@@ -184,18 +225,9 @@ class Localiser:
             )
             match = self._matcher.match(points, self._field, wide, self._rng)
             evaluations += match.evaluations
-            if match.fitness >= max(best.fitness + _BETTER, p.convincing_fraction * self._usual):
+            if self._match_gate.is_recovered(best.fitness, match.fitness):
                 best = match
         return best, evaluations
-
-    def _refusal(self, match: Match) -> str:
-        """Why a match is not believed; empty if it is."""
-        p = self._parameters
-        if match.fitness < p.min_fitness:
-            return f"fitness {match.fitness:.2f} below {p.min_fitness:.2f}"
-        if self._usual is not None and match.fitness < p.usual_fraction * self._usual:
-            return f"fitness {match.fitness:.2f} far below the usual {self._usual:.2f}"
-        return ""
 
     def _refuse(
         self,
@@ -207,44 +239,43 @@ class Localiser:
         reason: str,
     ) -> Estimate:
         """The prediction stands; after too many refusals the pose is lost."""
-        self._rejected += 1
+        refusals = self._match_gate.refuse()
         self._take(predicted, covariance, paired.T_odom_base)
         status = Status.REJECTED
-        if self._rejected >= self._parameters.lost_after:
+        if refusals >= self._parameters.lost_after:
             self._searching = True
             self._search_began = self._count
-            self._relocaliser.start()
+            self._global_search.start()
             status, reason = Status.SEARCHING, f"lost: {reason}"
         return Estimate(paired.scan.stamp_ns, predicted, status, covariance, match.fitness, evaluations, reason)
 
     def _search(self, paired: PairedScan) -> Estimate:
         """Let the relocaliser see the scan; take its answer when it is sure."""
         scan, T_odom_base = paired.scan, paired.T_odom_base
-        verdict = self._relocaliser.update(paired, self._count)
-        pose = self._T_map_odom @ T_odom_base if verdict.pose is None else verdict.pose
+        result = self._global_search.update(paired, self._count)
+        pose = self._T_map_odom @ T_odom_base if result.pose is None else result.pose
         status = Status.SEARCHING
-        if verdict.is_sure:
+        if result.is_sure:
             self._searching = False
-            self._rejected = 0
-            self._usual = verdict.fitness
+            self._match_gate.restart(result.fitness)
             status = Status.RELOCALISED
-        self._take(pose, self._covariance if verdict.covariance is None else verdict.covariance, T_odom_base)
+        self._take(pose, self._covariance if result.covariance is None else result.covariance, T_odom_base)
         return Estimate(
             scan.stamp_ns,
             pose,
             status,
-            verdict.covariance,
-            verdict.fitness,
-            verdict.evaluations,
-            verdict.reason,
-            self._revision(verdict),
+            result.covariance,
+            result.fitness,
+            result.evaluations,
+            result.reason,
+            self._revision(result),
         )
 
-    def _revision(self, verdict: Verdict) -> tuple[tuple[int, Pose2], ...]:
+    def _revision(self, result: RelocaliserResult) -> tuple[tuple[int, Pose2], ...]:
         """The winner's way since the search began; its first pose holds back to that moment, if it goes back so far."""
-        if not verdict.track or not verdict.track_is_whole:
-            return verdict.track
-        (_, first), *rest = verdict.track
+        if not result.track or not result.track_is_whole:
+            return result.track
+        (_, first), *rest = result.track
         return ((self._search_began, first), *rest)
 
     def _take(self, pose: Pose2, covariance: F64, T_odom_base: Pose2) -> None:

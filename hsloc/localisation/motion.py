@@ -1,14 +1,13 @@
-"""How uncertain a motion is that odometry tells: the prediction step of the EKF."""
+"""The covariances of an extended Kalman filter over poses: prediction and update."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import atan2, cos, hypot, pi, sin
+from math import cos, sin
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.errors import ConfigError
+from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.model.pose2 import Pose2, wrap_angle
 
 if TYPE_CHECKING:
@@ -16,51 +15,7 @@ if TYPE_CHECKING:
 
     F64 = NDArray[np.float64]
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OdometryNoise:
-    """The odometry motion model of *Probabilistic Robotics* (Thrun, Burgard, Fox; 5.4), names as in AMCL.
-
-    A motion is a turn, a straight line and a turn; their variances are `alpha1 rot^2 + alpha2 trans^2` (both turns)
-    and `alpha3 trans^2 + alpha4 (rot1^2 + rot2^2)`. The defaults mean a robot that nobody calibrated: 10 % of the way,
-    20 % of a turn. (With 20 % of the way the matches pull the pose from door to door in the corridors of Wean Hall.)
-    """
-
-    alpha1: float = 0.04
-    """Noise of a turn from turning (rad^2 / rad^2)."""
-    alpha2: float = 0.02
-    """Noise of a turn from driving (rad^2 / m^2)."""
-    alpha3: float = 0.01
-    """Noise of driving from driving (m^2 / m^2)."""
-    alpha4: float = 0.01
-    """Noise of driving from turning (m^2 / rad^2)."""
-
-    def __post_init__(self) -> None:
-        for name in ("alpha1", "alpha2", "alpha3", "alpha4"):
-            if not getattr(self, name) >= 0.0:
-                raise ConfigError(f"odometry_noise: {name} is {getattr(self, name)}; it must be 0 or more")
-
-    def covariance(self, motion: Pose2) -> F64:
-        """Covariance (3, 3) of a motion, in the frame in which it began.
-
-        For a robot that drove backwards the first turn is taken from its back, as in AMCL.
-        """
-        trans = hypot(motion.x, motion.y)
-        rot1 = atan2(motion.y, motion.x) if trans > 0.01 else 0.0
-        rot2 = wrap_angle(motion.theta - rot1)
-        turn1, turn2 = _shortest(rot1), _shortest(rot2)
-        var1 = self.alpha1 * turn1**2 + self.alpha2 * trans**2
-        var2 = self.alpha1 * turn2**2 + self.alpha2 * trans**2
-        var_trans = self.alpha3 * trans**2 + self.alpha4 * (turn1**2 + turn2**2)
-        c, s = cos(rot1), sin(rot1)
-        jacobian = np.array(((-s * trans, c, 0.0), (c * trans, s, 0.0), (1.0, 0.0, 1.0)))
-        covariance: F64 = jacobian @ np.diag((var1, var_trans, var2)) @ jacobian.T
-        return covariance
-
-
-def _shortest(turn: float) -> float:
-    """A turn, or what it lacks to half a turn: driving backwards is no turn."""
-    return min(abs(turn), abs(pi - abs(turn)))
+__all__ = ["OdometryNoise", "fuse", "predict_covariance"]
 
 
 def predict_covariance(covariance: F64, pose: Pose2, motion: Pose2, motion_covariance: F64) -> F64:

@@ -14,13 +14,15 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
-from math import floor, hypot, pi, radians
+from math import floor, pi, radians
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.errors import ConfigError
+from hsloc.localisation.global_search import RelocaliserResult
 from hsloc.localisation.motion import fuse, predict_covariance
+from hsloc.localisation.motion_gate import MotionGate
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2, wrap_angle
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from hsloc.localisation.motion import OdometryNoise
+    from hsloc.localisation.motion_models import MotionModel
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
     from hsloc.model.events import PairedScan
@@ -84,22 +86,6 @@ def _check(ok: bool, name: str, value: object, rule: str) -> None:
         raise ConfigError(f"relocaliser: {name} is {value}; it must be {rule}")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Verdict:
-    """What the relocaliser thinks after a scan."""
-
-    pose: Pose2 | None
-    covariance: F64 | None
-    fitness: float | None
-    evaluations: int
-    is_sure: bool
-    reason: str
-    track: tuple[tuple[int, Pose2], ...] = ()
-    """Once it is sure: the way since the search began, as (odometry messages before, T_map_odom)."""
-    track_is_whole: bool = False
-    """Whether the track goes back to the first scan of the search."""
-
-
 @dataclass(slots=True, eq=False)
 class _Hypothesis:
     pose: Pose2
@@ -125,7 +111,7 @@ REMEMBERED = 1000
 
 
 class Relocaliser:
-    """Searches the whole map; its state is a list of hypotheses."""
+    """A `GlobalSearch` by tiles; its state is a list of hypotheses."""
 
     def __init__(
         self,
@@ -133,13 +119,14 @@ class Relocaliser:
         likelihood: LikelihoodField,
         matcher: Matcher,
         parameters: RelocaliserParameters,
-        noise: OdometryNoise,
+        motion_model: MotionModel,
         rng: Generator,
     ) -> None:
         self._field = likelihood
         self._matcher = matcher
         self._parameters = parameters
-        self._noise = noise
+        self._motion_model = motion_model
+        self._gate = MotionGate(parameters.step_min_d, parameters.step_min_a)
         self._rng = rng
         self._tiles = _tiles(grid, self._parameters.tile)
         self._hypotheses: list[_Hypothesis] = []
@@ -152,13 +139,12 @@ class Relocaliser:
         self._T_odom_last = None
         self._seen.clear()
 
-    def update(self, paired: PairedScan, odometry_count: int) -> Verdict:
+    def update(self, paired: PairedScan, odometry_count: int) -> RelocaliserResult:
         """Take a scan, and how many odometry messages there were until now."""
         p = self._parameters
         T_odom_base = paired.T_odom_base
         motion = Pose2() if self._T_odom_last is None else self._T_odom_last.between(T_odom_base)
-        moved = hypot(motion.x, motion.y) >= p.step_min_d or abs(motion.theta) >= p.step_min_a
-        if self._hypotheses and not moved:
+        if self._hypotheses and not self._gate.is_open(motion):
             return self._verdict(motion, 0, False)
         points = paired.points_base()
         if len(points) < p.min_points:
@@ -201,7 +187,7 @@ class Relocaliser:
         """Move the hypotheses with the odometry and match them again."""
         evaluations = 0
         half, half_angle = _STEP_WINDOW
-        spread = 3.0 * np.sqrt(np.diag(self._noise.covariance(motion)))
+        spread = 3.0 * np.sqrt(np.diag(self._motion_model.covariance(motion)))
         half = max(half, float(spread[:2].max()))
         half_angle = max(half_angle, float(spread[2]))
         quick = self._quick_matcher()
@@ -229,9 +215,9 @@ class Relocaliser:
                 kept.append(hypothesis)
         self._hypotheses = kept
 
-    def _verdict(self, motion: Pose2, evaluations: int, fresh: bool) -> Verdict:
+    def _verdict(self, motion: Pose2, evaluations: int, fresh: bool) -> RelocaliserResult:
         if not self._hypotheses:
-            return Verdict(None, None, None, evaluations, False, "searching the whole map")
+            return RelocaliserResult(None, None, None, evaluations, False, "searching the whole map")
         p = self._parameters
         best = self._hypotheses[0]
         lead = best.total - self._hypotheses[1].total if len(self._hypotheses) > 1 else p.drop
@@ -240,7 +226,7 @@ class Relocaliser:
         covariance = best.covariance if sure else None
         fitness = best.fitness if fresh else None
         track, whole = self._retrace(best, motion) if sure else ((), False)
-        return Verdict(best.pose @ motion, covariance, fitness, evaluations, sure, reason, track, whole)
+        return RelocaliserResult(best.pose @ motion, covariance, fitness, evaluations, sure, reason, track, whole)
 
     def _retrace(self, winner: _Hypothesis, motion: Pose2) -> tuple[tuple[tuple[int, Pose2], ...], bool]:
         """The scans seen while searching, localised backwards from where the robot is now known to be.
@@ -256,7 +242,7 @@ class Relocaliser:
         for count, points, T_odom_base in reversed(self._seen):
             if T_odom_next is not None:
                 motion = T_odom_next.between(T_odom_base)
-                covariance = predict_covariance(covariance, pose, motion, self._noise.covariance(motion))
+                covariance = predict_covariance(covariance, pose, motion, self._motion_model.covariance(motion))
                 pose = pose @ motion
             T_odom_next = T_odom_base
             match = self._matcher.match(points, self._field, Window(pose, half, half, half_angle), self._rng)

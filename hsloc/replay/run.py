@@ -292,7 +292,7 @@ def _localiser(spec: RunSpec, grid: OccupancyGrid, likelihood: LikelihoodField, 
     config = spec.config
     rng = np.random.default_rng(spec.seed)
     _warm_up(config.make_matcher(), likelihood)
-    return Localiser(grid, likelihood, config.make_matcher(), config.localiser, rng, start)
+    return Localiser.from_parameters(grid, likelihood, config.make_matcher(), config.localiser, rng, start)
 
 
 def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:

@@ -14,10 +14,11 @@ import numpy as np
 
 from hsloc.errors import ConfigError
 from hsloc.localisation.match_gate import MatchGate, MatchLimits
-from hsloc.localisation.motion import fuse, predict_covariance
+from hsloc.localisation.motion import normalised_innovation, predict_covariance, update_with_information
 from hsloc.localisation.motion_gate import MotionGate
 from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, OdometryNoise, OmnidirectionalNoise
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
+from hsloc.matching.observability import match_information
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
@@ -108,6 +109,14 @@ class LocaliserParameters:
 
 _WIDER = (0.5, radians(20.0))
 """Half-widths (m, rad) of the window tried after a refused match: what a wheel may slip."""
+_SLIP = np.diag((_WIDER[0] ** 2, _WIDER[0] ** 2, _WIDER[1] ** 2)) / 9.0
+"""Added to the covariance with each refused match: a third of the wide window is one standard deviation of a slip."""
+_RESCALE = 0.1
+"""Gain of the odometry noise's scale: it follows within about ten matches."""
+_MOST_EXCESS = 10.0
+"""One innovation counts for at most this multiple of its expected square: a slip is not noise."""
+_MOST_NOISE = 100.0
+"""The odometry noise is scaled by at most this (variance): ten times the standard deviation."""
 
 
 class Localiser:
@@ -140,6 +149,7 @@ class Localiser:
         self._covariance = np.diag(
             (parameters.initial_sigma**2, parameters.initial_sigma**2, parameters.initial_sigma_angle**2)
         )
+        self._noise_scale = 1.0
         self._motion_gate = MotionGate(parameters.update_min_d, parameters.update_min_a)
         self._match_gate = MatchGate(parameters.match_limits())
         self._searching = initial_pose is None
@@ -192,9 +202,8 @@ class Localiser:
         predicted = self._T_map_match @ motion
         if not self._match_gate.is_fresh and not self._motion_gate.is_open(motion):
             return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
-        covariance = predict_covariance(
-            self._covariance, self._T_map_match, motion, self._motion_model.covariance(motion)
-        )
+        noise = self._noise_scale * self._motion_model.covariance(motion)
+        covariance = predict_covariance(self._covariance, self._T_map_match, motion, noise)
         points = paired.points_base()
         if len(points) < p.min_points:
             self._take(predicted, covariance, T_odom_base)
@@ -203,12 +212,22 @@ class Localiser:
         reason = self._match_gate.refusal(match.fitness)
         if reason:
             return self._refuse(paired, predicted, covariance, match, evaluations, reason)
-        pose, covariance = (
-            fuse(predicted, covariance, match.pose, match.covariance) if p.fuse else (match.pose, match.covariance)
-        )
+        information = match_information(points, self._field, match.pose)
+        if p.fuse:
+            self._rescale_noise(predicted, covariance, match.pose, information)
+            pose, covariance = update_with_information(predicted, covariance, match.pose, information)
+        else:
+            pose, covariance = match.pose, match.covariance
         self._match_gate.accept(match.fitness)
         self._take(pose, covariance, T_odom_base)
         return Estimate(scan.stamp_ns, pose, Status.MATCHED, covariance, match.fitness, evaluations)
+
+    def _rescale_noise(self, predicted: Pose2, covariance: F64, measured: Pose2, information: F64) -> None:
+        """Follow the odometry's real noise: where innovations are larger than expected, the next predictions grow."""
+        squared, freedom = normalised_innovation(predicted, covariance, measured, information)
+        if freedom > 0.0:
+            excess = min(squared / freedom, _MOST_EXCESS) - 1.0
+            self._noise_scale = min(max(self._noise_scale * (1.0 + _RESCALE * excess), 1.0), _MOST_NOISE)
 
     def _match(self, points: F64, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
         """Match in the window of the prediction; a refused match may give way to one in a wider window."""
@@ -240,6 +259,7 @@ class Localiser:
     ) -> Estimate:
         """The prediction stands; after too many refusals the pose is lost."""
         refusals = self._match_gate.refuse()
+        covariance = covariance + _SLIP
         self._take(predicted, covariance, paired.T_odom_base)
         status = Status.REJECTED
         if refusals >= self._parameters.lost_after:

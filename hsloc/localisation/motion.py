@@ -42,3 +42,31 @@ def fuse(prediction: Pose2, covariance: F64, measured: Pose2, measured_covarianc
     pose = Pose2.from_array(prediction.to_array() + gain @ innovation)
     updated = (np.eye(3) - gain) @ covariance
     return pose, 0.5 * (updated + updated.T)
+
+
+def update_with_information(prediction: Pose2, covariance: F64, measured: Pose2, information: F64) -> tuple[Pose2, F64]:
+    """The EKF's update with a measured pose of which `information` (3, 3) is known: `K = (I + P L)^-1 P L`.
+
+    Where the information is zero the prediction stays as it is, and so does its variance.
+    """
+    updated = np.linalg.solve(np.eye(3) + covariance @ information, covariance)
+    updated = 0.5 * (updated + updated.T)
+    pose = Pose2.from_array(prediction.to_array() + updated @ information @ difference(measured, prediction))
+    return pose, updated
+
+
+def normalised_innovation(prediction: Pose2, covariance: F64, measured: Pose2, information: F64) -> tuple[float, float]:
+    """Squared innovation by its expected covariance, and its degrees of freedom; directions not measured count for none.
+
+    With `P` the covariance of the prediction and `L` the information of the measurement the innovation's covariance is
+    `P + L^-1`, its inverse `L (I + P L)^-1`, and the degrees of freedom are the trace of the gain.
+    """
+    gain = np.linalg.solve(np.eye(3) + covariance @ information, covariance @ information)
+    weight = information @ np.linalg.inv(np.eye(3) + covariance @ information)
+    innovation = difference(measured, prediction)
+    return float(innovation @ weight @ innovation), float(np.trace(gain))
+
+
+def difference(pose: Pose2, other: Pose2) -> F64:
+    """x, y and theta (wrapped) of a pose less those of another, shape (3,)."""
+    return np.array((pose.x - other.x, pose.y - other.y, wrap_angle(pose.theta - other.theta)))

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+from hsloc.model.estimate import State
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from hsloc.model.estimate import Evidence
     from hsloc.model.events import PairedScan
     from hsloc.model.pose2 import Pose2
 
@@ -31,6 +34,10 @@ class RelocaliserResult:
     """Once it is sure: T_map_odom since the search began, as (odometry messages before, T_map_odom)."""
     track_is_whole: bool = False
     """Whether the track goes back to the first scan of the search."""
+    state: State = State.LOST
+    """While it is not sure: whether several places fit, none does, or it is too early to tell."""
+    evidence: Evidence | None = None
+    """Once it is sure: what its scans say for the place."""
 
 
 class GlobalSearch(Protocol):

@@ -6,8 +6,9 @@ While the pose is unknown the relocaliser has the word.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
-from math import radians
+from math import hypot, radians
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,10 +18,12 @@ from hsloc.localisation.match_gate import MatchGate, MatchLimits
 from hsloc.localisation.motion import normalised_innovation, predict_covariance, update_with_information
 from hsloc.localisation.motion_gate import MotionGate
 from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, OdometryNoise, OmnidirectionalNoise
+from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
+from hsloc.localisation.track_evidence import TrackFilter, TrackRow, rival_evidence
 from hsloc.matching.observability import match_information
 from hsloc.matching.window import Window
-from hsloc.model.estimate import Estimate, Status
+from hsloc.model.estimate import Estimate, Evidence, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY, Pose2
 
@@ -73,6 +76,9 @@ class LocaliserParameters:
     ackermann_noise: AckermannNoise = field(default_factory=AckermannNoise)
     omnidirectional_noise: OmnidirectionalNoise = field(default_factory=OmnidirectionalNoise)
     relocaliser: RelocaliserParameters = field(default_factory=RelocaliserParameters)
+    place_check: PlaceCheckParameters = field(default_factory=PlaceCheckParameters)
+    lost_log_odds: float = 5.0
+    """The pose is lost where the odds that the track is wrong reach the exponential of this, 0 or more."""
 
     def __post_init__(self) -> None:
         for name in ("min_points", "lost_after"):
@@ -109,6 +115,10 @@ class LocaliserParameters:
 
 _WIDER = (0.5, radians(20.0))
 """Half-widths (m, rad) of the window tried after a refused match: what a wheel may slip."""
+_FEWEST_JOINED = 4
+"""Scans that a place is compared by, at least."""
+_FIRST_COMPARISON_M = 3.0
+"""A new track is compared with the whole map after this path length (m), or after the usual one if that is shorter."""
 _SLIP = np.diag((_WIDER[0] ** 2, _WIDER[0] ** 2, _WIDER[1] ** 2)) / 9.0
 """Added to the covariance with each refused match: a third of the wide window is one standard deviation of a slip."""
 _RESCALE = 0.1
@@ -134,7 +144,15 @@ class Localiser:
         parameters: LocaliserParameters,
         rng: Generator,
         initial_pose: Pose2 | None = None,
+        *,
+        place_check: PlaceCheck | None = None,
     ) -> None:
+        self._place_check = place_check
+        self._track_filter = TrackFilter()
+        self._trail: deque[tuple[float, Pose2, F64]] = deque()
+        self._path_length = 0.0
+        self._checked_at = 0.0
+        self._seen_at = 0.0
         self._field = likelihood
         self._matcher = matcher
         self._global_search = search
@@ -153,6 +171,7 @@ class Localiser:
         self._motion_gate = MotionGate(parameters.update_min_d, parameters.update_min_a)
         self._match_gate = MatchGate(parameters.match_limits())
         self._searching = initial_pose is None
+        self._begin_track()
 
     @classmethod
     def from_parameters(
@@ -166,8 +185,10 @@ class Localiser:
     ) -> Localiser:
         """With the relocaliser and the motion model that the parameters name; `initial_pose` None is unknown."""
         noise = parameters.noise()
-        search = Relocaliser(grid, likelihood, matcher, parameters.relocaliser, noise, rng)
-        return cls(likelihood, matcher, search, noise, parameters, rng, initial_pose)
+        p = parameters.place_check
+        check = PlaceCheck(grid, likelihood, p) if p.interval > 0.0 else None
+        search = Relocaliser(grid, likelihood, matcher, parameters.relocaliser, noise, rng, place_check=check)
+        return cls(likelihood, matcher, search, noise, parameters, rng, initial_pose, place_check=check)
 
     @property
     def T_map_odom(self) -> Pose2:
@@ -205,9 +226,12 @@ class Localiser:
         noise = self._noise_scale * self._motion_model.covariance(motion)
         covariance = predict_covariance(self._covariance, self._T_map_match, motion, noise)
         points = paired.points_base()
+        self._path_length += hypot(motion.x, motion.y)
         if len(points) < p.min_points:
             self._take(predicted, covariance, T_odom_base)
-            return Estimate(scan.stamp_ns, predicted, Status.NO_RETURNS, covariance, reason=f"{len(points)} returns")
+            reason = f"{len(points)} returns"
+            evidence = Evidence(self._distance())
+            return Estimate(scan.stamp_ns, predicted, Status.NO_RETURNS, covariance, reason=reason, evidence=evidence)
         match, evaluations = self._match(points, predicted, covariance)
         reason = self._match_gate.refusal(match.fitness)
         if reason:
@@ -220,7 +244,50 @@ class Localiser:
             pose, covariance = match.pose, match.covariance
         self._match_gate.accept(match.fitness)
         self._take(pose, covariance, T_odom_base)
-        return Estimate(scan.stamp_ns, pose, Status.MATCHED, covariance, match.fitness, evaluations)
+        evidence = self._weigh(paired, pose, points)
+        status, reason = Status.MATCHED, ""
+        log_odds = self._track_filter.add(TrackRow(status, evidence))
+        if log_odds < -p.lost_log_odds and rival_evidence(evidence.rival) < 0.0:
+            status, reason = Status.SEARCHING, f"lost: another place fits {evidence.rival:.2f} times as well"
+            self._lose()
+        return Estimate(scan.stamp_ns, pose, status, covariance, match.fitness, evaluations, reason, evidence=evidence)
+
+    def _weigh(self, paired: PairedScan, pose: Pose2, points: F64) -> Evidence:
+        """What a matched scan says about the track; now and then its place is compared with the whole map."""
+        check = self._place_check
+        distance = self._distance()
+        if check is None:
+            return Evidence(distance)
+        p = check.parameters
+        self._trail.append((self._path_length, pose, check.few(points)))
+        while self._trail[0][0] < self._path_length - p.length:
+            self._trail.popleft()
+        rival = float("nan")
+        if self._path_length - self._checked_at >= p.interval and len(self._trail) >= _FEWEST_JOINED:
+            self._checked_at = self._path_length
+            chosen = np.unique(np.linspace(0, len(self._trail) - 1, p.scans).astype(np.int64))
+            rival = check.rival([self._trail[k][1:] for k in chosen], pose)
+        said = check.explain(paired, pose)
+        return Evidence(distance, said.fitness, said.short, said.through, said.unmapped, rival)
+
+    def _distance(self) -> float:
+        """Path length since the scan before."""
+        distance = self._path_length - self._seen_at
+        self._seen_at = self._path_length
+        return distance
+
+    def _lose(self) -> None:
+        """The pose is unknown from now on: search."""
+        self._searching = True
+        self._search_began = self._count
+        self._global_search.start()
+
+    def _begin_track(self) -> None:
+        """A new track begins here, of which nothing is known but its beginning; it is compared soon."""
+        self._track_filter.start()
+        self._trail.clear()
+        p = self._parameters.place_check
+        self._checked_at = self._path_length - max(p.interval - _FIRST_COMPARISON_M, 0.0)
 
     def _rescale_noise(self, predicted: Pose2, covariance: F64, measured: Pose2, information: F64) -> None:
         """Follow the odometry's real noise: where innovations are larger than expected, the next predictions grow."""
@@ -263,11 +330,13 @@ class Localiser:
         self._take(predicted, covariance, paired.T_odom_base)
         status = Status.REJECTED
         if refusals >= self._parameters.lost_after:
-            self._searching = True
-            self._search_began = self._count
-            self._global_search.start()
+            self._lose()
             status, reason = Status.SEARCHING, f"lost: {reason}"
-        return Estimate(paired.scan.stamp_ns, predicted, status, covariance, match.fitness, evaluations, reason)
+        evidence = Evidence(self._distance())
+        self._track_filter.add(TrackRow(Status.REJECTED, evidence))
+        return Estimate(
+            paired.scan.stamp_ns, predicted, status, covariance, match.fitness, evaluations, reason, evidence=evidence
+        )
 
     def _search(self, paired: PairedScan) -> Estimate:
         """Let the relocaliser see the scan; take its answer when it is sure."""
@@ -278,6 +347,7 @@ class Localiser:
         if result.is_sure:
             self._searching = False
             self._match_gate.restart(result.fitness)
+            self._begin_track()
             status = Status.RELOCALISED
         self._take(pose, self._covariance if result.covariance is None else result.covariance, T_odom_base)
         return Estimate(
@@ -289,6 +359,8 @@ class Localiser:
             result.evaluations,
             result.reason,
             self._revision(result),
+            None if result.is_sure else result.state,
+            result.evidence or Evidence(0.0),
         )
 
     def _revision(self, result: RelocaliserResult) -> tuple[tuple[int, Pose2], ...]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from math import floor, pi, radians
 from typing import TYPE_CHECKING
 
@@ -23,8 +24,10 @@ from hsloc.errors import ConfigError
 from hsloc.localisation.global_search import RelocaliserResult
 from hsloc.localisation.motion import fuse, predict_covariance
 from hsloc.localisation.motion_gate import MotionGate
+from hsloc.localisation.track_evidence import USUAL_EXPLAINED, TrackRow, rival_evidence
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.window import Window
+from hsloc.model.estimate import Evidence, State, Status
 from hsloc.model.pose2 import Pose2, wrap_angle
 
 if TYPE_CHECKING:
@@ -32,6 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.localisation.motion_models import MotionModel
+    from hsloc.localisation.place_check import PlaceCheck
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
     from hsloc.model.events import PairedScan
@@ -70,6 +74,12 @@ class RelocaliserParameters:
     """The winner's fitness, summed over the scans, must be ahead of every other's by this."""
     drop: float = 2.5
     """A hypothesis that is behind by this sum is dropped."""
+    max_rival_ratio: float = 0.93
+    """Mean fitness of the second best hypothesis by that of the best, at most, for the best to be believed [0..1]."""
+    keep_ratio: float = 0.85
+    """A hypothesis whose mean fitness reaches this part of the best one's is kept, however far behind its sum is [0..1]."""
+    min_evidence: float = 2.0
+    """Least log of the odds that the winner's own scans must give it against being a wrong place, 0 or more."""
     restart_below: float = 0.3
     """If the best falls below this mean fitness, the search begins anew."""
 
@@ -77,7 +87,17 @@ class RelocaliserParameters:
         for name in ("sectors", "budget", "search_points", "hypotheses", "seed_scans", "min_points", "min_scans"):
             _check(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         _check(self.tile > 0.0, "tile", self.tile, "positive")
-        for name in ("step_min_d", "step_min_a", "min_fitness", "lead", "drop", "restart_below"):
+        for name in (
+            "step_min_d",
+            "step_min_a",
+            "min_fitness",
+            "lead",
+            "drop",
+            "restart_below",
+            "min_evidence",
+            "max_rival_ratio",
+            "keep_ratio",
+        ):
             _check(getattr(self, name) >= 0.0, name, getattr(self, name), "0 or more")
 
 
@@ -102,9 +122,13 @@ class _Hypothesis:
 _NEAR = 0.5
 _NEAR_ANGLE = radians(15.0)
 _STEP_WINDOW = (0.25, radians(8.0))
-_FITS = 0.5
-"""Going backwards, a scan fits with so large a part of the winner's fitness."""
-_TRACE_LOST = 5
+_FITS = 0.8
+"""Going backwards, a scan fits with at least this part of the winner's fitness."""
+_WEIGHED = 12
+"""Scans that the winner is weighed by, at most."""
+_OFF_MAP = 0.87
+"""Explained fitness by the usual one below which the best place does not fit."""
+_TRACE_LOST = 3
 """Scans in a row that fit nowhere near, going backwards: before them the robot was elsewhere, or is not known."""
 REMEMBERED = 1000
 """Scans of a search that are kept to retrace the way; older ones are forgotten, so that memory is bounded."""
@@ -121,7 +145,11 @@ class Relocaliser:
         parameters: RelocaliserParameters,
         motion_model: MotionModel,
         rng: Generator,
+        *,
+        place_check: PlaceCheck | None = None,
     ) -> None:
+        self._check = place_check
+        self._explained: float | None = None
         self._field = likelihood
         self._matcher = matcher
         self._parameters = parameters
@@ -131,12 +159,13 @@ class Relocaliser:
         self._tiles = _tiles(grid, self._parameters.tile)
         self._hypotheses: list[_Hypothesis] = []
         self._T_odom_last: Pose2 | None = None
-        self._seen: deque[tuple[int, F64, Pose2]] = deque(maxlen=REMEMBERED)
+        self._seen: deque[tuple[int, F64, PairedScan]] = deque(maxlen=REMEMBERED)
 
     def start(self) -> None:
         """Forget everything."""
         self._hypotheses = []
         self._T_odom_last = None
+        self._explained = None
         self._seen.clear()
 
     def update(self, paired: PairedScan, odometry_count: int) -> RelocaliserResult:
@@ -150,7 +179,7 @@ class Relocaliser:
         if len(points) < p.min_points:
             return self._verdict(motion, 0, False)
         self._T_odom_last = T_odom_base
-        self._seen.append((odometry_count, points, T_odom_base))
+        self._seen.append((odometry_count, points, paired))
         if self._hypotheses and self._hypotheses[0].mean < p.restart_below:
             self._hypotheses = []
         evaluations = self._advance(points, motion)
@@ -209,7 +238,9 @@ class Relocaliser:
         taken = _Places()
         kept: list[_Hypothesis] = []
         for hypothesis in self._hypotheses:
-            if len(kept) >= p.hypotheses or hypothesis.total < self._hypotheses[0].total - p.drop:
+            best = self._hypotheses[0]
+            behind = hypothesis.total < best.total - p.drop and hypothesis.mean < p.keep_ratio * best.mean
+            if len(kept) >= p.hypotheses or behind:
                 break
             if taken.add(hypothesis.pose):
                 kept.append(hypothesis)
@@ -220,26 +251,84 @@ class Relocaliser:
             return RelocaliserResult(None, None, None, evaluations, False, "searching the whole map")
         p = self._parameters
         best = self._hypotheses[0]
-        lead = best.total - self._hypotheses[1].total if len(self._hypotheses) > 1 else p.drop
-        sure = fresh and best.scans >= p.min_scans and best.mean >= p.min_fitness and lead >= p.lead
+        alone = len(self._hypotheses) == 1
+        lead = p.drop if alone else best.total - self._hypotheses[1].total
+        ratio = 0.0 if alone else self._hypotheses[1].mean / max(best.mean, 1e-9)
+        ahead = best.scans >= p.min_scans and best.mean >= p.min_fitness and lead >= p.lead
+        pose = best.pose @ motion
         reason = f"{len(self._hypotheses)} hypotheses, best {best.mean:.2f}, lead {lead:.2f}, {best.scans} scans"
-        covariance = best.covariance if sure else None
-        fitness = best.fitness if fresh else None
+        evidence: Evidence | None = None
+        state = self._state(best, pose) if fresh else State.LOST
+        sure = fresh and ahead and ratio <= p.max_rival_ratio
+        if sure and self._check is not None:
+            evidence = self._weigh(best, motion)
+            row = TrackRow(Status.RELOCALISED, evidence)
+            sure = max(rival_evidence(ratio), 0.0) + row.log_likelihood_ratio(USUAL_EXPLAINED) >= p.min_evidence
         track, whole = self._retrace(best, motion) if sure else ((), False)
-        return RelocaliserResult(best.pose @ motion, covariance, fitness, evaluations, sure, reason, track, whole)
+        return RelocaliserResult(
+            pose,
+            best.covariance if sure else None,
+            best.fitness if fresh else None,
+            evaluations,
+            sure,
+            reason,
+            track,
+            whole,
+            state,
+            evidence if sure else None,
+        )
+
+    def _state(self, best: _Hypothesis, pose: Pose2) -> State:
+        """Why it is not sure: the best place does not fit, or several do."""
+        p = self._parameters
+        if self._check is not None and self._seen:
+            said = self._check.explain(self._seen[-1][2], pose).fitness
+            self._explained = said if self._explained is None else self._explained + 0.3 * (said - self._explained)
+        if best.scans < p.min_scans:
+            return State.LOST
+        if self._explained is not None and self._explained < _OFF_MAP * USUAL_EXPLAINED:
+            return State.OFF_MAP
+        alike = sum(hypothesis.mean >= p.max_rival_ratio * best.mean for hypothesis in self._hypotheses)
+        return State.AMBIGUOUS if alike > 1 else State.LOST
+
+    def _weigh(self, winner: _Hypothesis, motion: Pose2) -> Evidence:
+        """What the last scans say for the winner: how the map explains them, and whether another place fits as well."""
+        assert self._check is not None
+        traced = self._trace(winner, motion, _WEIGHED)
+        said = [self._check.explain(paired, pose) for _, pose, paired, _ in traced]
+        scans = [(pose, self._check.few(paired.points_base())) for _, pose, paired, _ in traced]
+        path = sum(a[1].distance(b[1]) for a, b in pairwise(traced))
+        means = np.mean([(e.fitness, e.short, e.through, e.unmapped) for e in said], axis=0)
+        rival = self._check.rival(scans, winner.pose @ motion)
+        return Evidence(path, float(means[0]), float(means[1]), float(means[2]), float(means[3]), rival)
 
     def _retrace(self, winner: _Hypothesis, motion: Pose2) -> tuple[tuple[tuple[int, Pose2], ...], bool]:
         """The scans seen while searching, localised backwards from where the robot is now known to be.
 
         As far as they fit, and whether that is all of them: where several in a row do not, the trace is lost.
         """
-        half, half_angle = _STEP_WINDOW
-        pose, covariance = winner.pose @ motion, winner.covariance
+        traced = self._trace(winner, motion, REMEMBERED)
         fits = max(self._parameters.min_fitness, _FITS * winner.fitness)
         track: list[tuple[int, Pose2]] = []
         misses = 0
+        for count, pose, paired, fitness in traced:
+            misses = 0 if fitness >= fits else misses + 1
+            track.append((count, pose @ paired.T_odom_base.inverse()))
+            if misses == _TRACE_LOST:
+                return tuple(reversed(track[:-misses])), False
+        whole = len(self._seen) < REMEMBERED
+        return tuple(reversed(track[: len(track) - misses])), whole and misses == 0
+
+    def _trace(self, winner: _Hypothesis, motion: Pose2, most: int) -> list[tuple[int, Pose2, PairedScan, float]]:
+        """(odometry messages before, T_map_base, scan, fitness) of the last scans, backwards; ends where none fits."""
+        half, half_angle = _STEP_WINDOW
+        pose, covariance = winner.pose @ motion, winner.covariance
+        fits = max(self._parameters.min_fitness, _FITS * winner.fitness)
+        traced: list[tuple[int, Pose2, PairedScan, float]] = []
+        misses = 0
         T_odom_next: Pose2 | None = None
-        for count, points, T_odom_base in reversed(self._seen):
+        for count, points, paired in reversed(self._seen):
+            T_odom_base = paired.T_odom_base
             if T_odom_next is not None:
                 motion = T_odom_next.between(T_odom_base)
                 covariance = predict_covariance(covariance, pose, motion, self._motion_model.covariance(motion))
@@ -250,10 +339,10 @@ class Relocaliser:
             if match.fitness >= fits:
                 pose, covariance = fuse(pose, covariance, match.pose, match.covariance)
                 misses = 0
-            track.append((count, pose @ T_odom_base.inverse()))
-            if misses == _TRACE_LOST:
-                return tuple(reversed(track[:-misses])), False
-        return tuple(reversed(track)), len(self._seen) < REMEMBERED
+            traced.append((count, pose, paired, match.fitness))
+            if misses == _TRACE_LOST or len(traced) == most:
+                break
+        return traced
 
     def _quick_matcher(self) -> HarmonySearch | Matcher:
         """The matcher with a small budget and one restart; a matcher without a budget stays as it is."""

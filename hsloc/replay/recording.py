@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.states import StateLog
 from hsloc.model.estimate import ScanDiagnostics, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
 from hsloc.model.pose2 import compose_poses
 from hsloc.model.trajectory import Trajectory
 
 if TYPE_CHECKING:
+    from hsloc.localisation.states import StateRows
     from hsloc.model.estimate import Estimate
     from hsloc.model.pose2 import Pose2
 
@@ -33,6 +35,7 @@ class Recording:
         self._fitness = array("d")
         self._sigma = array("d")
         self._evaluations = array("q")
+        self._states = StateLog()
         self._believed = 0
         self._searching = False
         self._revisions: list[tuple[int, tuple[tuple[int, Pose2], ...]]] = []
@@ -56,6 +59,7 @@ class Recording:
 
     def _add_scan(self, estimate: Estimate) -> None:
         self._note_belief(estimate.status)
+        self._states.add(estimate, len(self._odometry_stamps))
         self._scan_stamps.append(estimate.stamp_ns)
         self._status.append(estimate.status.value)
         self._reason.append(estimate.reason)
@@ -105,6 +109,10 @@ class Recording:
                 poses[first:last] = compose_poses(T_map_odom.to_array(), odometry[first:last])
                 localised[first:last] = True
         return Trajectory(estimated.stamps_ns, poses), localised
+
+    def states(self) -> StateRows | None:
+        """The state of each pose of the trajectory in hindsight; None for an estimator that weighs no evidence."""
+        return self._states.at_odometry(len(self._odometry_stamps)) if len(self._states) else None
 
     def diagnostics(self) -> ScanDiagnostics:
         """One row for each scan."""

@@ -31,6 +31,8 @@ FEWEST_POINTS = 5
 """Points that a wall is fitted to, at least: fewer have no reliable normal."""
 SAME_WALL = 0.97
 """Cosine of the largest angle between a point's normal and the mean normal of its wall: 14 deg."""
+DOUBTFUL_WEIGHT = 20.0
+"""A wall of this many cells counts by half: what is seen on a few cells may be a door or an object."""
 _COLUMNS = 1 << 40
 """Rows and columns of cells are told apart by an offset larger than any map."""
 
@@ -217,6 +219,7 @@ def _within(points: F64, a: int, b: int) -> bool:
 def _close(summed: F64, squares: F64, weight: float, variances: F64, information: F64) -> None:
     """Add a group's information, `(S - v_w / (v_p + v_w W) s s^T) / v_p`."""
     shared = variances[1] / (variances[0] + variances[1] * weight)
+    trusted = weight / (weight + DOUBTFUL_WEIGHT)
     for a in range(3):
         for b in range(3):
-            information[a, b] += (squares[a, b] - shared * summed[a] * summed[b]) / variances[0]
+            information[a, b] += trusted * (squares[a, b] - shared * summed[a] * summed[b]) / variances[0]

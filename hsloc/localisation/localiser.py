@@ -20,7 +20,7 @@ from hsloc.localisation.motion_gate import MotionGate
 from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, OdometryNoise, OmnidirectionalNoise
 from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
-from hsloc.localisation.track_evidence import TrackFilter, TrackRow, rival_evidence
+from hsloc.localisation.track_evidence import NOT_UNIQUE, TrackFilter, TrackRow
 from hsloc.matching.observability import match_information
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Evidence, Status
@@ -77,8 +77,8 @@ class LocaliserParameters:
     omnidirectional_noise: OmnidirectionalNoise = field(default_factory=OmnidirectionalNoise)
     relocaliser: RelocaliserParameters = field(default_factory=RelocaliserParameters)
     place_check: PlaceCheckParameters = field(default_factory=PlaceCheckParameters)
-    lost_log_odds: float = 5.0
-    """The pose is lost where the odds that the track is wrong reach the exponential of this, 0 or more."""
+    lost_probability: float = 0.99
+    """The pose is lost where the track is astray with this probability, and not unique on the map, in [0, 1]."""
 
     def __post_init__(self) -> None:
         for name in ("min_points", "lost_after"):
@@ -121,12 +121,10 @@ _FIRST_COMPARISON_M = 3.0
 """A new track is compared with the whole map after this path length (m), or after the usual one if that is shorter."""
 _SLIP = np.diag((_WIDER[0] ** 2, _WIDER[0] ** 2, _WIDER[1] ** 2)) / 9.0
 """Added to the covariance with each refused match: a third of the wide window is one standard deviation of a slip."""
-_RESCALE = 0.1
-"""Gain of the odometry noise's scale: it follows within about ten matches."""
+_EXCESS_GAIN = 0.1
+"""Gain of the running mean of squared innovations by their expected ones: it follows within about ten matches."""
 _MOST_EXCESS = 10.0
 """One innovation counts for at most this multiple of its expected square: a slip is not noise."""
-_MOST_NOISE = 100.0
-"""The odometry noise is scaled by at most this (variance): ten times the standard deviation."""
 
 
 class Localiser:
@@ -167,7 +165,7 @@ class Localiser:
         self._covariance = np.diag(
             (parameters.initial_sigma**2, parameters.initial_sigma**2, parameters.initial_sigma_angle**2)
         )
-        self._noise_scale = 1.0
+        self._excess = 1.0
         self._motion_gate = MotionGate(parameters.update_min_d, parameters.update_min_a)
         self._match_gate = MatchGate(parameters.match_limits())
         self._searching = initial_pose is None
@@ -223,7 +221,7 @@ class Localiser:
         predicted = self._T_map_match @ motion
         if not self._match_gate.is_fresh and not self._motion_gate.is_open(motion):
             return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
-        noise = self._noise_scale * self._motion_model.covariance(motion)
+        noise = self._motion_model.covariance(motion)
         covariance = predict_covariance(self._covariance, self._T_map_match, motion, noise)
         points = paired.points_base()
         self._path_length += hypot(motion.x, motion.y)
@@ -231,6 +229,7 @@ class Localiser:
             self._take(predicted, covariance, T_odom_base)
             reason = f"{len(points)} returns"
             evidence = Evidence(self._distance())
+            covariance = self._reported(covariance)
             return Estimate(scan.stamp_ns, predicted, Status.NO_RETURNS, covariance, reason=reason, evidence=evidence)
         match, evaluations = self._match(points, predicted, covariance)
         reason = self._match_gate.refusal(match.fitness)
@@ -238,7 +237,7 @@ class Localiser:
             return self._refuse(paired, predicted, covariance, match, evaluations, reason)
         information = match_information(points, self._field, match.pose)
         if p.fuse:
-            self._rescale_noise(predicted, covariance, match.pose, information)
+            self._weigh_innovation(predicted, covariance, match.pose, information)
             pose, covariance = update_with_information(predicted, covariance, match.pose, information)
         else:
             pose, covariance = match.pose, match.covariance
@@ -246,10 +245,12 @@ class Localiser:
         self._take(pose, covariance, T_odom_base)
         evidence = self._weigh(paired, pose, points)
         status, reason = Status.MATCHED, ""
-        log_odds = self._track_filter.add(TrackRow(status, evidence))
-        if log_odds < -p.lost_log_odds and rival_evidence(evidence.rival) < 0.0:
-            status, reason = Status.SEARCHING, f"lost: another place fits {evidence.rival:.2f} times as well"
+        _, _, astray = self._track_filter.add(TrackRow(status, evidence))
+        if evidence.rival > NOT_UNIQUE and astray > p.lost_probability:
+            status = Status.SEARCHING
+            reason = f"lost: the map explains {evidence.explained:.2f}, another place fits {evidence.rival:.2f} times as well"
             self._lose()
+        covariance = self._reported(covariance)
         return Estimate(scan.stamp_ns, pose, status, covariance, match.fitness, evaluations, reason, evidence=evidence)
 
     def _weigh(self, paired: PairedScan, pose: Pose2, points: F64) -> Evidence:
@@ -289,17 +290,27 @@ class Localiser:
         p = self._parameters.place_check
         self._checked_at = self._path_length - max(p.interval - _FIRST_COMPARISON_M, 0.0)
 
-    def _rescale_noise(self, predicted: Pose2, covariance: F64, measured: Pose2, information: F64) -> None:
-        """Follow the odometry's real noise: where innovations are larger than expected, the next predictions grow."""
+    def _weigh_innovation(self, predicted: Pose2, covariance: F64, measured: Pose2, information: F64) -> None:
+        """Follow how large innovations really are; covariances that are reported grow with them.
+
+        What grows is not the weight of the odometry or of the match: which of the two is worse than assumed, an
+        innovation does not tell. (Where the odometry's noise alone was scaled, the matches pulled the pose from door to
+        door in the corridors of Wean Hall.)
+        """
         squared, freedom = normalised_innovation(predicted, covariance, measured, information)
         if freedom > 0.0:
-            excess = min(squared / freedom, _MOST_EXCESS) - 1.0
-            self._noise_scale = min(max(self._noise_scale * (1.0 + _RESCALE * excess), 1.0), _MOST_NOISE)
+            self._excess += _EXCESS_GAIN * (min(squared / freedom, _MOST_EXCESS) - self._excess)
+
+    def _reported(self, covariance: F64) -> F64:
+        """A covariance with the scale of the innovations; never smaller than the filter's."""
+        return max(self._excess, 1.0) * covariance
 
     def _match(self, points: F64, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
         """Match in the window of the prediction; a refused match may give way to one in a wider window."""
         p = self._parameters
-        window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
+        window = Window.from_covariance(
+            predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle)
+        )
         best = self._matcher.match(points, self._field, window, self._rng)
         evaluations = best.evaluations
         if self._match_gate.usual is not None and self._match_gate.refusal(best.fitness):
@@ -332,6 +343,7 @@ class Localiser:
         if refusals >= self._parameters.lost_after:
             self._lose()
             status, reason = Status.SEARCHING, f"lost: {reason}"
+        covariance = self._reported(covariance)
         evidence = Evidence(self._distance())
         self._track_filter.add(TrackRow(Status.REJECTED, evidence))
         return Estimate(

@@ -24,10 +24,10 @@ from hsloc.errors import ConfigError
 from hsloc.localisation.global_search import RelocaliserResult
 from hsloc.localisation.motion import fuse, predict_covariance
 from hsloc.localisation.motion_gate import MotionGate
-from hsloc.localisation.track_evidence import USUAL_EXPLAINED, TrackRow, rival_evidence
+from hsloc.localisation.track_evidence import MOST_FROM_RIVAL, USUAL_EXPLAINED, fit_evidence, rival_evidence
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.window import Window
-from hsloc.model.estimate import Evidence, State, Status
+from hsloc.model.estimate import Evidence, State
 from hsloc.model.pose2 import Pose2, wrap_angle
 
 if TYPE_CHECKING:
@@ -80,6 +80,8 @@ class RelocaliserParameters:
     """A hypothesis whose mean fitness reaches this part of the best one's is kept, however far behind its sum is [0..1]."""
     min_evidence: float = 2.0
     """Least log of the odds that the winner's own scans must give it against being a wrong place, 0 or more."""
+    confidence: float = 0.99
+    """Confidence of the test that the best hypothesis fits better than every other one, below 1."""
     restart_below: float = 0.3
     """If the best falls below this mean fitness, the search begins anew."""
 
@@ -113,6 +115,8 @@ class _Hypothesis:
     fitness: float
     total: float
     scans: int
+    history: list[float]
+    """Fitness of each scan since it was found."""
 
     @property
     def mean(self) -> float:
@@ -124,6 +128,10 @@ _NEAR_ANGLE = radians(15.0)
 _STEP_WINDOW = (0.25, radians(8.0))
 _FITS = 0.8
 """Going backwards, a scan fits with at least this part of the winner's fitness."""
+_BLOCK = 7
+"""Scans of a block: two metres at the steps of the search."""
+_RESOLUTION = 0.02
+"""Standard deviation of the fitness of the same place, matched twice: what blocks differ by at least."""
 _WEIGHED = 12
 """Scans that the winner is weighed by, at most."""
 _OFF_MAP = 0.87
@@ -198,7 +206,7 @@ class Relocaliser:
         poses, fitness, evaluations = self._search(points, windows)
         unsure = np.diag(np.square(half))
         self._hypotheses += [
-            _Hypothesis(pose, unsure, float(fit), float(fit) * scans, scans)
+            _Hypothesis(pose, unsure, float(fit), float(fit) * scans, scans, [float(fit)])
             for pose, fit in zip(poses, fitness, strict=True)
         ]
         return evaluations
@@ -229,6 +237,7 @@ class Relocaliser:
             hypothesis.fitness = match.fitness
             hypothesis.total += match.fitness
             hypothesis.scans += 1
+            hypothesis.history.append(match.fitness)
         return evaluations
 
     def _keep(self) -> None:
@@ -259,11 +268,13 @@ class Relocaliser:
         reason = f"{len(self._hypotheses)} hypotheses, best {best.mean:.2f}, lead {lead:.2f}, {best.scans} scans"
         evidence: Evidence | None = None
         state = self._state(best, pose) if fresh else State.LOST
-        sure = fresh and ahead and ratio <= p.max_rival_ratio
+        proven = fresh and ahead and self._is_proven(best)
+        sure = proven or (fresh and ahead and ratio <= p.max_rival_ratio)
         if sure and self._check is not None:
             evidence = self._weigh(best, motion)
-            row = TrackRow(Status.RELOCALISED, evidence)
-            sure = max(rival_evidence(ratio), 0.0) + row.log_likelihood_ratio(USUAL_EXPLAINED) >= p.min_evidence
+            of_rivals = MOST_FROM_RIVAL if proven else max(rival_evidence(ratio), 0.0)
+            of_place = min(fit_evidence(evidence, USUAL_EXPLAINED), 0.0) + rival_evidence(evidence.rival)
+            sure = of_rivals + of_place >= p.min_evidence
         track, whole = self._retrace(best, motion) if sure else ((), False)
         return RelocaliserResult(
             pose,
@@ -277,6 +288,12 @@ class Relocaliser:
             state,
             evidence if sure else None,
         )
+
+    def _is_proven(self, best: _Hypothesis) -> bool:
+        """Whether the best fits better than each other one in a paired t-test over blocks of scans."""
+        confidence = self._parameters.confidence
+        others = self._hypotheses[1:]
+        return all(_fits_better(best.history, other.history, confidence) for other in others) if others else False
 
     def _state(self, best: _Hypothesis, pose: Pose2) -> State:
         """Why it is not sure: the best place does not fit, or several do."""
@@ -356,6 +373,24 @@ class Relocaliser:
                 polish_iterations=10,
             )
         return self._matcher
+
+
+def _fits_better(best: list[float], other: list[float], confidence: float) -> bool:
+    """Student's paired t-test, one-sided, over means of blocks of scans.
+
+    Scans that follow each other see the same errors of the map, so that their differences are no independent evidence;
+    blocks about two metres long are taken for it. An error of the map in one place makes the blocks differ, and a sum
+    that comes from few of them proves nothing.
+    """
+    from scipy.special import stdtrit
+
+    n = min(len(best), len(other)) // _BLOCK
+    if n < 2:
+        return False
+    difference = np.array(best[-n * _BLOCK :]) - np.array(other[-n * _BLOCK :])
+    means = difference.reshape(n, _BLOCK).mean(axis=1)
+    error = np.sqrt((means.var(ddof=1) + _RESOLUTION**2) / n)
+    return bool(means.mean() >= float(stdtrit(n - 1, confidence)) * error)
 
 
 class _Places:

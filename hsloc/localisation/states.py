@@ -27,6 +27,8 @@ MAX_SIGMA_ANGLE = np.radians(2.0)
 """And of its heading (rad): 2.5 of them are 5 deg."""
 _POOR_FIT = 0.92
 """Explained fitness by the usual one below which a doubted pose is taken for off the map."""
+_SETTLED = 5
+"""Matches after which the covariance no longer knows how a track began."""
 _BRIDGED_M = 2.0
 """Over this path length of refused scans the pose is interpolated if the next match agrees with the prediction (m)."""
 
@@ -99,8 +101,8 @@ class StateLog:
                 states.append(estimate.state or State.LOST)
                 reasons.append(estimate.reason)
                 continue
-            probability[k] = smoothed[owner]
-            state, reason = _judge(float(probability[k]), sigma[k], rows[owner], usual, rows[: owner + 1])
+            probability[k] = smoothed[owner, 0]
+            state, reason = _judge(smoothed[owner], sigma[k], usual, rows[: owner + 1])
             states.append(state)
             reasons.append(reason or estimate.reason)
         fitness = np.array([np.nan if e.fitness is None else e.fitness for e in self._estimates])
@@ -136,7 +138,11 @@ class StateLog:
             if estimate.covariance is not None:
                 sigma[k] = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
             elif k + 1 < n and owners[k] == owners[k + 1]:
-                sigma[k] = sigma[k + 1]  # before a relocalisation: as sure as where it was found
+                sigma[k] = sigma[k + 1]
+            if estimate.status is Status.RELOCALISED:
+                # Before it the scans were matched backwards, and are as sure as those matched forwards after it.
+                settled = next((j for j in range(k + _SETTLED, k, -1) if j < n and owners[j] - owners[k] == j - k), k)
+                sigma[k] = np.fmin(sigma[k], sigma[settled])
         return sigma
 
 
@@ -146,15 +152,16 @@ def _rank(scans: StateRows, index: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(ranks[index])
 
 
-def _judge(
-    probability: float, sigma: F64, row: TrackRow, usual: float, before: Sequence[TrackRow]
-) -> tuple[State, str]:
+def _judge(probabilities: F64, sigma: F64, usual: float, before: Sequence[TrackRow]) -> tuple[State, str]:
     """The state of a row of a track, and the reason where it is not localised."""
-    if probability < CONFIDENCE:
+    right, alike, astray = probabilities
+    if right < CONFIDENCE:
+        if alike > astray:
+            return State.AMBIGUOUS, "another place fits as well"
         evidence = _last_explained(before)
         if evidence is not None and evidence.explained < _POOR_FIT * usual:
             return State.OFF_MAP, f"the map explains {evidence.explained:.2f} of the scan, usually {usual:.2f}"
-        return State.AMBIGUOUS, "another place fits as well"
+        return State.LOST, "scans before or after do not fit"
     if not (max(sigma[0], sigma[1]) <= MAX_SIGMA and sigma[2] <= MAX_SIGMA_ANGLE):
         return State.PREDICTED, f"standard deviation {max(sigma[0], sigma[1]):.2f} m, {np.degrees(sigma[2]):.1f} deg"
     return State.LOCALISED, ""

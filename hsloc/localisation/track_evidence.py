@@ -1,13 +1,14 @@
-"""The probability that a track is right: a hidden Markov model of two states over its scans.
+"""The probability that a track is right: a hidden Markov model of three states over its scans.
 
-A track is right or wrong. It begins right with a prior, may turn wrong as the robot moves on (seldom) or where a scan
-is refused (more often), and does not turn right again by itself. Scans are evidence by what the map explains of them,
-comparisons with the whole map by whether another place fits as well. Forward alone it is a filter; forward and backward
-it is what an offline service can say: the scans to come count as well.
+A track is right, in a look-alike of the right place, or astray: where the scans do not fit, off the map perhaps. It
+begins right with a prior, and may go astray as the robot moves on or where a scan is refused; it does not come back by
+itself. Forward alone the model is a filter; forward and backward it is what an offline service can say: the scans to
+come count as well.
 
-Evidence is bounded so that what the map gets wrong does not add up like evidence. A scan that fits is none at all: the
-wrong one of two look-alike places fits as well. A scan that does not fit counts by the metre and not by the scan. A
-comparison counts for the place only where it leaves the others clearly behind.
+Scans are evidence by what the map explains of them, by the metre and not by the scan: one that fits speaks against being
+astray, but not against a look-alike, so that what the map gets wrong in one of two like places does not add up like
+evidence. A comparison with the whole map speaks against both where it leaves all other places clearly behind, and
+against the place where another one fits clearly better.
 
 The figures of the likelihoods are from simulation: 24 kinds of runs in three worlds, right and wrong, two seeds (see
 benchmarks/README.md). Right places: explained 0.93 to 0.97, rival 0.80 to 1.05; wrong ones: 0.4 to 0.85, 0.93 to 1.8.
@@ -16,7 +17,7 @@ benchmarks/README.md). Right places: explained 0.93 to 0.97, rival 0.80 to 1.05;
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp, log
+from math import exp
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,22 +33,29 @@ if TYPE_CHECKING:
 
     F64 = NDArray[np.float64]
 
-PRIOR_RIGHT = 0.98
-"""Probability that a given start, or a place that the relocaliser was sure of, is right."""
-_TURNS_WRONG_PER_M = 0.002
-"""Rate at which a track turns wrong (1/m): once in 500 m."""
-_TURNS_WRONG_REFUSED = 0.05
-"""Probability that it turned wrong where a scan was refused."""
-_UNIQUE, _NOT_UNIQUE = 0.85, 0.93
+States = tuple[float, float, float]
+"""A number for each state: right, alike, astray."""
+
+PRIOR_RIGHT, _PRIOR_ALIKE, _PRIOR_ASTRAY = 0.98, 0.01, 0.01
+"""Probabilities of the states where a track begins: with a given start, or where the relocaliser was sure."""
+PRIOR: States = (PRIOR_RIGHT, _PRIOR_ALIKE, _PRIOR_ASTRAY)
+_SMALLEST = 1e-30
+_ASTRAY_PER_M = 0.005
+"""Rate at which a track goes astray (1/m): once in 200 m."""
+_ASTRAY_REFUSED = 0.05
+"""Probability that it went astray where a scan was refused."""
+_ALIKE_REFUSED = 0.002
+"""Probability that a right track ended in a look-alike place where a scan was refused: a parallel corridor."""
+_UNIQUE, NOT_UNIQUE = 0.85, 0.93
 """A rival ratio up to the first is full evidence for the place, from the second on it is none."""
-_RIVALLED, _BEATEN = 1.08, 1.25
+_RIVALLED, _BEATEN = 1.12, 1.3
 """A rival ratio from the second on is full evidence against the place, up to the first it is none."""
 MOST_FROM_RIVAL = 4.0
 """Log of the odds that one comparison changes, at most: 55 to 1."""
 _GOOD_FIT, _FIT_SCALE = 0.95, 0.03
-"""Explained fitness by the usual one that is no evidence against a track, and the step below it that counts 1 a metre."""
-_MOST_FROM_FIT = 3.0
-"""Log of the odds that a metre of bad fit changes, at most."""
+"""Explained fitness by the usual one that is no evidence, and the step from it that counts 1 a metre."""
+_MOST_FROM_FIT, _MOST_FROM_MISFIT = 1.0, 3.0
+"""Log of the odds that a metre of good or of bad fit changes, at most."""
 _REFUSED = -1.0
 """Log of the odds that a refused scan changes."""
 USUAL_EXPLAINED = 0.93
@@ -56,25 +64,24 @@ _LEAST_USUAL = 0.75
 """Nor for lower: wrong places reach it."""
 _CERTIFIED_M = 6.0
 """A comparison that leaves the others behind vouches for the scans of this path length before it (m)."""
-_MOST_LOG_ODDS = 30.0
 
 
 def rival_evidence(ratio: float) -> float:
     """Log of the likelihood ratio, right to wrong, of a rival ratio; 0 for NaN."""
-    if ratio <= _NOT_UNIQUE:
-        return MOST_FROM_RIVAL * min((_NOT_UNIQUE - ratio) / (_NOT_UNIQUE - _UNIQUE), 1.0)
+    if ratio <= NOT_UNIQUE:
+        return MOST_FROM_RIVAL * min((NOT_UNIQUE - ratio) / (NOT_UNIQUE - _UNIQUE), 1.0)
     if ratio >= _RIVALLED:
         return -MOST_FROM_RIVAL * min((ratio - _RIVALLED) / (_BEATEN - _RIVALLED), 1.0)
     return 0.0
 
 
 def fit_evidence(evidence: Evidence, usual: float) -> float:
-    """Log of the likelihood ratio of what the map explains of a scan; never positive, 0 for NaN."""
+    """Log of the likelihood ratio, fitting place to astray, of what the map explains of a scan; 0 for NaN."""
     if not evidence.explained >= 0.0:
         return 0.0
     per_metre = (evidence.explained / usual - _GOOD_FIT) / _FIT_SCALE
     seen = 1.0 - evidence.short
-    return max(min(per_metre, 0.0), -_MOST_FROM_FIT) * min(evidence.distance, 1.0) * seen
+    return min(max(per_metre, -_MOST_FROM_MISFIT), _MOST_FROM_FIT) * min(evidence.distance, 1.0) * seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,57 +92,63 @@ class TrackRow:
     evidence: Evidence
     begins: bool = False
 
-    def log_likelihood_ratio(self, usual: float) -> float:
-        """Of right to wrong."""
-        refused = _REFUSED if self.status is Status.REJECTED else 0.0
-        return refused + fit_evidence(self.evidence, usual) + rival_evidence(self.evidence.rival)
+    def likelihoods(self, usual: float) -> States:
+        """Of right, alike and astray, up to a common factor."""
+        fit = fit_evidence(self.evidence, usual) + (_REFUSED if self.status is Status.REJECTED else 0.0)
+        rival = rival_evidence(self.evidence.rival)
+        return exp(fit + rival), exp(fit + min(rival, 0.0)), 1.0
 
-    def turns_wrong(self) -> float:
-        """Probability that a right track turned wrong since the scan before."""
-        moved = 1.0 - exp(-_TURNS_WRONG_PER_M * self.evidence.distance)
-        return moved + (_TURNS_WRONG_REFUSED if self.status is Status.REJECTED else 0.0)
+    def moved_on(self, before: States) -> States:
+        """Probabilities of the states after the step to this scan, before its evidence."""
+        refused = self.status is Status.REJECTED
+        astray = 1.0 - exp(-_ASTRAY_PER_M * self.evidence.distance) + (_ASTRAY_REFUSED if refused else 0.0)
+        alike = _ALIKE_REFUSED if refused else 0.0
+        right = before[0] * (1.0 - astray - alike)
+        return right, before[0] * alike + before[1] * (1.0 - astray), before[2] + (before[0] + before[1]) * astray
+
+    def looked_back(self, after: States) -> States:
+        """Likelihoods of all that follows, from before the step to this scan; the transpose of `moved_on`."""
+        refused = self.status is Status.REJECTED
+        astray = 1.0 - exp(-_ASTRAY_PER_M * self.evidence.distance) + (_ASTRAY_REFUSED if refused else 0.0)
+        alike = _ALIKE_REFUSED if refused else 0.0
+        right = (1.0 - astray - alike) * after[0] + alike * after[1] + astray * after[2]
+        return right, (1.0 - astray) * after[1] + astray * after[2], after[2]
 
 
 class TrackFilter:
-    """The forward pass. State: the log of the odds that the track is right, given the scans so far."""
+    """The forward pass. State: the probabilities of right, alike and astray, given the scans so far."""
 
     def __init__(self) -> None:
-        self.log_odds = log(PRIOR_RIGHT / (1.0 - PRIOR_RIGHT))
+        self.states: States = PRIOR
 
     def start(self) -> None:
         """A new track begins."""
-        self.__init__()  # type: ignore[misc]
+        self.states = PRIOR
 
-    def add(self, row: TrackRow) -> float:
-        """Take a scan; the log of the odds."""
-        self.log_odds = _moved_on(self.log_odds, row.turns_wrong()) + row.log_likelihood_ratio(USUAL_EXPLAINED)
-        self.log_odds = min(max(self.log_odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
-        return self.log_odds
+    def add(self, row: TrackRow) -> States:
+        """Take a scan; the probabilities."""
+        self.states = _product(row.moved_on(self.states), row.likelihoods(USUAL_EXPLAINED))
+        return self.states
 
 
 def smooth(rows: Sequence[TrackRow]) -> F64:
-    """The probability that the track is right at each row, shape (n,), given all rows."""
+    """The probabilities of right, alike and astray at each row, shape (n, 3), given all rows."""
     n = len(rows)
     usual = usual_explained(rows)
-    ratios = [row.log_likelihood_ratio(usual) for row in rows]
-    # Backward: log of P(rows to come | right) / P(rows to come | wrong); the wrong state keeps itself.
-    backward = np.zeros(n)
+    likelihoods = [row.likelihoods(usual) for row in rows]
+    backward: list[States] = [(1.0, 1.0, 1.0)] * n
     for k in range(n - 2, -1, -1):
         following = rows[k + 1]
         if not following.begins:
-            right = ratios[k + 1] + backward[k + 1]
-            stays = 1.0 - following.turns_wrong()
-            backward[k] = float(np.logaddexp(log(stays) + right, log(max(1.0 - stays, 1e-300))))
-    probability = np.zeros(n)
-    odds = 0.0
+            after = _product(likelihoods[k + 1], backward[k + 1])
+            backward[k] = _product(following.looked_back(after), (1.0, 1.0, 1.0))
+    probabilities = np.zeros((n, 3))
+    states = PRIOR
     for k, row in enumerate(rows):
-        if k == 0 or row.begins:
-            odds = log(PRIOR_RIGHT / (1.0 - PRIOR_RIGHT)) + ratios[k]
-        else:
-            odds = _moved_on(odds, row.turns_wrong()) + ratios[k]
-        odds = min(max(odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
-        probability[k] = 1.0 / (1.0 + exp(-min(max(odds + backward[k], -700.0), 700.0)))
-    return probability
+        before = PRIOR if k == 0 or row.begins else row.moved_on(states)
+        states = _product(before, likelihoods[k])
+        probabilities[k] = _product(states, backward[k])
+    return probabilities
 
 
 def usual_explained(rows: Sequence[TrackRow]) -> float:
@@ -152,9 +165,8 @@ def usual_explained(rows: Sequence[TrackRow]) -> float:
     return float(np.clip(np.percentile(values, 75.0), _LEAST_USUAL, USUAL_EXPLAINED))
 
 
-def _moved_on(log_odds: float, turns_wrong: float) -> float:
-    """The log of the odds after a step in which a right track turns wrong with a probability."""
-    right = 1.0 / (1.0 + exp(-log_odds))
-    right *= 1.0 - turns_wrong
-    right = min(max(right, 1e-13), 1.0 - 1e-13)
-    return log(right / (1.0 - right))
+def _product(first: States, second: States) -> States:
+    """State by state, normalised to the sum 1; kept above the smallest numbers, so that no state is ruled out for ever."""
+    a, b, c = (max(x * y, _SMALLEST) for x, y in zip(first, second, strict=True))
+    total = a + b + c
+    return a / total, b / total, c / total

@@ -46,8 +46,11 @@ class GlobalSearch(Protocol):
     Law: the same scans since `start` and the same state of its random generator give the same results.
     """
 
-    def start(self) -> None:
-        """Begin a new search: nothing of the scans before is kept."""
+    def start(self, usual_explained: float | None = None) -> None:
+        """Begin a new search: nothing of the scans before is kept.
+
+        `usual_explained` is the explained fitness (see `Evidence`) at places of this map that were sure, if known.
+        """
         ...
 
     def update(self, paired: PairedScan, odometry_count: int) -> RelocaliserResult:

@@ -20,7 +20,7 @@ from hsloc.localisation.motion_gate import MotionGate
 from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, OdometryNoise, OmnidirectionalNoise
 from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
-from hsloc.localisation.track_evidence import NOT_UNIQUE, TrackFilter, TrackRow
+from hsloc.localisation.track_evidence import TrackFilter, TrackRow
 from hsloc.matching.observability import match_information
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Evidence, Status
@@ -246,7 +246,7 @@ class Localiser:
         evidence = self._weigh(paired, pose, points)
         status, reason = Status.MATCHED, ""
         _, _, astray = self._track_filter.add(TrackRow(status, evidence))
-        if evidence.rival > NOT_UNIQUE and astray > p.lost_probability:
+        if evidence.rival >= 1.0 and astray > p.lost_probability:
             status = Status.SEARCHING
             reason = f"lost: the map explains {evidence.explained:.2f}, another place fits {evidence.rival:.2f} times as well"
             self._lose()
@@ -281,7 +281,7 @@ class Localiser:
         """The pose is unknown from now on: search."""
         self._searching = True
         self._search_began = self._count
-        self._global_search.start()
+        self._global_search.start(self._track_filter.usual)
 
     def _begin_track(self) -> None:
         """A new track begins here, of which nothing is known but its beginning; it is compared soon."""
@@ -308,9 +308,7 @@ class Localiser:
     def _match(self, points: F64, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
         """Match in the window of the prediction; a refused match may give way to one in a wider window."""
         p = self._parameters
-        window = Window.from_covariance(
-            predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle)
-        )
+        window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
         best = self._matcher.match(points, self._field, window, self._rng)
         evaluations = best.evaluations
         if self._match_gate.usual is not None and self._match_gate.refusal(best.fitness):

@@ -66,7 +66,8 @@ class PlaceCheckParameters:
 class Explanation:
     """What the map explains of a scan at a pose.
 
-    `fitness` is the mean score over the beams that no object in free space cut short; `short`, `through` and
+    `fitness` is the mean score over the beams that no object in free space cut short and that end where something is
+    mapped; `short`, `through` and
     `unmapped` are the shares of all beams that end before a wall, behind one, or where nothing is mapped.
     """
 
@@ -78,7 +79,7 @@ class Explanation:
 
 _FITS = 0.3
 """A point scores this much within about 1.2 sigma of a wall."""
-_MARGIN_M = 0.3
+_MARGIN_M = 0.1
 """A wall this near before a beam's end is the one that it ends at (m)."""
 _NEEDED = 0.8
 """Other places below this part of the own fitness are not looked for: they make no difference."""
@@ -87,6 +88,8 @@ _OWN_HALF, _OWN_HALF_ANGLE = 0.4, 0.15
 _LEVELS = 6
 _MOST_VISITS = 2_000_000
 """Bounds computed in one comparison, at most: about a second."""
+_MOST_VISITS_OF_FITTEST = 300_000
+"""The same in the search for the fittest place."""
 _LEVER_QUANTILE = 70.0
 _LEAST_LEVER = 2.0
 """Headings are so close that a point at this distance (m), or at this percentile of all, moves by a cell."""
@@ -117,7 +120,8 @@ class PlaceCheck:
             return Explanation(0.0, 0.0, 0.0, 0.0)
         counts = np.bincount(beam, minlength=4)
         short = int(counts[SHORT])
-        fitness = float(score[beam != SHORT].sum()) / (n - short) if n > short else 0.0
+        judged = (beam != SHORT) & (beam != UNMAPPED)
+        fitness = float(score[judged].sum()) / int(judged.sum()) if judged.any() else 0.0
         return Explanation(fitness, short / n, int(counts[THROUGH]) / n, int(counts[UNMAPPED]) / n)
 
     def _classify(self, paired: PairedScan, T_map_base: Pose2) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
@@ -151,12 +155,9 @@ class PlaceCheck:
 
         `scans` are poses of the base in the map and points (n, 2) seen from them, `pose` is the place in question.
         """
-        cloud = np.vstack([pose.between(T_map_base) @ points for T_map_base, points in scans])
         pooled = self._pyramid()
+        points, step = self._cloud(scans, pose)
         side = self._field.resolution * self._coarser
-        points = np.ascontiguousarray(cloud / side, dtype=np.float32)
-        lever = max(float(np.percentile(np.hypot(cloud[:, 0], cloud[:, 1]), _LEVER_QUANTILE)), _LEAST_LEVER)
-        step = side / lever
         here = self._field.to_cells(pose)
         here[:2] /= self._coarser
         nowhere = np.array((-1.0, -1.0, -1.0))
@@ -172,6 +173,34 @@ class PlaceCheck:
         same = np.array((p.own_distance / side, p.own_distance / side, p.own_angle))
         other, _ = best_on_lattice(pooled, points, middle, whole, step, here, same, _NEEDED * own, _MOST_VISITS, found)
         return 1.0 if other < 0.0 else other / own
+
+    def fittest(self, scans: list[tuple[Pose2, F64]], last: Pose2, needed: float) -> Pose2 | None:
+        """The fittest place on the whole map for scans that are joined by odometry, None if none is fitter than `needed`.
+
+        `scans` are poses of the base and points (n, 2) seen from them, `last` is the pose of the base whose place in
+        the map is asked for, all in the frame of the odometry.
+        """
+        pooled = self._pyramid()
+        points, step = self._cloud(scans, last)
+        height, width = pooled.shape[1:]
+        middle = np.array((width / 2.0, height / 2.0, 0.0))
+        whole = np.array((width / 2.0, height / 2.0, np.pi))
+        nowhere = np.array((-1.0, -1.0, -1.0))
+        found = np.empty(3)
+        best, _ = best_on_lattice(
+            pooled, points, middle, whole, step, middle, nowhere, needed, _MOST_VISITS_OF_FITTEST, found
+        )
+        if best <= needed:
+            return None
+        found[:2] *= self._coarser
+        return self._field.from_cells(found)
+
+    def _cloud(self, scans: list[tuple[Pose2, F64]], pose: Pose2) -> tuple[NDArray[np.float32], float]:
+        """The points of scans seen from a pose, in units of the lattice, and the step between headings (rad)."""
+        cloud = np.vstack([pose.between(other) @ points for other, points in scans])
+        side = self._field.resolution * self._coarser
+        lever = max(float(np.percentile(np.hypot(cloud[:, 0], cloud[:, 1]), _LEVER_QUANTILE)), _LEAST_LEVER)
+        return np.ascontiguousarray(cloud / side, dtype=np.float32), side / lever
 
     def _pyramid(self) -> NDArray[np.float32]:
         """The field's scores, pooled: of each block of nodes the largest, and on each level those of four blocks."""

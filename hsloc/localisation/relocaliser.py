@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from math import floor, pi, radians
+from math import floor, hypot, pi, radians
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -66,6 +66,8 @@ class RelocaliserParameters:
     """The whole map is searched with so many scans: what one misses another finds."""
     min_points: int = 20
     """A scan with fewer hits says too little."""
+    renew_distance: float = 3.0
+    """Path length after which the whole map is looked at again while no hypothesis fits [m], positive."""
     min_scans: int = 4
     """Scans before anything is believed."""
     min_fitness: float = 0.35
@@ -78,7 +80,7 @@ class RelocaliserParameters:
     """Mean fitness of the second best hypothesis by that of the best, at most, for the best to be believed [0..1]."""
     keep_ratio: float = 0.85
     """A hypothesis whose mean fitness reaches this part of the best one's is kept, however far behind its sum is [0..1]."""
-    min_evidence: float = 2.0
+    min_evidence: float = 4.0
     """Least log of the odds that the winner's own scans must give it against being a wrong place, 0 or more."""
     confidence: float = 0.99
     """Confidence of the test that the best hypothesis fits better than every other one, below 1."""
@@ -88,7 +90,8 @@ class RelocaliserParameters:
     def __post_init__(self) -> None:
         for name in ("sectors", "budget", "search_points", "hypotheses", "seed_scans", "min_points", "min_scans"):
             _check(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        _check(self.tile > 0.0, "tile", self.tile, "positive")
+        for name in ("tile", "renew_distance"):
+            _check(getattr(self, name) > 0.0, name, getattr(self, name), "positive")
         for name in (
             "step_min_d",
             "step_min_a",
@@ -134,6 +137,8 @@ _RESOLUTION = 0.02
 """Standard deviation of the fitness of the same place, matched twice: what blocks differ by at least."""
 _WEIGHED = 12
 """Scans that the winner is weighed by, at most."""
+_FULL_M = 3.0
+"""Comparisons with other places count in full over this path length (m): on the spot one view is seen again and again."""
 _OFF_MAP = 0.87
 """Explained fitness by the usual one below which the best place does not fit."""
 _TRACE_LOST = 3
@@ -157,7 +162,10 @@ class Relocaliser:
         place_check: PlaceCheck | None = None,
     ) -> None:
         self._check = place_check
+        self._path_length = 0.0
+        self._renewed_at = 0.0
         self._explained: float | None = None
+        self._usual = USUAL_EXPLAINED
         self._field = likelihood
         self._matcher = matcher
         self._parameters = parameters
@@ -169,8 +177,9 @@ class Relocaliser:
         self._T_odom_last: Pose2 | None = None
         self._seen: deque[tuple[int, F64, PairedScan]] = deque(maxlen=REMEMBERED)
 
-    def start(self) -> None:
-        """Forget everything."""
+    def start(self, usual_explained: float | None = None) -> None:
+        """See `GlobalSearch`."""
+        self._usual = USUAL_EXPLAINED if usual_explained is None else usual_explained
         self._hypotheses = []
         self._T_odom_last = None
         self._explained = None
@@ -192,8 +201,13 @@ class Relocaliser:
             self._hypotheses = []
         evaluations = self._advance(points, motion)
         scans = self._hypotheses[0].scans if self._hypotheses else 1
+        self._path_length += hypot(motion.x, motion.y)
         if scans <= p.seed_scans:
             evaluations += self._seed(points, scans)
+            self._renewed_at = self._path_length
+        elif self._path_length - self._renewed_at >= p.renew_distance:
+            self._renewed_at = self._path_length
+            evaluations += self._renew(points, paired, scans)
         self._keep()
         return self._verdict(Pose2(), evaluations, True)
 
@@ -210,6 +224,22 @@ class Relocaliser:
             for pose, fit in zip(poses, fitness, strict=True)
         ]
         return evaluations
+
+    def _renew(self, points: F64, paired: PairedScan, scans: int) -> int:
+        """While no hypothesis fits, look at the whole map again: the robot may have come back to it only now."""
+        best = self._hypotheses[0]
+        poor = self._explained is not None and self._explained < _OFF_MAP * self._usual
+        if self._check is None or not poor:
+            return 0
+        joined = [(seen.T_odom_base, self._check.few(p)) for _, p, seen in list(self._seen)[-_WEIGHED:]]
+        found = self._check.fittest(joined, paired.T_odom_base, best.mean)
+        if found is None:
+            return 0
+        half, half_angle = _STEP_WINDOW
+        match = self._matcher.match(points, self._field, Window(found, half, half, half_angle), self._rng)
+        fitness = match.fitness
+        self._hypotheses.append(_Hypothesis(match.pose, match.covariance, fitness, fitness * scans, scans, [fitness]))
+        return match.evaluations
 
     def _search(self, points: F64, windows: list[Window]) -> tuple[list[Pose2], F64, int]:
         """The fittest pose in each window, how fit, and the evaluations spent."""
@@ -263,7 +293,7 @@ class Relocaliser:
         alone = len(self._hypotheses) == 1
         lead = p.drop if alone else best.total - self._hypotheses[1].total
         ratio = 0.0 if alone else self._hypotheses[1].mean / max(best.mean, 1e-9)
-        ahead = best.scans >= p.min_scans and best.mean >= p.min_fitness and lead >= p.lead
+        ahead = len(best.history) >= p.min_scans and best.mean >= p.min_fitness and lead >= p.lead
         pose = best.pose @ motion
         reason = f"{len(self._hypotheses)} hypotheses, best {best.mean:.2f}, lead {lead:.2f}, {best.scans} scans"
         evidence: Evidence | None = None
@@ -273,8 +303,8 @@ class Relocaliser:
         if sure and self._check is not None:
             evidence = self._weigh(best, motion)
             of_rivals = MOST_FROM_RIVAL if proven else max(rival_evidence(ratio), 0.0)
-            of_place = min(fit_evidence(evidence, USUAL_EXPLAINED), 0.0) + rival_evidence(evidence.rival)
-            sure = of_rivals + of_place >= p.min_evidence
+            others = min(evidence.distance / _FULL_M, 1.0) * (of_rivals + rival_evidence(evidence.rival))
+            sure = others + min(fit_evidence(evidence, self._usual), 0.0) >= p.min_evidence
         track, whole = self._retrace(best, motion) if sure else ((), False)
         return RelocaliserResult(
             pose,
@@ -303,7 +333,7 @@ class Relocaliser:
             self._explained = said if self._explained is None else self._explained + 0.3 * (said - self._explained)
         if best.scans < p.min_scans:
             return State.LOST
-        if self._explained is not None and self._explained < _OFF_MAP * USUAL_EXPLAINED:
+        if self._explained is not None and self._explained < _OFF_MAP * self._usual:
             return State.OFF_MAP
         alike = sum(hypothesis.mean >= p.max_rival_ratio * best.mean for hypothesis in self._hypotheses)
         return State.AMBIGUOUS if alike > 1 else State.LOST

@@ -62,6 +62,8 @@ USUAL_EXPLAINED = 0.93
 """Explained fitness at right places of a good map; the usual one of a run is not taken for higher."""
 _LEAST_USUAL = 0.75
 """Nor for lower: wrong places reach it."""
+_SEVERAL, _LEAST_USUAL_OF_SEVERAL = 3, 0.65
+"""So many comparisons that vouch for the track show what is usual even on a poor map; not below this, though."""
 _CERTIFIED_M = 6.0
 """A comparison that leaves the others behind vouches for the scans of this path length before it (m)."""
 
@@ -80,7 +82,7 @@ def fit_evidence(evidence: Evidence, usual: float) -> float:
     if not evidence.explained >= 0.0:
         return 0.0
     per_metre = (evidence.explained / usual - _GOOD_FIT) / _FIT_SCALE
-    seen = 1.0 - evidence.short
+    seen = 1.0 - evidence.short - evidence.unmapped
     return min(max(per_metre, -_MOST_FROM_MISFIT), _MOST_FROM_FIT) * min(evidence.distance, 1.0) * seen
 
 
@@ -116,18 +118,24 @@ class TrackRow:
 
 
 class TrackFilter:
-    """The forward pass. State: the probabilities of right, alike and astray, given the scans so far."""
+    """The forward pass. State: the probabilities of right, alike and astray, and the scans of all tracks so far."""
 
     def __init__(self) -> None:
         self.states: States = PRIOR
+        self.usual = USUAL_EXPLAINED
+        """Explained fitness that is usual on this map as far as it is known (see `usual_explained`)."""
+        self._rows: list[TrackRow] = []
 
     def start(self) -> None:
-        """A new track begins."""
+        """A new track begins; what is usual on the map stays known."""
         self.states = PRIOR
 
     def add(self, row: TrackRow) -> States:
         """Take a scan; the probabilities."""
-        self.states = _product(row.moved_on(self.states), row.likelihoods(USUAL_EXPLAINED))
+        self._rows.append(row)
+        if row.evidence.rival <= NOT_UNIQUE:
+            self.usual = usual_explained(self._rows)
+        self.states = _product(row.moved_on(self.states), row.likelihoods(self.usual))
         return self.states
 
 
@@ -152,17 +160,25 @@ def smooth(rows: Sequence[TrackRow]) -> F64:
 
 
 def usual_explained(rows: Sequence[TrackRow]) -> float:
-    """The explained fitness that is usual at places that comparisons vouch for; that of a good map where none does."""
+    """The explained fitness that is usual at places that comparisons vouch for; that of a good map where none does.
+
+    Where several comparisons vouch for the track, three quarters of the scans between them reach it: people and
+    furniture are usual there. With few, a quarter of the scans does.
+    """
     path = np.cumsum([row.evidence.distance for row in rows])
     explained = np.array([row.evidence.explained for row in rows])
     vouched = np.zeros(len(rows), dtype=np.bool_)
+    comparisons = 0
     for k, row in enumerate(rows):
         if rival_evidence(row.evidence.rival) >= 0.5 * MOST_FROM_RIVAL:
+            comparisons += 1
             vouched |= (path <= path[k]) & (path >= path[k] - _CERTIFIED_M)
     values = explained[vouched & np.isfinite(explained)]
     if len(values) == 0:
         return USUAL_EXPLAINED
-    return float(np.clip(np.percentile(values, 75.0), _LEAST_USUAL, USUAL_EXPLAINED))
+    if comparisons < _SEVERAL:
+        return float(np.clip(np.percentile(values, 75.0), _LEAST_USUAL, USUAL_EXPLAINED))
+    return float(np.clip(np.percentile(values, 25.0), _LEAST_USUAL_OF_SEVERAL, USUAL_EXPLAINED))
 
 
 def _product(first: States, second: States) -> States:

@@ -16,8 +16,8 @@ import httpx2 as httpx
 import pytest
 from fastapi.testclient import TestClient
 
-from service.http.app import create_app
-from service.settings import Settings
+from hsloc_service.http.app import create_app
+from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -15,8 +15,8 @@ import pytest
 from conftest import upload, wait
 
 from hsloc.errors import MapError
-from service.settings import Settings
-from service.worker import linked_map
+from hsloc_service.execution.worker import linked_map
+from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable

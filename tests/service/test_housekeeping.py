@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from conftest import settings, submit, wait
 
-from service.housekeeping import Housekeeping
-from service.settings import SettingsError, from_environment, parse_size
+from hsloc_service.housekeeping import Housekeeping
+from hsloc_service.settings import SettingsError, from_environment, parse_size
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from conftest import upload
 
-from service.settings import Settings
+from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from conftest import free_port, submit, wait
 
-from service import supervisor
-from service.processes import marked
-from service.storage import Storage
+from hsloc_service.execution import supervisor
+from hsloc_service.execution.processes import marked
+from hsloc_service.storage import Storage
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, rule
 from test_uploads import TUS, append, begin
 
-from service.housekeeping import Housekeeping
-from service.http.app import create_app
+from hsloc_service.housekeeping import Housekeeping
+from hsloc_service.http.app import create_app
 
 TTL = 1000.0
 

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from conftest import settings, submit, wait
 
-from service import webhooks
-from service.database import Database
-from service.tables import DeliveryRow
+from hsloc_service import webhooks
+from hsloc_service.db.database import Database
+from hsloc_service.db.tables import DeliveryRow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

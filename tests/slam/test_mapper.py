@@ -7,7 +7,8 @@ import pytest
 from conftest import ape_rmse, drive
 
 from hsloc.model import IDENTITY, Odometry, PairedScan, Pose2, Scan, Status
-from hsloc.slam.mapper import GraphMapperParameters, Mapper
+from hsloc.slam.mapper import Mapper
+from hsloc.slam.parameters import GraphMapperParameters
 
 
 def mapped(events, parameters=None, seed=0):

@@ -8,8 +8,8 @@ import uuid
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from conftest import settings, submit, upload, wait
 from fastapi.testclient import TestClient
+from live_service import settings, submit, upload, wait
 
 from hsloc.cli.main import main as program
 from hsloc_service.auth import Tokens
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from conftest import Live
+    from live_service import Live
 
 PUBLIC = {("get", "/healthz"), ("get", "/readyz")}
 READ = {

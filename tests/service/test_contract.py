@@ -15,8 +15,8 @@ import hypothesis
 import pytest
 import requests
 import schemathesis
-from conftest import Live, settings, submit, upload, wait
 from hypothesis import HealthCheck, Phase
+from live_service import Live, settings, submit, upload, wait
 from schemathesis.specs.openapi.checks import negative_data_rejection
 
 from hsloc_service.http import tus

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import upload, wait
+from live_service import upload, wait
 
 from hsloc.errors import MapError
 from hsloc_service.execution.worker import linked_map

@@ -11,7 +11,7 @@ import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from conftest import submit, upload, wait
+from live_service import submit, upload, wait
 from mcap.reader import make_reader
 from mcap.writer import Writer
 

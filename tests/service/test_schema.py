@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import settings, wait
 from fastapi.testclient import TestClient
+from live_service import settings, wait
 from sqlalchemy import event
 
 from hsloc_service.auth import ANYBODY

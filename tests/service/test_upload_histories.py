@@ -10,11 +10,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from conftest import settings as service_settings
 from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, rule
+from live_service import settings as service_settings
 from test_uploads import TUS, append, begin
 
 from hsloc_service.housekeeping import Housekeeping

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import httpx2 as httpx
 import pytest
-from conftest import upload
+from live_service import upload
 
 from hsloc_service.execution.dispatcher import sweep
 from hsloc_service.uploads.repository import Files
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from conftest import Live
     from fastapi.testclient import TestClient
+    from live_service import Live
 
 TUS = {"Tus-Resumable": "1.0.0"}
 PATCH = {**TUS, "Content-Type": "application/offset+octet-stream"}

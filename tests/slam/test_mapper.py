@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from conftest import ape_rmse, drive
+from drives import ape_rmse, drive
 
 from hsloc.model import IDENTITY, Odometry, PairedScan, Pose2, Scan, Status
 from hsloc.slam.mapper import Mapper

@@ -81,7 +81,9 @@ def test_the_gradient_is_that_of_half_the_sum_of_squares(two):
 
 
 def test_a_scan_moved_into_the_room_conflicts():
-    scans = KeyScans.from_scans([KeyScan.of(room_scan(Pose2(1.0, 2.0, 0.0))), KeyScan.of(room_scan(Pose2(1.0, 2.0, 0.0)))])
+    scans = KeyScans.from_scans(
+        [KeyScan.of(room_scan(Pose2(1.0, 2.0, 0.0))), KeyScan.of(room_scan(Pose2(1.0, 2.0, 0.0)))]
+    )
     _, _, counts = terms(scans, 1, 0, (-2.0, 0.0, 0.0))
     assert counts[1] > 20
     assert terms(scans, 1, 0, (0.0, 0.0, 0.0))[2][1] == 0

@@ -173,6 +173,7 @@ class Losses:
     stamps_zero: Counter[str] = field(default_factory=Counter)
     stamps_zero_dropped: Counter[str] = field(default_factory=Counter)
     late_messages: int = 0
+    log_times_repaired: int = 0
     reasons: list[str] = field(default_factory=list)
 
     @property
@@ -197,6 +198,7 @@ class Losses:
         self.bytes_lost += other.bytes_lost
         self.truncated_files += other.truncated_files
         self.late_messages += other.late_messages
+        self.log_times_repaired += other.log_times_repaired
         self.unknown_compression.update(other.unknown_compression)
         self.undecodable_messages.update(other.undecodable_messages)
         self.invalid_messages.update(other.invalid_messages)
@@ -226,6 +228,7 @@ class Losses:
             (self.bytes_lost, "bytes were lost"),
             (self.truncated_files, "files end too early (cut off, or never closed)"),
             (self.late_messages, "messages came later than the window of reordering"),
+            (self.log_times_repaired, "messages with an impossible log time; the time of the one before was taken"),
         )
         found = [f"{count} {text}" for count, text in plain if count]
         found += [f"{n} chunks in unknown compression {name!r}" for name, n in self.unknown_compression.items()]

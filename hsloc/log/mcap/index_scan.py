@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 import numpy as np
 
 from hsloc.errors import LogFormatError
+from hsloc.log.container import plausible_times
 from hsloc.log.mcap import records
 from hsloc.log.mcap.records import ChunkHead, Damage, Opcode
 from hsloc.log.summary import Losses, TopicStatistics
@@ -223,9 +224,19 @@ class IndexScan:
         """The chunk's indexes are complete when something else follows."""
         if self.chunk is not None:
             channels = frozenset(self.index) if self.index and self.index_is_whole else None
-            for channel in channels or ():
-                self.directory.count_times(channel, self.index[channel])
-            self.directory.segments.append(self.chunk._replace(channels=channels))
+            start = self.chunk.start_ns
+            if channels:
+                everything = np.sort(np.concatenate(list(self.index.values())))
+                if len(everything):
+                    low, high = plausible_times(everything)
+                    start = int(everything[np.searchsorted(everything, max(low, 0))])
+                for channel in channels:
+                    times = self.index[channel]
+                    wrong = (times < max(low, 0)) | (times > high)
+                    if wrong.any():
+                        times = np.where(wrong, np.uint64(start), times)
+                    self.directory.count_times(channel, times)
+            self.directory.segments.append(self.chunk._replace(channels=channels, start_ns=start))
         self.chunk = None
         self.index = {}
         self.index_is_whole = True

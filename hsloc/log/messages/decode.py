@@ -26,7 +26,19 @@ if TYPE_CHECKING:
     Payload = memoryview | bytes
 
 NANOSECONDS = 1_000_000_000
-LITTLE_ENDIAN = b"\x00\x01"
+LITTLE_ENDIAN, BIG_ENDIAN = b"\x00\x01", b"\x00\x00"
+_ALIGNMENTS = {LITTLE_ENDIAN: 8, b"\x00\x07": 4}
+"""Encapsulations that are read by hand, and the widest alignment in them: XCDR2 aligns doubles to four bytes."""
+_ENCAPSULATIONS = {
+    b"\x00\x02": "big-endian PL_CDR (a parameter list)",
+    b"\x00\x03": "PL_CDR (a parameter list)",
+    b"\x00\x06": "big-endian XCDR2",
+    b"\x00\x08": "big-endian delimited XCDR2",
+    b"\x00\x09": "delimited XCDR2",
+    b"\x00\x0a": "big-endian PL_CDR2 (a parameter list)",
+    b"\x00\x0b": "PL_CDR2 (a parameter list)",
+}
+"""Encapsulations that are not read, by the names of the DDS-XTypes standard (7.6.3.1.2)."""
 BAD_PAYLOAD = (StructError, ValueError, IndexError, OverflowError)
 """What decoders raise on a payload that is not what its channel says (UnicodeDecodeError is a ValueError)."""
 
@@ -94,6 +106,8 @@ POSE_BYTES = _POSE.size
 _F4 = np.dtype("<f4")
 _MAP_INFO = Struct("<fII")
 COVARIANCE_BYTES = 36 * 8
+_ODOMETRY_TAIL = POSE_BYTES + COVARIANCE_BYTES + 6 * 8 + COVARIANCE_BYTES
+_STAMPED_TAILS = (POSE_BYTES, POSE_BYTES + COVARIANCE_BYTES)
 _ZEROS = bytes(COVARIANCE_BYTES)
 PLANE = np.array((0, 1, 5, 6, 7, 11, 30, 31, 35))
 _BODY = 4
@@ -111,9 +125,22 @@ def _aligned(at: int, size: int) -> int:
     return at + (_BODY - at) % size
 
 
-def _check_encapsulation(data: Payload) -> None:
-    if data[:2] != LITTLE_ENDIAN:
-        raise ValueError("not little-endian CDR")
+def _alignment(data: Payload) -> int:
+    """The alignment of doubles in a message; raises ValueError for an encapsulation that is not read."""
+    identifier = bytes(data[:2])
+    found = _ALIGNMENTS.get(identifier)
+    if found is None:
+        name = _ENCAPSULATIONS.get(identifier)
+        raise ValueError(f"encoded as {name}, which is not read" if name else "not little-endian CDR")
+    return found
+
+
+def _fits(data: Payload, end: int) -> bool:
+    """Whether a message ends at `end`, but for bytes that fill up a word.
+
+    Some middleware labels its messages as XCDR2 and lays them out as XCDR1 does: their length tells which it is.
+    """
+    return 0 <= len(data) - end < 4
 
 
 def _header(data: Payload, at: int) -> tuple[int, str, int]:
@@ -146,7 +173,7 @@ def _floats(data: Payload, at: int, count: int) -> NDArray[np.float32]:
 
 def laser_scan(data: Payload) -> ScanMessage:
     """sensor_msgs/LaserScan from CDR."""
-    _check_encapsulation(data)
+    _alignment(data)
     stamp, frame, at = _header(data, 4)
     at = _aligned(at, 4)
     angle_min, _, increment, time_increment, scan_time, range_min, range_max, count = _SCAN.unpack_from(data, at)
@@ -176,10 +203,12 @@ def plane_covariance(raw: bytes) -> NDArray[np.float64] | None:
 
 def _odometry_head(data: Payload) -> tuple[int, str, str, int]:
     """(stamp, frame, child frame, offset of the pose) of a nav_msgs/Odometry."""
-    _check_encapsulation(data)
+    widest = _alignment(data)
     stamp, frame, at = _header(data, 4)
     child, at = _string(data, at)
-    return stamp, frame, child, _aligned(at, 8)
+    if widest == 4 and not _fits(data, _aligned(at, 4) + _ODOMETRY_TAIL):
+        widest = 8
+    return stamp, frame, child, _aligned(at, widest)
 
 
 def odometry_pose_at(data: Payload) -> int:
@@ -200,7 +229,17 @@ def odometry(data: Payload) -> OdometryMessage:
 
 def transforms(data: Payload) -> list[LinkMessage]:
     """tf2_msgs/TFMessage from CDR."""
-    _check_encapsulation(data)
+    widest = _alignment(data)
+    links, end = _links(data, widest)
+    if widest == 4 and not _fits(data, end):
+        links, end = _links(data, 8)
+    if end < 0:
+        raise ValueError("a transform is cut off")
+    return links
+
+
+def _links(data: Payload, widest: int) -> tuple[list[LinkMessage], int]:
+    """The links of a message whose doubles are aligned to `widest` bytes, and where the last of them ends."""
     (count,) = _SIZE.unpack_from(data, 4)
     if count * 76 > len(data):
         raise ValueError("more transforms than the message holds")
@@ -209,20 +248,25 @@ def transforms(data: Payload) -> list[LinkMessage]:
     for _ in range(count):
         stamp, parent, at = _header(data, _aligned(at, 4))
         child, at = _string(data, at)
-        at = _aligned(at, 8)
+        at = _aligned(at, widest)
+        if at + _POSE.size > len(data):
+            return links, -1
         x, y, z, qx, qy, qz, qw = _POSE.unpack_from(data, at)
         at += _POSE.size
         links.append(LinkMessage(stamp, parent, child, Transform3((x, y, z), (qx, qy, qz, qw))))
-    return links
+    return links, at
 
 
 def occupancy_grid(data: Payload) -> GridMessage:
     """nav_msgs/OccupancyGrid from CDR."""
-    _check_encapsulation(data)
+    widest = _alignment(data)
     stamp, frame, at = _header(data, 4)
     at = _aligned(at, 4) + 8
     resolution, width, height = _MAP_INFO.unpack_from(data, at)
-    at = _aligned(at + _MAP_INFO.size, 8)
+    at += _MAP_INFO.size
+    if widest == 4 and not _fits(data, _aligned(at, 4) + POSE_BYTES + 4 + width * height):
+        widest = 8
+    at = _aligned(at, widest)
     origin = _pose2(_POSE.unpack_from(data, at))
     at += _POSE.size
     (count,) = _SIZE.unpack_from(data, at)
@@ -243,9 +287,11 @@ def _grid(cells: NDArray[np.int8], width: int, height: int, resolution: float, o
 
 def _stamped_head(data: Payload) -> tuple[int, str, int]:
     """(stamp, frame, offset of the pose) of a geometry_msgs/PoseStamped."""
-    _check_encapsulation(data)
+    widest = _alignment(data)
     stamp, frame, at = _header(data, 4)
-    return stamp, frame, _aligned(at, 8)
+    if widest == 4 and not any(_fits(data, _aligned(at, 4) + tail) for tail in _STAMPED_TAILS):
+        widest = 8
+    return stamp, frame, _aligned(at, widest)
 
 
 def stamped_pose_at(data: Payload) -> int:

@@ -104,7 +104,7 @@ class LogSession:
         """The decoder of a channel of a container; made once. Raises LogFormatError."""
         key = (number, channel.id)
         if key not in self._decoders:
-            self._decoders[key] = decoder_for(channel)
+            self._decoders[key] = decoder_for(channel, self._warnings)
         return self._decoders[key]
 
     def messages(self, topic: str, typename: str | None = None) -> Iterator[tuple[int, Any]]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from hsloc.errors import EvaluationError, HslocError
 from hsloc.evaluation import read_tum
-from hsloc.log import TF, TF_NAMES, TF_STATIC, FrameTree, ReadOptions, is_log, open_log
+from hsloc.log import TF, TF_NAMES, FrameTree, ReadOptions, is_log, is_static_topic, open_log
 from hsloc.model import Odometry, Pose2, Trajectory, Truth
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def _links(log: Log) -> Iterator[tuple[int, LinkMessage, bool]]:
     for topic, log_time, message in log.observations():
         if isinstance(message, list):
             for link in message:
-                yield log_time, link, topic.lstrip("/") == TF_STATIC.lstrip("/")
+                yield log_time, link, is_static_topic(topic)
 
 
 def _candidates(log: Log) -> str:

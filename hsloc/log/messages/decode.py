@@ -243,7 +243,7 @@ def _links(data: Payload, widest: int) -> tuple[list[LinkMessage], int]:
     (count,) = _SIZE.unpack_from(data, 4)
     if count * 76 > len(data):
         raise ValueError("more transforms than the message holds")
-    links = []
+    links: list[LinkMessage] = []
     at = 8
     for _ in range(count):
         stamp, parent, at = _header(data, _aligned(at, 4))

@@ -9,6 +9,7 @@ import numpy as np
 
 from hsloc.log.messages import definitions
 from hsloc.log.session.ordering import Arrivals
+from hsloc.log.session.transform_topics import is_map_frame
 from hsloc.log.transforms import Transform3
 from hsloc.model import Odometry, Pose2, Scan, Truth
 
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
     Stamped = tuple[TopicClock, Event]
 
-MAP_FRAME = "map"
 MAX_ABS = 1e7
 """Coordinates beyond (metres) are taken for damage; the Earth's circumference is 4e7."""
 
@@ -183,9 +183,13 @@ class TransformFeed:
         """Events of the links that matter."""
         found: list[Stamped] = []
         for link in message:
-            if link.parent == MAP_FRAME and link.child == self._odom_frame:
+            if is_map_frame(link.parent) and link.child == self._odom_frame:
                 self._T_map_odom = link.transform.normalised()
-            elif link.child == self._base_frame and link.parent == (self._odom_frame or MAP_FRAME):
+            elif is_map_frame(link.child) and link.parent == self._odom_frame:  # some localisers publish the inverse
+                self._T_map_odom = link.transform.normalised().inverse()
+            elif link.child == self._base_frame and (
+                is_map_frame(link.parent) if self._odom_frame is None else link.parent == self._odom_frame
+            ):
                 found += self._base(link, log_time_ns)
         return found
 

@@ -11,11 +11,11 @@ from hsloc.log.container import in_runs
 from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import Undecodable, canonical_type, is_decodable
 from hsloc.log.session.event_builders import OdometryFeed, PoseFeed, ScanFeed, TransformFeed
-from hsloc.log.session.extrinsics import BASE_FRAMES
 from hsloc.log.session.log_session import FirstMessage, LogSession
 from hsloc.log.session.ordering import KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH, Reorder, TopicClock, one_by_one
 from hsloc.log.session.topic_reader import Route
-from hsloc.log.session.topic_selection import TF, of_type
+from hsloc.log.session.topic_selection import TF
+from hsloc.log.session.transform_topics import BASE_FRAMES
 from hsloc.log.source import Observation
 from hsloc.log.summary import Losses
 from hsloc.model import Pose2
@@ -137,9 +137,8 @@ class RosSource:
 
     def map(self) -> OccupancyGrid | None:
         """The last map of /map, or of the only topic with maps."""
-        topics = of_type(self._survey.active, definitions.OCCUPANCY_GRID)
-        named = [t for t in topics if t.lstrip("/") == "map"] or [t for t in topics if t.endswith("/map")] or topics
-        if not named or (len(named) > 1 and len(topics) > 1):
+        named = self._survey.maps
+        if not named or (len(named) > 1 and named[0].rpartition("/")[2] != "map"):
             return None
         grid = None
         for _, message in self._survey.messages(named[0], definitions.OCCUPANCY_GRID):
@@ -147,9 +146,9 @@ class RosSource:
         return grid
 
     def initial_pose(self) -> tuple[int, Pose2] | None:
-        """The first message on /initialpose, else the metadata record `hsloc.initial_pose`."""
-        for log_time, message in self._survey.messages("/initialpose", definitions.POSE_WITH_COVARIANCE_STAMPED):
-            return message.stamp_ns or log_time, message.pose
+        """The first usable message on /initialpose, else the metadata record `hsloc.initial_pose`."""
+        if self._survey.initial_pose is not None:
+            return self._survey.initial_pose
         values = self.summary.metadata.get(INITIAL_POSE)
         if values is None:
             return None

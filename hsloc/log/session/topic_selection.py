@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from hsloc.errors import TopicError
-from hsloc.log.messages import definitions, foxglove
+from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import canonical_type, is_decodable
+from hsloc.log.session.transform_topics import is_static_topic, is_transform_topic
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,17 +41,19 @@ def has_name(channel: Channel, name: str) -> bool:
     return channel.topic.lstrip("/") == name.lstrip("/")
 
 
-def carries(channel: Channel, topic: str) -> bool:
-    """Whether a channel belongs to a topic: Foxglove's transforms are found by their type, under any name."""
-    if has_name(channel, topic):
-        return True
-    is_transform = foxglove.TYPES.get(channel.typename) == definitions.TF_MESSAGE
-    return topic == TF and is_transform and not has_name(channel, TF_STATIC)
-
-
 def of_type(channels: Sequence[Channel], typename: str) -> list[str]:
     """Topics of a type that can be decoded, sorted."""
     return sorted({c.topic for c in channels if canonical_type(c.typename) == typename and is_decodable(c)})
+
+
+def names_transforms(channels: Sequence[Channel], name: str | None) -> str | None:
+    """The topic of transforms that a user names in place of odometry, as the log has it; `/tf` for `tf`."""
+    if name is None:
+        return None
+    if name in TF_NAMES:
+        return TF
+    found = sorted({c.topic for c in channels if has_name(c, name) and is_transform_topic(c)})
+    return found[0] if found and not is_static_topic(found[0]) else None
 
 
 def choose_topics(
@@ -63,8 +66,8 @@ def choose_topics(
     """
     choice = TopicSelection()
     choice.truth = _truth(where, channels, options)
-    choice.scans = _scans(where, channels, options, choice.problems)
-    if options.odom_topic in TF_NAMES:
+    choice.scans = choose_scans(where, channels, options, choice.problems)
+    if names_transforms(channels, options.odom_topic) is not None:
         choice.odom = TF
     else:
         others = [c for c in channels if c.topic != choice.truth and not is_truth_name(c.topic)]
@@ -95,7 +98,7 @@ def is_truth_name(topic: str) -> bool:
     return _TRUTH_NAME.search(topic) is not None
 
 
-def _scans(where: str, channels: Sequence[Channel], options: ReadOptions, problems: list[str]) -> tuple[str, ...]:
+def choose_scans(where: str, channels: Sequence[Channel], options: ReadOptions, problems: list[str]) -> tuple[str, ...]:
     """The scan topics: the only one, or those that are named, separated by commas."""
     candidates = of_type(channels, definitions.LASER_SCAN)
     names: list[str | None] = [None]

@@ -40,6 +40,20 @@ def to_pose(values: tuple[float, float, float] | None) -> Pose2 | None:
     return Pose2(values[0], values[1], wrap_angle(values[2]))
 
 
+def heights(text: str) -> tuple[float, float]:
+    """LOW,HIGH in metres."""
+    low, high = numbers(text, 2, "LOW,HIGH (metres)")
+    return low, high
+
+
+def time_offset(text: str) -> tuple[str, float]:
+    """TOPIC=SECONDS."""
+    topic, _, seconds = text.rpartition("=")
+    if not topic:
+        raise argparse.ArgumentTypeError(f"{text!r} is not TOPIC=SECONDS")
+    return topic, numbers(seconds, 1, "a number of seconds")[0]
+
+
 def add_read_arguments(parser: argparse.ArgumentParser) -> None:
     """How to read a log."""
     group = parser.add_argument_group("reading the log")
@@ -55,6 +69,22 @@ def add_read_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--deskew", action="store_true", help="move each beam to where the robot was when it was measured"
+    )
+    group.add_argument(
+        "--scan-fix", metavar="FIELD=VALUE", action="append", default=[],
+        help="override a field of the scans: increment=RAD|angles|negate, angles=degrees, time_increment=S|interval, "
+        "range_max=M; several are allowed",
+    )  # fmt: skip
+    group.add_argument(
+        "--slice", type=heights, metavar="LOW,HIGH",
+        help="read point clouds as scans: the nearest point of each direction between two heights above the base (m)",
+    )  # fmt: skip
+    group.add_argument(
+        "--time-offset", type=time_offset, metavar="TOPIC=SECONDS", action="append", default=[],
+        help="add seconds to the stamps of a topic (s)",
+    )  # fmt: skip
+    group.add_argument(
+        "--stamps", choices=("header", "log"), default="header", help="take the log's time in place of header stamps"
     )
     group.add_argument("--start", type=float, metavar="S", help="begin so many seconds into the log")
     end = group.add_mutually_exclusive_group()
@@ -77,6 +107,10 @@ def read_options(arguments: argparse.Namespace) -> ReadOptions:
         start_s=arguments.start,
         end_s=end,
         deskew=arguments.deskew,
+        scan_fix=tuple(arguments.scan_fix),
+        slice=arguments.slice,
+        time_offset=tuple(arguments.time_offset),
+        stamps=arguments.stamps,
     )
 
 

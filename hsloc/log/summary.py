@@ -7,6 +7,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from hsloc.errors import ConfigError
 from hsloc.model import IDENTITY, Pose2
 
 if TYPE_CHECKING:
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 NANOSECONDS = 1_000_000_000
+STAMPS = ("header", "log")
+LONGEST_OFFSET_S = 1e6
+"""Clocks that are farther apart (s) are of different epochs: the log's time is the way out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +30,11 @@ class ReadOptions:
     in seconds from the first event of the chosen topics. Without `require_scan` or
     `require_odometry` a missing or ambiguous topic is a warning, not an error. `deskew` asks for scans whose points
     are moved to where the robot was when each beam was measured.
+
+    `scan_fix` overrides fields of scans (see `hsloc.log.session.scan_geometry.ScanFixes`). `slice` are two heights
+    above the base (m): point clouds are read as scans, the nearest point of each direction between them.
+    `time_offset` adds seconds to the stamps of a topic; `stamps` takes the log's time in place of header stamps
+    ("log") or not ("header").
     """
 
     scan_topic: str | None = None
@@ -38,6 +47,18 @@ class ReadOptions:
     require_scan: bool = True
     require_odometry: bool = True
     deskew: bool = False
+    scan_fix: tuple[str, ...] = ()
+    slice: tuple[float, float] | None = None
+    time_offset: tuple[tuple[str, float], ...] = ()
+    stamps: str = "header"
+
+    def __post_init__(self) -> None:
+        if self.stamps not in STAMPS:
+            raise ConfigError(f"stamps is {self.stamps!r}; it must be one of {', '.join(STAMPS)}")
+        if self.slice is not None and not self.slice[0] < self.slice[1]:
+            raise ConfigError(f"--slice is {self.slice[0]:g},{self.slice[1]:g}; the first must be the lower height")
+        if any(not abs(seconds) <= LONGEST_OFFSET_S for _, seconds in self.time_offset):
+            raise ConfigError(f"--time-offset must be a number of seconds, at most {LONGEST_OFFSET_S:g}")
 
 
 @dataclass(slots=True)

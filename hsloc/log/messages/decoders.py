@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import LogFormatError
 from hsloc.log.messages import cdr_batch_decode as columns
-from hsloc.log.messages import decode, definitions, foxglove, ros_json
+from hsloc.log.messages import decode, definitions, foxglove, from_objects, point_cloud, ros_json
 from hsloc.log.messages import definition_compatibility as schema
 from hsloc.log.messages.definitions import long_name
 
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _ALIASES = {"tf/msg/tfMessage": definitions.TF_MESSAGE} | foxglove.TYPES
 """ROS 1's old name of a type that is otherwise the same, and Foxglove's types."""
 
+BY_HAND = decode.BY_HAND | {definitions.POINT_CLOUD2: point_cloud.point_cloud}
+FROM_OBJECT = from_objects.FROM_OBJECT | {definitions.POINT_CLOUD2: point_cloud.object_point_cloud}
 _ENCODINGS = ("cdr", "ros1", "json")
 _ZSTD = b"\x28\xb5\x2f\xfd"
 """How a payload begins that rosbag2 compressed by itself (`--compression-mode message`); CDR begins with a zero."""
@@ -43,7 +45,7 @@ def is_decodable(channel: Channel) -> bool:
     """Whether hsloc has a decoder for the channel's type and encoding."""
     if channel.typename.startswith(foxglove.PREFIX):
         return foxglove.is_foxglove(channel)
-    return channel.message_encoding in _ENCODINGS and canonical_type(channel.typename) in decode.BY_HAND
+    return channel.message_encoding in _ENCODINGS and canonical_type(channel.typename) in BY_HAND
 
 
 def decoder_for(channel: Channel, warnings: list[str] | None = None) -> Decoder:
@@ -56,7 +58,7 @@ def decoder_for(channel: Channel, warnings: list[str] | None = None) -> Decoder:
         return _guarded(foxglove.decoder(channel))
     typename = canonical_type(channel.typename)
     if channel.message_encoding == "json":
-        return _guarded(ros_json.decoder(decode.FROM_OBJECT[typename]))
+        return _guarded(ros_json.decoder(FROM_OBJECT[typename]))
     if channel.message_encoding == "cdr" and _is_known(channel, typename):
         return _by_hand(channel, typename)
     if _is_incomplete(channel, typename):
@@ -94,7 +96,7 @@ def _is_incomplete(channel: Channel, typename: str) -> bool:
 
 
 def _by_hand(channel: Channel, typename: str) -> Decoder:
-    fast = decode.BY_HAND[typename]
+    fast = BY_HAND[typename]
     slow: list[Decoder] = []
 
     def decoder(data: Payload) -> Any:
@@ -165,7 +167,7 @@ def _by_rosbags(channel: Channel, typename: str) -> Decoder:
             f"{channel.topic}: the definition of {name} cannot be used ({_short(error)}); name another topic"
         ) from error
     deserialise = store.deserialize_ros1 if channel.message_encoding == "ros1" else store.deserialize_cdr
-    convert = decode.FROM_OBJECT[typename]
+    convert = FROM_OBJECT[typename]
 
     def decoder(data: Payload) -> Any:
         if data[:4] == _ZSTD:

@@ -50,6 +50,13 @@ class Extrinsics:
         self.found(laser_frame)
         return laser_mounting(self._spatial.get(laser_frame, Transform3()) @ T_frame_laser)
 
+    def in_space(self, frame: str) -> Transform3:
+        """T_base_frame in space, the identity where it is not known; a mounting that was given is in the plane."""
+        if self._override is not None:
+            return Transform3.from_pose2(self._override)
+        self.found(frame)
+        return self._spatial.get(frame, Transform3())
+
     def found(self, laser_frame: str) -> tuple[Mounting, str]:
         """The mounting, and where it comes from: `option`, topics of transforms, `same frame` or `identity`."""
         known = self._known.get(laser_frame)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hsloc.log.messages import definitions, foxglove
 from hsloc.log.messages.decoders import Undecodable, canonical_type, decoder_for, is_decodable
 from hsloc.log.session.extrinsics import Extrinsics
+from hsloc.log.session.scan_geometry import ScanFixes, ScanSurvey, survey
 from hsloc.log.session.split_recordings import check_parts
 from hsloc.log.session.topic_selection import (
     TF,
@@ -34,6 +35,7 @@ CONVERTED = "hsloc.convert"
 """Metadata record of a converted log; `order` = `log` says that the order of the log is the true one."""
 
 _STAMPS_AT_OPENING = 100
+_SCANS_AT_OPENING = 60
 _SAME_CLOCK_NS = 3600 * 1_000_000_000
 _CLOCKS_APART_NS = 5_000_000_000
 
@@ -80,7 +82,8 @@ class LogSession:
         if len(containers) > 1:
             where += f" and {len(containers) - 1} more"
         scans = choose_scans(where, self.active, options, [])
-        self.scans = {topic: self._first(topic, definitions.LASER_SCAN) for topic in scans}
+        self.scan_types = scans
+        self.scans = {topic: self._first(topic, kind) for topic, kind in scans.items()}
         frames = [(topic, first.message.frame_id) for topic, first in self.scans.items() if first is not None]
         self.transforms = choose_transforms(
             containers, frames, options.base_frame, names_transforms(self.active, options.odom_topic)
@@ -97,6 +100,8 @@ class LogSession:
             self.tf_frames if odom == TF else None,
         )
         self._warnings += doubts
+        self.fixes = ScanFixes.parse(options.scan_fix)
+        self.surveys = {topic: self._survey(topic) for topic in scans}
         self.odom_type = self._pose_type(self.choice.odom)
         self.odom = self._first(self.choice.odom, self.odom_type)
         self.truth_type = self._pose_type(self.choice.truth)
@@ -159,6 +164,22 @@ class LogSession:
             return definitions.ODOMETRY
         kinds = {canonical_type(channel.typename) for _, channel in self.channels(topic)}
         return next((kind for kind in TRUTH_TYPES if kind in kinds), definitions.ODOMETRY)
+
+    def _survey(self, topic: str) -> ScanSurvey:
+        """A look at the first scans of a topic, with what the user overrides."""
+        kind = self.scan_types[topic]
+        if kind == definitions.POINT_CLOUD2:
+            return ScanSurvey()
+        first = [message for _, message in islice(self.messages(topic, kind), _SCANS_AT_OPENING)]
+        interval = survey(first).interval_s
+        found = survey(self.fixes.apply(message, interval) for message in first)
+        self._warnings += [f"{topic}: {problem.text}; {problem.remedy}" for problem in found.problems]
+        if found.segments > 1:
+            self._warnings.append(
+                f"{topic}: a turn comes in {found.segments} segments, which are joined; record the topic of whole "
+                "turns if the driver has one"
+            )
+        return found
 
     @property
     def odometry_child(self) -> str | None:
@@ -230,7 +251,7 @@ class LogSession:
     def _laser(self, topic: str, first: FirstMessage) -> LaserSummary:
         frame = first.message.frame_id
         extrinsics = self.mountings.found(frame)[1]
-        mounting = self.mountings.of(frame, first.message.T_frame_laser)
+        mounting = self.mountings.of(frame, getattr(first.message, "T_frame_laser", None))
         return LaserSummary(topic, frame, mounting.T_base_laser, mounting.flipped, extrinsics)
 
     def _topics(self) -> list[TopicSummary]:

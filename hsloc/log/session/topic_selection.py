@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from hsloc.errors import TopicError
 from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import canonical_type, is_decodable
-from hsloc.log.session.transform_topics import is_static_topic, is_transform_topic
+from hsloc.log.session.transform_topics import is_static_topic, is_transform_topic, namespace
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,6 +23,10 @@ TF_NAMES = ("tf", "/tf")
 TRUTH_TYPES = (definitions.ODOMETRY, definitions.POSE_STAMPED, definitions.POSE_WITH_COVARIANCE_STAMPED)
 _TRUTH_NAME = re.compile(r"ground_?truth|(^|/)truth($|/)|(^|/)gt($|/)")
 _ODOMETRY_NAME = re.compile(r"(^|/)odom(etry)?($|/)")
+SCAN_TYPES = (definitions.LASER_SCAN, definitions.MULTI_ECHO_LASER_SCAN, definitions.POINT_CLOUD2)
+"""What scans are made of, the plainest first."""
+_ECHOES = ("first", "most_intense", "last")
+"""Names under which drivers publish the echoes of one laser, the one to read first."""
 _LISTED = 12
 
 
@@ -66,7 +70,7 @@ def choose_topics(
     """
     choice = TopicSelection()
     choice.truth = _truth(where, channels, options)
-    choice.scans = choose_scans(where, channels, options, choice.problems)
+    choice.scans = tuple(choose_scans(where, channels, options, choice.problems))
     if names_transforms(channels, options.odom_topic) is not None:
         choice.odom = TF
     else:
@@ -98,17 +102,30 @@ def is_truth_name(topic: str) -> bool:
     return _TRUTH_NAME.search(topic) is not None
 
 
-def choose_scans(where: str, channels: Sequence[Channel], options: ReadOptions, problems: list[str]) -> tuple[str, ...]:
-    """The scan topics: the only one, or those that are named, separated by commas."""
-    candidates = of_type(channels, definitions.LASER_SCAN)
+def choose_scans(where: str, channels: Sequence[Channel], options: ReadOptions, problems: list[str]) -> dict[str, str]:
+    """The scan topics with their types: the only one, or those that are named, separated by commas.
+
+    Plain scans come first; several echoes or clouds of points are read where there are no others, or if they are named.
+    """
+    types = [kind for kind in SCAN_TYPES if kind != definitions.POINT_CLOUD2 or options.slice is not None]
+    by_type = {kind: of_type(channels, kind) for kind in types}
+    kinds = {topic: kind for kind in reversed(types) for topic in by_type[kind]}
+    first = next((kind for kind in types if by_type[kind]), definitions.LASER_SCAN)
+    candidates = by_type[first]
     names: list[str | None] = [None]
     if options.scan_topic is not None:
         names = [*dict.fromkeys(name.strip() for name in options.scan_topic.split(","))]
-    chosen = [
-        _pick(where, channels, "scan", definitions.LASER_SCAN, candidates, name, options.require_scan, problems)
-        for name in names
-    ]
-    return tuple(dict.fromkeys(topic for topic in chosen if topic is not None))
+        candidates = sorted(kinds)
+    elif len(candidates) > 1:
+        echoes = [topic for topic in candidates if topic.rpartition("/")[2] in _ECHOES]
+        if len(echoes) == len(candidates) and len({namespace(topic) for topic in echoes}) == 1:
+            first_echo = min(echoes, key=lambda topic: _ECHOES.index(topic.rpartition("/")[2]))
+            problems.append(
+                f"{', '.join(echoes)} are echoes of one laser; {first_echo} is read: choose with --scan-topic"
+            )
+            names = [first_echo]
+    chosen = [_pick(where, channels, "scan", first, candidates, name, options.require_scan, problems) for name in names]
+    return {topic: kinds[topic] for topic in chosen if topic is not None}
 
 
 def _odometry_candidates(channels: Sequence[Channel], named: bool) -> list[str]:
@@ -145,6 +162,11 @@ def _pick(
         problem += f", or take all with {flag} {','.join(candidates[:_LISTED])}" if kind == "scan" else ""
     else:
         problem = f"{where}: no {what} topic ({typename}); the log holds {listed(channels)}"
+        if kind == "scan" and of_type(channels, definitions.POINT_CLOUD2):
+            problem += (
+                "; point clouds are read as scans with --slice LOW,HIGH, the heights above the base (m) between which "
+                "walls are seen"
+            )
         problem += "; without odometry a map can be drawn (--no-odom)" if kind == "odom" and required else ""
     if required:
         raise TopicError(problem)

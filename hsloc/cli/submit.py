@@ -81,7 +81,9 @@ def _request(arguments: argparse.Namespace, client: Client) -> dict[str, Any]:
     if arguments.config is not None:
         request["config"] = _yaml(arguments.config)
     if arguments.map is not None:
-        image = arguments.map.parent / str(_yaml(arguments.map).get("image", ""))
+        from hsloc.maps.metadata import read_metadata
+
+        image = read_metadata(arguments.map).image
         request["map"] = {"yaml": client.upload(arguments.map), "image": client.upload(image)}
     if arguments.relations is not None:
         request["relations"] = client.upload(arguments.relations)

@@ -94,10 +94,11 @@ def run(spec: RunRequest, progress: Callable[[Progress], None] | None = None) ->
     """
     begin = time.perf_counter()
     log = open_log(spec.logs, spec.reading())
-    reference = None if spec.reference is None else read_reference(spec.reference, spec.logs)
+    of_reference: list[str] = []
+    reference = None if spec.reference is None else read_reference(spec.reference, spec.logs, of_reference)
     grid, warnings = find_map(spec, log)
     state, remarks = load_state(spec)
-    warnings = (*warnings, *remarks)
+    warnings = (*warnings, *remarks, *of_reference)
     draws = spec.mode == "slam" or spec.no_odometry or state is not None
     localise = spec.mode == "localise" or (grid is not None and not draws)
     opened = time.perf_counter()

@@ -193,6 +193,7 @@ class Losses:
     stamp_jumps: Counter[str] = field(default_factory=Counter)
     stamps_zero: Counter[str] = field(default_factory=Counter)
     stamps_zero_dropped: Counter[str] = field(default_factory=Counter)
+    orientations_unset: Counter[str] = field(default_factory=Counter)
     late_messages: int = 0
     log_times_repaired: int = 0
     reasons: list[str] = field(default_factory=list)
@@ -226,6 +227,7 @@ class Losses:
         self.stamps_backwards.update(other.stamps_backwards)
         self.stamp_jumps.update(other.stamp_jumps)
         self.stamps_zero.update(other.stamps_zero)
+        self.orientations_unset.update(other.orientations_unset)
         self.stamps_zero_dropped.update(other.stamps_zero_dropped)
         for reason in other.reasons:
             self.note(reason)
@@ -243,6 +245,7 @@ class Losses:
             ("stamps jump out of line and were not trusted for the order", self.stamp_jumps),
             ("messages without stamp; the log's time was taken", self.stamps_zero),
             ("messages without stamp were dropped", self.stamps_zero_dropped),
+            ("orientations are quaternions of zeros; the heading 0 was taken", self.orientations_unset),
         )
         plain = (
             (self.damaged_chunks, "damaged chunks were skipped"),

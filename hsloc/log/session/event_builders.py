@@ -186,14 +186,17 @@ class OdometryFeed:
         pose = message.pose if self._T_child_base is None else message.pose @ self._T_child_base
         if self.is_truth:
             return ((self._clock, Truth(stamp, pose)),)
-        return ((self._clock, Odometry(stamp, pose, message.covariance)),)
+        has_heading = any(getattr(message, "quaternion", (1.0,)))
+        if not has_heading:
+            self._losses.orientations_unset[self.topic] += 1
+        return ((self._clock, Odometry(stamp, pose, message.covariance, has_heading)),)
 
     def arrivals(self, columns: PoseColumns, places: Sequence[int], log_times: Sequence[int]) -> Arrivals | None:
         """The events of many messages at once, as `events` gives them; None where one needs a closer look."""
         x, y, theta = columns.x, columns.y, columns.theta
         with np.errstate(invalid="ignore"):
             usable = (np.abs(x) < MAX_ABS) & (np.abs(y) < MAX_ABS) & np.isfinite(theta)
-        if not (usable.all() and columns.stamps_ns.all()):
+        if not (usable.all() and columns.stamps_ns.all() and columns.has_headings):
             return None
         stamps = list(log_times) if self._clock.by_log else columns.stamps_ns.tolist()
         if self._clock.offset_ns:
@@ -268,7 +271,10 @@ class TransformFeed:
         if self._odometry is not None:
             stamp = self._odometry.stamp(link.stamp_ns, log_time_ns)
             if stamp is not None:
-                yield self._odometry, Odometry(stamp, pose)
+                has_heading = any(link.transform.rotation)
+                if not has_heading:
+                    self._losses.orientations_unset[self.topic] += 1
+                yield self._odometry, Odometry(stamp, pose, None, has_heading)
         if self._truth is None:
             return
         stamp = self._truth.stamp(link.stamp_ns, log_time_ns)

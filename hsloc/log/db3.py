@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import tempfile
 from contextlib import closing, contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from hsloc.errors import HslocError, LogError, LogFormatError
 from hsloc.log.container import Channel, RawMessage, in_runs, plausible_times
+from hsloc.log.files import Scratch
 from hsloc.log.messages.definitions import long_name
 from hsloc.log.summary import Losses, TopicStatistics
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
+    from pathlib import Path
 
 _RUN = 1024
 """Messages in one run."""
@@ -38,8 +38,9 @@ class Db3Container:
 
     def __init__(self, path: Path, shown: Path | None = None) -> None:
         self.path = shown or path
-        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._scratch = Scratch()
         self._file = self._with_write_ahead_log(path)
+        self._is_copy = self._file != path
         self.channels: dict[int, Channel] = {}
         self.statistics: dict[int, TopicStatistics] = {}
         self.metadata: dict[str, dict[str, str]] = {}
@@ -89,8 +90,7 @@ class Db3Container:
         try:
             if not log.is_file() or log.stat().st_size == 0:
                 return path
-            self._scratch = tempfile.TemporaryDirectory(prefix="hsloc-db3-")
-            copy = Path(self._scratch.name) / "bag.db3"
+            copy = self._scratch.folder / "bag.db3"
             shutil.copyfile(path, copy)
             shutil.copyfile(log, copy.with_name("bag.db3-wal"))
         except OSError as error:
@@ -103,7 +103,7 @@ class Db3Container:
     @contextmanager
     def _connected(self) -> Iterator[sqlite3.Connection]:
         """A connection that changes nothing. A name may hold `#`, `?` and `%`: it is quoted in the URI."""
-        mode = "mode=rw" if self._scratch is not None else "mode=ro&immutable=1"
+        mode = "mode=rw" if self._is_copy else "mode=ro&immutable=1"
         uri = f"file:{quote(str(self._file.absolute()))}?{mode}"
         with closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
             connection.execute("PRAGMA query_only = 1")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import shutil
 import tempfile
+import weakref
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -35,19 +37,20 @@ class Scratch:
     """A temporary folder that is made when it is first needed, and removed with the last reference to it."""
 
     def __init__(self) -> None:
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._folder: Path | None = None
 
     @property
     def folder(self) -> Path:
         """The folder. Raises LogError where none can be made."""
         if self._folder is None:
             try:
-                self._folder = tempfile.TemporaryDirectory(prefix="hsloc-log-", ignore_cleanup_errors=True)
+                self._folder = Path(tempfile.mkdtemp(prefix="hsloc-log-"))
             except OSError as error:
                 raise LogError(
                     f"no temporary folder to unpack the log in ({error.strerror or error}); set TMPDIR"
                 ) from error
-        return Path(self._folder.name)
+            weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+        return self._folder
 
 
 def expand(path: Path, scratch: Scratch, shown: Path | None = None) -> list[LogFile]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from hsloc.errors import LogError, LogFormatError
-from hsloc.log.container import Channel, RawMessage, plausible_times
+from hsloc.log.container import Channel, RawMessage
 from hsloc.log.mcap import records
 from hsloc.log.mcap.index_scan import IndexScan, Segment
 from hsloc.log.mcap.records import ChunkHead, Damage, Opcode, UnknownCompression
@@ -32,8 +32,6 @@ MAX_TOTAL_RATIO = 100
 """Bytes a file may unpack to, as a multiple of its own size ..."""
 FREE_UNPACKED_BYTES = 4 << 30
 """... but in any case as many as this: maps of unknown cells pack 1 : 8000."""
-LONGEST_SEGMENT_NS = 3600 * 1_000_000_000
-"""No chunk holds an hour of messages: where the log times of one span more, some of them are wrong."""
 _FEW = 4096
 """Messages held back that are rather sorted anew with each segment (a sorted list is a heap as well)."""
 
@@ -175,8 +173,9 @@ class McapContainer:
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and not self._directory.knows(opcode, data, at):
                 self._directory.define(opcode, view[at + prefix_size : following], segment.at, losses)
             at = following
-        if len(found) > 1 and max(found)[0] - min(found)[0] > LONGEST_SEGMENT_NS:
-            found = _with_plausible_times(found, losses)
+        low, high = self._directory.plausible_ns
+        if found and not (low <= min(found)[0] and max(found)[0] <= high):
+            found = _with_plausible_times(found, low, high, segment.start_ns, losses)
         if at < end:
             losses.damaged_chunks += 1
             losses.bytes_lost += end - at
@@ -219,10 +218,11 @@ class McapContainer:
         return frozenset(times) if times else None
 
 
-def _with_plausible_times(found: list[RawMessage], losses: Losses) -> list[RawMessage]:
+def _with_plausible_times(
+    found: list[RawMessage], low: int, high: int, start_ns: int, losses: Losses
+) -> list[RawMessage]:
     """Messages in the order of the file, those with impossible log times at the time of the one before."""
-    low, high = plausible_times(sorted(message[0] for message in found))
-    last = next((message[0] for message in found if low <= message[0] <= high), 0)
+    last = next((message[0] for message in found if low <= message[0] <= high), start_ns)
     repaired = []
     for message in found:
         if low <= message[0] <= high:

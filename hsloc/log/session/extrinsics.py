@@ -133,7 +133,7 @@ class Extrinsics:
     def _warn_if_restated(self, tree: FrameTree, base: str, laser: str) -> None:
         """Static transforms that are stated twice with different values: the later ones were taken."""
         path = tree.path(tree.resolve(base, laser) or base, tree.resolve(laser, base) or laser)
-        for frame in path[0] + path[1] if path else ():
+        for frame in path[0] + path[1] if path else (laser,):
             statements = self._static.statements(frame)
             if len(statements) > 1:
                 listed = " and ".join(

@@ -30,8 +30,9 @@ _LEAST_DISAGREEMENT = radians(2.0)
 _LONGEST_SWEEP, _SHORTEST_SWEEP = 1.5, 0.25
 """A lidar that turns once between two scans measures its beams in as large a part of the interval as they span of a
 turn; a sweep that takes a smaller or larger part of that than this is an error of the driver, or of another lidar."""
-_FAR_SHARE = 0.01
-"""Finite readings beyond range_max that are worth a word, as a part of all finite ones."""
+_FAR_SHARE = 0.05
+"""Finite readings beyond range_max that are worth a word, as a part of all finite ones: cheap lidars have stray ones, a
+hundredth of all in a real log."""
 _CODE_SHARE = 0.5
 """Readings beyond range_max of which more than this part have one value are a code for no return."""
 
@@ -160,13 +161,11 @@ def _angles(scan: ScanMessage) -> Problem | None:
         f"angle_min {low:.4f} and {beams} beams of angle_increment {increment:.5f} end at {end:.4f} rad, angle_max is "
         f"{high:.4f}"
     )
+    remedy = "find out which is right: --scan-fix increment=angles takes angle_max's, increment=VALUE any other"
     if abs(low - (beams - 1) * increment - high) <= tolerance:
         text += ": they differ by the sign of the increment, and the scan is mirrored if that is wrong"
-    return Problem(
-        "angle_increment",
-        text,
-        "find out which is right: --scan-fix increment=angles takes angle_max's, --scan-fix increment=VALUE any other",
-    )
+        remedy = "--scan-fix increment=negate takes the sign of angle_max's"
+    return Problem("angle_increment", text, remedy)
 
 
 _REPAIR = "repair the driver; --scan-fix overrides a field"

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from hsloc.log.messages.decode import ScanMessage
 
 _TURN = 2.0 * pi
+_LONGEST_TURN = 1.25 * _TURN
+"""Some lidars measure a little more than a turn (rad)."""
 _WIDEST_SEGMENT = pi
 """A segment of a turn spans at most half of it (rad)."""
 _SPARE_BEAMS = 2.5
@@ -155,7 +157,8 @@ def _angles(scan: ScanMessage) -> Problem | None:
     end = low + (beams - 1) * increment
     tolerance = max(_LEAST_DISAGREEMENT, _SPARE_BEAMS * abs(increment))
     # A full turn may be written to end where it began, and angles may be written with or without a turn.
-    if min(abs(end - high + turn) for turn in (-_TURN, 0.0, _TURN)) <= tolerance:
+    is_one_turn = abs(increment) * (beams - 1) <= _LONGEST_TURN
+    if is_one_turn and min(abs(end - high + turn) for turn in (-_TURN, 0.0, _TURN)) <= tolerance:
         return None
     text = (
         f"angle_min {low:.4f} and {beams} beams of angle_increment {increment:.5f} end at {end:.4f} rad, angle_max is "

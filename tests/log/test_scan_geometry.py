@@ -49,7 +49,7 @@ def scans(
                 None,
                 0.1,
                 angle_max=end,
-            )  # fmt: skip
+            )
         )
     return found
 
@@ -160,7 +160,8 @@ def test_segments_become_turns(count: int, skipped: int, clockwise: bool) -> Non
         assert turn.time_increment == pytest.approx(scan.time_increment, rel=1e-3)
 
 
-def test_a_lost_segment_splits_a_turn_and_no_other(count: int = 12) -> None:
+def test_a_lost_segment_splits_a_turn_and_no_other() -> None:
+    count = 12
     parts = in_segments(scans(6), count)
     found = survey(parts)
     del parts[count + 5]

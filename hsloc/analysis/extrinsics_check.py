@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.matching.hide import Hide
 from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2
@@ -20,6 +19,7 @@ from hsloc.model.pose2 import Pose2
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hsloc.matching.match import Matcher
     from hsloc.model.events import Scan
     from hsloc.model.occupancy_grid import OccupancyGrid
 
@@ -38,10 +38,18 @@ _SURE = 4.0
 class MountingCheck:
     """Takes the believed scans of a run with their poses, a few of which it matches again."""
 
-    def __init__(self, grid: OccupancyGrid, scans: int, lasers: int) -> None:
-        """`scans` are to come, of so many lasers; of one laser there is nothing to compare."""
+    def __init__(
+        self, grid: OccupancyGrid, likelihood: LikelihoodField | None, matcher: Matcher, sigma: float, scans: int,
+        lasers: int,
+    ) -> None:  # fmt: skip
+        """`scans` are to come, of `lasers` lasers; of one laser there is nothing to compare.
+
+        The map's field is made with `sigma` (m) where it is not given.
+        """
         self._every = max(scans // (max(lasers, 1) * SAMPLES), 1)
-        self._field = LikelihoodField.from_grid(grid) if lasers > 1 and grid.occupied().any() else None
+        usable = lasers > 1 and bool(grid.occupied().any())
+        self._field = (likelihood or LikelihoodField.from_grid(grid, sigma)) if usable else None
+        self._matcher = matcher
         self._rng = np.random.default_rng(0)
         self._seen: dict[str, int] = {}
         self._mounted: dict[str, Pose2] = {}
@@ -57,7 +65,7 @@ class MountingCheck:
         points = scan.points_base()
         if len(points) < _MIN_POINTS:
             return
-        match = Hide().match(points, self._field, Window(T_map_base, _HALF, _HALF, _HALF_ANGLE), self._rng)
+        match = self._matcher.match(points, self._field, Window(T_map_base, _HALF, _HALF, _HALF_ANGLE), self._rng)
         if match.fitness >= _MIN_FITNESS:
             self._offsets.setdefault(frame, []).append(T_map_base.between(match.pose).to_array())
 

@@ -18,7 +18,6 @@ from hsloc.version import __version__
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -36,17 +35,11 @@ class Pairing(TypedDict, total=False):
     max_difference_s: float
 
 
-def metrics(
-    result: Result,
-    residuals: Residuals,
-    alignment: str | None = None,
-    relations: Path | None = None,
-    doubts: Sequence[str] = (),
-) -> dict[str, object]:
+def metrics(result: Result, residuals: Residuals, doubts: Sequence[str] = ()) -> dict[str, object]:
     """The content of metrics.json: the same for the same run, wall times left out.
 
-    `alignment` of the trajectory with the truth: by default none on a given map, and se2 on one that was drawn, whose
-    frame is its own. `relations` is a file for the metric [K], `doubts` are warnings besides the result's own.
+    The trajectory is aligned with the reference as the request says: by default not on a given map, and by se2 on one
+    that was built, whose frame is its own. `doubts` are warnings besides the result's own.
     """
     diagnostics = result.diagnostics
     status = Counter(diagnostics.status)
@@ -63,7 +56,7 @@ def metrics(
             "map": _map_name(result),
             "seed": spec.seed,
             "preset": spec.preset,
-            "matcher": spec.config.matcher,
+            "matcher": result.matcher_name,
         },
         "log": {
             "duration_s": duration(result),
@@ -88,15 +81,15 @@ def metrics(
         "warnings": [*result.warnings, *doubts],
     }
     if result.reference is not None and len(result.reference) > 1:
-        chosen = alignment or ("se2" if result.mode == "slam" else "none")
+        chosen = spec.alignment or ("se2" if result.mode == "slam" else "none")
         values |= _against(result.trajectory, result.reference, chosen)
         if not result.localised.all() and result.localised.any():
             believed = Trajectory(
                 result.trajectory.stamps_ns[result.localised], result.trajectory.poses[result.localised]
             )
             values["localised_only"] = _against(believed, result.reference, chosen)
-    if relations is not None:
-        values["relations"] = evaluate_relations(result.trajectory, read_relations(relations)).to_dict()
+    if spec.relations is not None:
+        values["relations"] = evaluate_relations(result.trajectory, read_relations(spec.relations)).to_dict()
     return values
 
 

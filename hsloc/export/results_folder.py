@@ -38,8 +38,6 @@ def write_results(
     folder: Path,
     *,
     overwrite: bool = False,
-    alignment: str | None = None,
-    relations: Path | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> dict[str, object]:
     """Write the result into `folder`, which must not exist yet unless `overwrite`; returns the metrics.
@@ -51,7 +49,7 @@ def write_results(
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
         partial.mkdir(parents=True)
-        values = _write(result, partial, alignment, relations, progress)
+        values = _write(result, partial, progress)
         if folder.exists():
             shutil.rmtree(folder)
         partial.rename(folder)
@@ -76,15 +74,9 @@ def refuse_folder(folder: Path, overwrite: bool) -> None:
         raise OutputError(f"{folder}: holds no results of hsloc, so it is not overwritten; choose another --out")
 
 
-def _write(
-    result: Result,
-    folder: Path,
-    alignment: str | None,
-    relations: Path | None,
-    progress: Callable[[float], None] | None,
-) -> dict[str, object]:
+def _write(result: Result, folder: Path, progress: Callable[[float], None] | None) -> dict[str, object]:
     review = write_recording(result, folder / "run.mcap", progress)
-    values = metrics(result, review.residuals, alignment, relations, [*doubts(result), *review.doubts])
+    values = metrics(result, review.residuals, [*doubts(result), *review.doubts])
     write_tum(folder / "trajectory.tum", result.trajectory)
     if len(result.odometry):
         write_tum(folder / "odometry.tum", result.odometry)

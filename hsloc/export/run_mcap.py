@@ -47,15 +47,9 @@ def write_recording(result: Result, path: Path, progress: Callable[[float], None
     """
     log = open_log(result.spec.logs, result.spec.reading())
     residuals = Residuals(result.grid)
-    check = MountingCheck(result.grid, len(result.diagnostics), len(result.summary.lasers))
-    config = result.spec.config
-    sample = ConvergenceSample(
-        result.grid,
-        result.likelihood,
-        config.make_matcher(),
-        config.likelihood_field.sigma,
-        len(result.diagnostics),
-    )
+    matcher, sigma, scans = result.spec.matcher, result.spec.config.likelihood_field.sigma, len(result.diagnostics)
+    check = MountingCheck(result.grid, result.likelihood, matcher, sigma, scans, len(result.summary.lasers))
+    sample = ConvergenceSample(result.grid, result.likelihood, matcher, sigma, scans)
     places = _Places(result)
     mountings: set[str] = set()
     start = int(result.trajectory.stamps_ns[0])
@@ -85,7 +79,7 @@ def write_recording(result: Result, path: Path, progress: Callable[[float], None
                 progress(places.row / len(result.trajectory))
         every = max(len(result.trajectory) // _PATH_POSES, 1)
         writer.path(start, Trajectory(result.trajectory.stamps_ns[::every], result.trajectory.poses[::every]))
-    return Review(residuals, [*residuals.doubts(), *check.doubts()], sample.curves(config.matcher.upper()))
+    return Review(residuals, [*residuals.doubts(), *check.doubts()], sample.curves(result.spec.matcher_name.upper()))
 
 
 class _Places:

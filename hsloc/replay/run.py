@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.config import preset
 from hsloc.errors import ConfigError, LogError, MapError
 from hsloc.log import LogSummary, Losses, open_log
 from hsloc.matching.likelihood_field import LikelihoodField
@@ -82,6 +83,12 @@ class Result:
     likelihood: LikelihoodField | None = None
 
     @property
+    def matcher_name(self) -> str | None:
+        """The scan matcher that was used; None for the graph mapper, which has its own."""
+        own = self.mode == "slam" and self.spec.config.mapper == "graph"
+        return None if own else self.spec.matcher_name
+
+    @property
     def follows_scans(self) -> bool:
         """Whether the trajectory has a pose for each scan, for want of odometry."""
         return len(self.odometry) == 0
@@ -111,6 +118,7 @@ def run(spec: RunRequest, progress: Callable[[Progress], None] | None = None) ->
         )
         estimator: Estimator = _localiser(spec, require_map(grid), likelihood, start)
     else:
+        require_matcher(spec)
         likelihood, estimator = None, _mapper(spec, state)
     first = None if spec.no_odometry else first_odometry(log.events())
     prepared = time.perf_counter()
@@ -205,24 +213,36 @@ def require_map(grid: OccupancyGrid | None) -> OccupancyGrid:
     return grid
 
 
+def require_matcher(spec: RunRequest) -> None:
+    """Raise ConfigError for a matcher that was asked for and that the graph mapper would not use."""
+    if spec.config.mapper == "graph" and spec.matcher_name != preset(spec.preset).matcher:
+        raise ConfigError(
+            f"the graph mapper has a matcher of its own and would not use {spec.matcher_name}; leave out --matcher, "
+            "or use --mapper point"
+        )
+
+
 def _mapper(spec: RunRequest, state: MapState | None) -> Mapper | PointMapper:
     if spec.config.mapper == "point":
         if spec.no_odometry:
             raise ConfigError("the point mapper predicts with odometry; leave out --no-odom, or use --mapper graph")
-        matcher = spec.config.make_matcher()
         start = IDENTITY if spec.initial_pose is None else spec.initial_pose
-        return PointMapper(matcher, spec.config.point_mapper, np.random.default_rng(spec.seed), start)
-    resume = None if state is None else Resume(state, None if spec.unknown_start else spec.initial_pose)
+        return PointMapper(spec.matcher, spec.config.point_mapper, np.random.default_rng(spec.seed), start)
+    config = spec.config
+    resume = None
+    if state is not None:
+        field = LikelihoodField.from_grid(state.grid, config.likelihood_field.sigma, config.likelihood_field.margin)
+        begin = None if spec.unknown_start else spec.initial_pose
+        resume = Resume(state, field, spec.matcher, config.localiser.relocaliser, begin)
     return Mapper(spec.mapping(), np.random.default_rng(spec.seed), resume)
 
 
 def _localiser(spec: RunRequest, grid: OccupancyGrid, likelihood: LikelihoodField, start: Pose2 | None) -> Estimator:
     from hsloc.localisation.localiser import Localiser
 
-    config = spec.config
     rng = np.random.default_rng(spec.seed)
-    _warm_up(config.make_matcher(), likelihood)
-    return Localiser(grid, likelihood, config.make_matcher(), config.localiser, rng, start)
+    _warm_up(spec.matcher, likelihood)
+    return Localiser(grid, likelihood, spec.matcher, spec.config.localiser, rng, start)
 
 
 def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:

@@ -43,7 +43,8 @@ def _rows(log: dict[str, object], metrics: Mapping[str, object]) -> list[tuple[s
     rows.append(("reference", str(log.get("reference") or "none")))
     run = metrics.get("run")
     if isinstance(run, dict):
-        rows.append(("algorithm", f"{run.get('matcher')}, preset {run.get('preset')}, seed {run.get('seed')}"))
+        matcher = run.get("matcher") or "graph mapper"
+        rows.append(("algorithm", f"{matcher}, preset {run.get('preset')}, seed {run.get('seed')}"))
     return rows
 
 

@@ -12,6 +12,7 @@ import importlib
 import os
 import signal
 import sys
+import warnings
 from io import TextIOWrapper
 from typing import TYPE_CHECKING
 
@@ -111,6 +112,7 @@ def program() -> None:
     """
     if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")
+    warnings.formatwarning = lambda message, *_, **__: f"hsloc: warning: {message}\n"
     status = main()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:

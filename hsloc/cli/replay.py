@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hsloc.cli import BEGIN
 from hsloc.cli.arguments import add_no_progress, add_options, request
 from hsloc.cli.folders import default_folder, link_latest, refuse_early
 from hsloc.cli.progress import ProgressLine
@@ -59,6 +61,9 @@ def run(arguments: argparse.Namespace) -> int:
     with ProgressLine(arguments.quiet or arguments.no_progress) as line:
 
         def show(progress: Progress) -> None:
+            if progress.phase == "compile":
+                line.show_clock("compile", 20.0, "compiling kernels (once, about 20 s)")
+                return
             speed = progress.done_s / max(line.elapsed, 1e-9)
             line.show(
                 progress.phase,
@@ -80,6 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(format_json({**metrics, "timings": timings(result), "results": str(folder)}), end="")
     elif not arguments.quiet:
         print_summary(metrics, timings(result), folder)
+        print(f"whole command: {time.perf_counter() - BEGIN:.1f} s, reading and writing included")
     return EXIT_DATA_LOST if result.losses.data_lost else EXIT_OK
 
 

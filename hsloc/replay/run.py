@@ -6,12 +6,14 @@ import signal
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from os import PathLike
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hsloc.config import preset
 from hsloc.errors import ConfigError, LogError, MapError
+from hsloc.kernels.cache import compilation_reported
 from hsloc.log import LogSummary, Losses, open_log
 from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.matching.window import Window
@@ -25,12 +27,13 @@ from hsloc.replay.initial_pose import find_start, first_odometry
 from hsloc.replay.map_sources import load_grid, load_state, maps_beside, unread_maps
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory
+from hsloc.request import RunRequest
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.parameters import Resume
 from hsloc.slam.point_mapper import PointMapper
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -41,14 +44,16 @@ if TYPE_CHECKING:
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.model.pose2 import Pose2
     from hsloc.replay.engine import Estimator
-    from hsloc.request import RunRequest
     from hsloc.slam.map_state import MapState
     from hsloc.slam.result import MappingResult
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a run is: the phase in a word, seconds of the log done and in all, and the scans so far."""
+    """How far a run is: the phase in a word, seconds of the log done and in all, and the scans so far.
+
+    In the phase "compile", `done_s` is the number of kernels compiled; how many there will be is not known.
+    """
 
     phase: str
     done_s: float
@@ -94,11 +99,30 @@ class Result:
         return len(self.odometry) == 0
 
 
-def run(spec: RunRequest, progress: Callable[[Progress], None] | None = None) -> Result:
+def run(
+    request: RunRequest | str | PathLike[str] | Sequence[str | PathLike[str]],
+    progress: Callable[[Progress], None] | None = None,
+    **options: Any,
+) -> Result:
     """Replay a log through the localiser or the mapper.
 
-    Raises an `HslocError` for a log, map or configuration that cannot be used.
+    `request` is a RunRequest, or the log, or the parts of one log; then `options` are those of `hsloc.options` by
+    their names, as in `run("run.mcap", map="map.yaml", matcher="icp", seed=3)`. `matcher` may be an object with the
+    method of `hsloc.Matcher`. Raises an `HslocError` for a log, map or option that cannot be used.
     """
+    if not isinstance(request, RunRequest):
+        logs = [request] if isinstance(request, str | PathLike) else request
+        request = RunRequest.from_values(logs, options)
+    elif options:
+        raise ConfigError(f"a RunRequest says it all; put {', '.join(options)} into it")
+    if progress is None:
+        return _run(request, None)
+    report = progress
+    with compilation_reported(lambda count: report(Progress("compile", float(count), 0.0, 0))):
+        return _run(request, progress)
+
+
+def _run(spec: RunRequest, progress: Callable[[Progress], None] | None) -> Result:
     begin = time.perf_counter()
     log = open_log(spec.logs, spec.reading())
     reference = None if spec.reference is None else read_reference(spec.reference, spec.logs)
@@ -249,13 +273,13 @@ def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:
     """Have the kernels compiled (once after an installation, up to a minute) before the clock of the replay starts."""
     points = np.zeros((1, 2))
     window = Window(likelihood.T_map_field, 0.1, 0.1, 0.1)
-    with _uninterrupted():
+    with interrupts_held_back():
         matcher.match(points, likelihood, window, np.random.default_rng(0))
 
 
 @contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Hold back Ctrl-C until the end: a compiler that is thrown out of its work may take the process with it."""
+def interrupts_held_back() -> Iterator[None]:
+    """Hold back Ctrl-C until the end: a compiler that is interrupted may take the process with it."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.cli.arguments import add_config_arguments, add_read_arguments, config, pose, read_options, to_pose
-from hsloc.cli.folders import default_folder, link_latest, refuse_early
+from hsloc.cli.output import default_folder, link_latest, print_warnings, refuse_early
 from hsloc.cli.progress import ProgressLine
 
 if TYPE_CHECKING:
     import argparse
 
     from hsloc.replay.run import Progress, Result
+    from hsloc.warnings import RunWarning
 
 HELP = "localise the robot of a recorded log, or map while it goes"
 
@@ -47,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--alignment",
         choices=("none", "origin", "se2"),
-        help="move the estimate onto the truth first (default: none on a given map, se2 on a drawn one)",
+        help="align the estimate with the reference (default: none on a given map, se2 on a built one)",
     )
     parser.add_argument(
         "--reference", metavar="POSES",
@@ -66,9 +67,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run, write the results, print the table; 3 where part of the input was lost."""
     from hsloc.cli.main import EXIT_DATA_LOST, EXIT_OK
-    from hsloc.cli.table import print_summary
+    from hsloc.cli.output import print_summary
     from hsloc.evaluation.metrics import format_json
-    from hsloc.export.results_folder import timings, write_results
+    from hsloc.export.results_folder import write_results
     from hsloc.replay.run import run as run_replay
     from hsloc.request import RunRequest
 
@@ -99,7 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
             )
 
         result = run_replay(spec, show)
-        metrics = write_results(
+        written = write_results(
             result,
             folder,
             overwrite=arguments.overwrite,
@@ -109,20 +110,20 @@ def run(arguments: argparse.Namespace) -> int:
         )
     if arguments.out is None:
         link_latest(folder)
-    _tell(result, metrics["warnings"], arguments)
+    _warn(result, written.metrics.warnings, arguments)
     if arguments.json:
-        print(format_json({**metrics, "timings": timings(result), "results": str(folder)}), end="")
+        values = {**written.metrics.to_json(), "timings": written.timings.to_json(), "results": str(folder)}
+        print(format_json(values), end="")
     elif not arguments.quiet:
-        print_summary(metrics, timings(result), folder)
+        print_summary(written.metrics, written.timings, folder)
     return EXIT_DATA_LOST if result.losses.data_lost else EXIT_OK
 
 
-def _tell(result: Result, warnings: object, arguments: argparse.Namespace) -> None:
+def _warn(result: Result, warnings: tuple[RunWarning, ...], arguments: argparse.Namespace) -> None:
     """Warnings and losses, on stderr."""
     if arguments.quiet:
         return
-    for warning in warnings if isinstance(warnings, list) else ():
-        print(f"hsloc: warning: {warning}", file=sys.stderr)
+    print_warnings(warnings)
     candidates = result.summary.reference_candidates
     if result.reference is None and candidates:
         print(f"hsloc: the log has poses to compare with: --truth-topic {' or '.join(candidates)}", file=sys.stderr)

@@ -6,12 +6,13 @@ alignment, and does not punish one early error for ever after.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.dataclass_json import to_json
 from hsloc.errors import EvaluationError
 from hsloc.evaluation.association import interpolate_poses
 from hsloc.evaluation.statistics import PoseErrors, PoseStatistics
@@ -39,15 +40,19 @@ class Relations:
 
 @dataclass(frozen=True, slots=True)
 class RelationsResult:
-    """Statistics over the relations whose two poses the trajectory has; [K] states mean and std."""
+    """Errors of the relations whose two poses the trajectory has; [K] states mean and std."""
 
-    statistics: PoseStatistics
     matched: int
+    """Number of relations whose two poses the trajectory has."""
     unmatched: int
+    """Number of the other relations."""
+    statistics: PoseStatistics = field(metadata={"inline": True})
+    """Statistics of the errors."""
 
     def to_dict(self) -> dict[str, object]:
         """For JSON."""
-        return {"matched": self.matched, "unmatched": self.unmatched, **self.statistics.to_dict()}
+        result: dict[str, object] = to_json(self)
+        return result
 
 
 def read_relations(path: str | Path) -> Relations:
@@ -83,7 +88,7 @@ def evaluate_relations(trajectory: Trajectory, relations: Relations, *, max_gap_
     Raises `EvaluationError` where no relation matches.
     """
     errors = relation_errors(trajectory, relations, max_gap_s=max_gap_s)
-    return RelationsResult(errors.statistics(), len(errors), len(relations) - len(errors))
+    return RelationsResult(len(errors), len(relations) - len(errors), errors.statistics())
 
 
 def relation_errors(trajectory: Trajectory, relations: Relations, *, max_gap_s: float = 1.0) -> PoseErrors:

@@ -6,7 +6,7 @@ estimate, as evo does by default.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
@@ -38,9 +38,12 @@ class Delta:
     Raises `EvaluationError` for a length that is not positive, or a part of a frame.
     """
 
-    value: float = 1.0
-    unit: DeltaUnit = "frames"
+    value: float = field(default=1.0, metadata={"key": "delta"})
+    """Length of a piece, in `delta_unit`."""
+    unit: DeltaUnit = field(default="frames", metadata={"key": "delta_unit"})
+    """Unit of the length: frames (pairs), m (path) or s."""
     all_pairs: bool = False
+    """Whether a piece starts at every pose; else the pieces follow each other."""
 
     def __post_init__(self) -> None:
         if self.unit not in DELTA_UNITS:

@@ -1,4 +1,4 @@
-"""report.png: one picture that says where the robot went, and how sure one can be."""
+"""report.png: where the robot went, how large the errors are, and how certain the result is, in one picture."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from hsloc.report.png_map import draw_map
 from hsloc.report.table import Row, summary, table_rows
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     import numpy as np
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
+    from hsloc.evaluation import Comparison
     from hsloc.model import OccupancyGrid, ScanDiagnostics, Trajectory
     from hsloc.report.data import ReportData
+    from hsloc.run_metrics import RunMetrics
 
 WIDTH, HEIGHT, DPI = 16.0, 10.0, 100
 """The picture is 1600 x 1000 pixels."""
@@ -52,17 +52,18 @@ def draw_report(
     reference: Trajectory | None = None,
     grid: OccupancyGrid | None = None,
     diagnostics: ScanDiagnostics | None = None,
-    metrics: Mapping[str, object] | None = None,
+    metrics: RunMetrics | None = None,
+    comparison: Comparison | None = None,
+    localised: NDArray[np.bool_] | None = None,
     points: NDArray[np.float64] | None = None,
 ) -> None:
     """Draw the report of a run as a PNG of 1600 x 1000 pixels: the same run gives the same bytes.
 
-    `metrics` is the content of metrics.json; its alignment and time difference rule the error curves. `points`,
-    shape (n, 2) in metres, are drawn as a map of points. All poses are in the map frame but for `odometry`,
-    which is moved to start where the trajectory starts. Raises `OutputError` where `path` cannot be written.
+    `comparison` of trajectory and reference gives the error curves, `localised` (n,) says which poses are known.
+    `points`, shape (n, 2) in metres, are drawn as a map of points. All poses are in the map frame, but for the
+    reference, which `comparison` aligns. Raises `OutputError` where `path` cannot be written.
     """
-    metrics = {} if metrics is None else metrics
-    data = prepare(trajectory, odometry, reference, diagnostics, metrics)
+    data = prepare(trajectory, odometry, reference, diagnostics, comparison, localised)
     # A user's matplotlibrc must not change the picture.
     defaults = {
         key: value for key, value in matplotlib.rcParamsDefault.items() if not key.startswith(SETTINGS_THAT_STAY)
@@ -85,16 +86,17 @@ def _figure(
     data: ReportData,
     grid: OccupancyGrid | None,
     points: NDArray[np.float64] | None,
-    metrics: Mapping[str, object],
+    metrics: RunMetrics | None,
 ) -> Figure:
     figure = Figure(figsize=(WIDTH, HEIGHT), dpi=DPI, facecolor=style.PAPER)
     FigureCanvasAgg(figure)
-    extent, panels, rows = shown_extent(data, grid, points), time_panels(data), table_rows(data, metrics)
+    rows = [] if metrics is None else table_rows(metrics)
+    extent, panels = shown_extent(data, grid, points), time_panels(data)
     left, bottom, width, height = _place(figure, extent, panels, rows, data)
     axes = figure.add_axes((left, bottom, width, height))
     shown = extent.widened(width * WIDTH / (height * HEIGHT))
     draw_map(axes, data, grid, points, shown, max(width * WIDTH, height * HEIGHT) * DPI)
-    _draw_head(figure, axes, title, summary(data, metrics))
+    _draw_head(figure, axes, title, [] if metrics is None else summary(metrics))
     return figure
 
 

@@ -77,7 +77,7 @@ def _draw_paths(axes: Axes, data: ReportData, width: float, pixel: float) -> Non
         return joined(pieces_of(xy, 0.5 * pixel))
 
     if len(data.path):
-        known = seen(np.where(data.believed[:, None], data.path, np.nan))
+        known = seen(np.where(data.localised[:, None], data.path, np.nan))
         axes.plot(*known.T, color=style.BLUE, linewidth=width, label="trajectory", zorder=5, solid_capstyle="round")
     if data.reference is not None and len(data.reference):
         axes.plot(
@@ -88,8 +88,8 @@ def _draw_paths(axes: Axes, data: ReportData, width: float, pixel: float) -> Non
             *seen(data.odometry).T, color=style.VERMILLION, alpha=0.7, linewidth=1.3, linestyle=(0, (1, 1.2)),
             label="odometry alone", zorder=3,
         )  # fmt: skip
-    if not data.believed.all():
-        guessed = seen(np.where(data.believed[:, None], np.nan, data.path))
+    if not data.localised.all():
+        guessed = seen(np.where(data.localised[:, None], np.nan, data.path))
         axes.plot(
             *guessed.T, color=style.PURPLE, linewidth=2.0, linestyle=(0, (0.8, 1.2)), label="pose unknown", zorder=4
         )

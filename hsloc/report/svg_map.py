@@ -49,10 +49,10 @@ def map_svg(data: ReportData, grid: OccupancyGrid | None, points: Floats | None)
     if data.odometry is not None and len(data.odometry):
         parts.append(_layer("odometry", f'<path class="odometry" d="{_path(data.odometry, middle, finest)}"/>'))
     if len(data.path):
-        believed = np.where(data.believed[:, None], data.path, np.nan)
-        guessed = np.where(data.believed[:, None], np.nan, data.path)
-        lines = f'<path class="trajectory" d="{_path(believed, middle, finest)}"/>'
-        if not data.believed.all():
+        known = np.where(data.localised[:, None], data.path, np.nan)
+        guessed = np.where(data.localised[:, None], np.nan, data.path)
+        lines = f'<path class="trajectory" d="{_path(known, middle, finest)}"/>'
+        if not data.localised.all():
             lines += f'<path class="guessed" d="{_path(guessed, middle, finest)}"/>'
         parts.append(_layer("trajectory", lines))
     if data.reference is not None and len(data.reference):

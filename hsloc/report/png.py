@@ -138,7 +138,7 @@ def _place(figure: Figure, extent: Extent, panels: list[Panel], rows: list[Row],
         return LEFT_OF_AXES, TOP - height, RIGHT - LEFT_OF_AXES, height
     width = min(max((TOP - BOTTOM) * HEIGHT * extent.aspect / WIDTH, 0.36), 0.64)
     column = LEFT_OF_AXES + width + 0.055
-    table = min(LINE * (len(rows) + 1), 0.45) if rows else 0.0
+    table = min(LINE * (len(rows) + 2), 0.5) if rows else 0.0
     above = TOP - BOTTOM - table - (0.065 if rows else 0.0)
     _draw_panels(figure, panels, data, (column, TOP - above, RIGHT - column, above))
     _draw_rows(figure, rows, (column, BOTTOM - 0.02 if panels else TOP - table, RIGHT - column, table))

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from hsloc.report.table import Row
 
 MOST_POINTS = 3000
+_GAP_PIXELS = 10.0
+"""Between a label of the table and its value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +136,11 @@ def draw_table(axes: Axes, rows: list[Row], *, line_height: float) -> None:
         if y < 0.6 * line_height:
             break
         axes.plot((0.0, 1.0), (y + 0.18 * line_height,) * 2, color=style.RULE, linewidth=0.7, clip_on=False)
-        axes.text(0.0, y, row.label, ha="left", va="top", fontsize=style.TEXT, color=style.INK)
+        label = axes.text(0.0, y, row.label, ha="left", va="top", fontsize=style.TEXT, color=style.INK)
         for x, value in zip((0.74, 1.0) if len(row.values) == 2 else (1.0,), row.values, strict=True):
-            axes.text(x, y, value, ha="right", va="top", fontsize=style.TEXT, color=style.INK, fontweight="bold")
+            text = axes.text(x, y, value, ha="right", va="top", fontsize=style.TEXT, color=style.INK, fontweight="bold")
+            if len(row.values) == 1 and text.get_window_extent().x0 < label.get_window_extent().x1 + _GAP_PIXELS:
+                y -= line_height  # a long value has a line of its own
+                text.set_y(y)
+                text.set_fontsize(style.TEXT * min(0.95 * axes.bbox.width / text.get_window_extent().width, 1.0))
         y -= line_height

@@ -133,7 +133,7 @@ def _error_rows(metrics: RunMetrics) -> list[Row]:
             add("APE rmse where localised", metrics.localised_only.ape)
         add("APE max", errors.ape, "max")
         if metrics.odometry_alone is not None:
-            add("APE rmse of odometry alone", metrics.odometry_alone.ape)
+            add("APE rmse of odometry", metrics.odometry_alone.ape)
         # A path that is shorter than a metre still has pieces of a second, or from frame to frame.
         known = [each for each in (errors.rpe_1m, errors.rpe_1s, errors.rpe) if each.statistics.trans_part.count]
         for relative in known[:1]:
@@ -181,8 +181,8 @@ def _map_rows(found: MapMetrics) -> list[Row]:
         rows.append(Row("scan to map, median, 95 %", (", ".join(dict.fromkeys(near)),)))
         rows.append(Row("points within 15 cm of a wall", (f"{100.0 * residuals.within_15_cm:.1f} %",)))
     if found.mapping is not None:
-        loops = f"{found.mapping.loops} closed, {found.mapping.loops_refused} rejected"
-        rows += [Row("keyscans", (str(found.mapping.keyscans),)), Row("loops", (loops,))]
+        loops = f"{found.mapping.keyscans} keyscans, {found.mapping.loops} loops"
+        rows.append(Row("map built from", (loops,)))
     if found.crispness is not None and isfinite(found.crispness.wall_thickness_median):
         rows.append(Row("wall thickness", (format_length(found.crispness.wall_thickness_median),)))
     compared = found.comparison

@@ -244,7 +244,7 @@ def test_the_table_shows_what_metrics_hold(run):
     assert rows["APE rmse"][0] == format_length(metrics.errors.ape.trans_part.rmse)
     assert rows["RPE rmse per 1 m"][0] == format_length(metrics.errors.rpe_1m.statistics.trans_part.rmse)
     assert "map precision, recall" not in rows
-    assert "APE rmse of odometry alone" not in rows
+    assert "APE rmse of odometry" not in rows
     alone = replace(metrics, odometry_alone=metrics.errors, errors=None)
     assert "APE rmse" not in {row.label for row in table_rows(alone)}
 

@@ -46,8 +46,8 @@ class RunIdentity:
     """Seed of the random generator."""
     preset: str
     """Name of the preset that the configuration started from."""
-    matcher: str
-    """Scan matcher that was used."""
+    matcher: str | None
+    """Scan matcher that was used; null where the mapper has its own."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

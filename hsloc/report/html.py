@@ -17,8 +17,7 @@ from hsloc.atomic_write import write_text_atomically
 from hsloc.evaluation.metrics import format_json
 from hsloc.model import Status
 from hsloc.report.data import Curve, prepare, reason_counts, status_counts
-from hsloc.report.svg_charts import Chart, chart_svg, timeline_html
-from hsloc.report.svg_map import map_svg
+from hsloc.report.svg import Chart, chart_svg, map_svg, timeline_html
 from hsloc.report.table import DASH, STATUS_WORDS, error_statistics, summary, table_rows
 
 if TYPE_CHECKING:
@@ -275,7 +274,7 @@ def _quality(metrics: RunMetrics) -> str:
     rows = [("scans", _laser(laser)) for laser in metrics.log.lasers]
     rows += [("odometry", metrics.log.odometry or "none"), ("reference", metrics.log.reference or "none")]
     run = metrics.run
-    rows.append(("algorithm", f"{run.matcher}, preset {run.preset}, seed {run.seed}"))
+    rows.append(("algorithm", f"{run.matcher or 'graph mapper'}, preset {run.preset}, seed {run.seed}"))
     table = "".join(
         f'<tr><th scope="row">{escape(name)}</th><td class="words">{escape(value)}</td></tr>' for name, value in rows
     )

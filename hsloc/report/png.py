@@ -14,8 +14,7 @@ from hsloc.atomic_write import write_atomically
 from hsloc.report import style
 from hsloc.report.data import prepare
 from hsloc.report.map_image import Extent, shown_extent
-from hsloc.report.png_charts import Panel, draw_panel, draw_table, time_panels
-from hsloc.report.png_map import draw_map
+from hsloc.report.png_panels import Panel, draw_map, draw_panel, draw_table, time_panels
 from hsloc.report.table import Row, summary, table_rows
 
 if TYPE_CHECKING:

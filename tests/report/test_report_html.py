@@ -21,8 +21,7 @@ from hsloc.model import OccupancyGrid, Pose2, Trajectory
 from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.report.data import prepare
 from hsloc.report.html import Provenance, time_charts, write_report_html
-from hsloc.report.svg_charts import Chart, chart_svg, runs, ticks
-from hsloc.report.svg_map import MOST_MARKS, map_svg
+from hsloc.report.svg import MOST_MARKS, Chart, chart_svg, map_svg, runs, ticks
 from hsloc.warnings import RunWarning
 
 NASTY = "<script>alert('x')</script> & \"quoted\" {{data}} {{nothing}} ]]> <b>"

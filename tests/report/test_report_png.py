@@ -20,8 +20,7 @@ from hsloc.model.pose2 import compose_poses
 from hsloc.report.data import Curve, prepare, reason_counts, status_counts
 from hsloc.report.map_image import darkest_of_blocks, grey_levels, line_width, shown_extent
 from hsloc.report.png import draw_report
-from hsloc.report.png_charts import time_panels
-from hsloc.report.png_map import format_round_length, round_length
+from hsloc.report.png_panels import format_round_length, round_length, time_panels
 from hsloc.report.table import format_angle, format_duration, format_length, table_rows
 from hsloc.run_metrics import MapMetrics, ResidualMetrics
 

@@ -1,7 +1,7 @@
 """What a user is warned of: a value with a stable code, a text and a remedy. All codes are listed here.
 
-A warning does not stop a run: it says what was assumed, or what makes its result less certain. What stops one is an
-`HslocError`. Programs look at `code`; `text` and `remedy` are for people and may change.
+A warning does not stop a run: it describes what was assumed, or what makes its result less certain. What stops one is
+an `HslocError`. Programs look at `code`; `text` and `remedy` are for people and may change.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What makes the result of a run doubtful: warnings, and the verdict with its reasons."""
+"""Quality of a run's result: warnings, and the verdict with its reasons."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Crispness:
-    """How sharply the walls of a map are drawn; a pose that is wrong by little blurs them or doubles them.
+    """Sharpness of the walls of a map: small errors of the poses blur walls or double them.
 
     Around each occupied cell, the occupied cells within `radius` form a small cloud with a covariance.
 

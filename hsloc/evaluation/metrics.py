@@ -89,8 +89,8 @@ class Evaluation:
 class Comparison:
     """An estimate paired with its reference and moved onto it, with the error of each pair.
 
-    `pairs` holds the estimate as it came; `aligned` (n, 3) are its poses in the reference's frame. The other fields say
-    how it was paired and aligned, and how long both trajectories are (m).
+    `pairs` holds the estimate as it came; `aligned` (n, 3) are its poses in the reference's frame. The other fields
+    are how it was paired and aligned, and the lengths of both trajectories (m).
     """
 
     pairs: Pairs

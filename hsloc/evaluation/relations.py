@@ -1,7 +1,7 @@
-"""The relations metric [K]: does the path know how places lie to each other that a human has checked?
+"""The relations metric [K]: errors of relative poses that were verified by hand
 
 R. Kümmerle et al., "On measuring the accuracy of SLAM algorithms", Autonomous Robots 27, 2009. It needs no
-alignment, and does not punish one early error for ever after.
+alignment, and one early error does not count in all later poses.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def read_relations(path: str | Path) -> Relations:
 def evaluate_relations(trajectory: Trajectory, relations: Relations, *, max_gap_s: float = 1.0) -> RelationsResult:
     """Score a trajectory by relations: e = relation^-1 * (pose(t1)^-1 * pose(t2)).
 
-    The pose at a stamp is the one with that very stamp (the last of several, the wisest of an estimator);
+    The pose at a stamp is the one with that very stamp (the last of several, which an estimator has corrected most);
     else it is interpolated between neighbours at most `max_gap_s` apart; else the relation is unmatched.
     Raises `EvaluationError` where no relation matches.
     """
@@ -112,7 +112,7 @@ def relation_errors(trajectory: Trajectory, relations: Relations, *, max_gap_s: 
 def _poses_at(
     trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Poses (n, 3) at stamps, and which of them can be believed."""
+    """Poses (n, 3) at stamps, and which of them are known."""
     ordered = trajectory.sorted()
     times = ordered.stamps_ns
     # The last pose at or before each stamp, and the first after it.

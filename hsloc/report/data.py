@@ -82,7 +82,7 @@ class Scans:
 class ReportData:
     """Everything in the frame of the map: metres, and seconds since the first pose.
 
-    `path` (n, 2) and `seconds` (n,) are the trajectory; `localised` (n,) says which of its poses are known.
+    `path` (n, 2) and `seconds` (n,) are the trajectory; `localised` (n,) marks its known poses.
     `reference` has been moved onto the trajectory where an alignment was asked for.
     """
 
@@ -140,7 +140,7 @@ def status_counts(scans: Scans) -> dict[str, int]:
 def reason_counts(scans: Scans) -> list[tuple[str, str, int]]:
     """(status, reason, how many scans) for all scans that were not used, the most frequent first.
 
-    Reasons that differ in their figures alone are one; the first of them stands for the others.
+    Reasons that differ in their figures alone are one; the first is the example.
     """
     skipped: dict[tuple[str, str], list[str]] = {}
     for status, reason in zip(scans.status, scans.reason, strict=True):

@@ -103,7 +103,7 @@ def write_report_html(
 def time_charts(data: ReportData, drifts: bool = False) -> list[Chart]:
     """All that is known over time: errors where there is truth, fitness, standard deviations, effort.
 
-    With `drifts` the standard deviations are those of a map that is being drawn, before its loops are closed.
+    With `drifts` the standard deviations are those of a map being built, before its loops are closed.
     """
     of = ", before loops are closed" if drifts else ""
     charts = []
@@ -334,7 +334,7 @@ def _short(values: Floats) -> list[float | None]:
 
 
 def _script_json(values: dict[str, object]) -> str:
-    """JSON that cannot end the <script> element it stands in."""
+    """JSON that cannot end the <script> element around it."""
     text = json.dumps(values, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 

@@ -31,13 +31,13 @@ WIDTH, HEIGHT, DPI = 16.0, 10.0, 100
 """The picture is 1600 x 1000 pixels."""
 
 LEFT, LEFT_OF_AXES, RIGHT, BOTTOM, TOP = 0.015, 0.05, 0.985, 0.06, 0.9
-"""Edges as parts of the picture: of text, of axes (their numbers stand left of them), and of all below the head."""
+"""Edges as parts of the picture: of text, of axes (their numbers are left of them), and of all below the head."""
 
 LINE = 0.031
 """Height of a line of the table, as a part of the picture's."""
 
 WIDE = 2.1
-"""From this ratio of width to height on, the map takes the whole width, and the rest stands below it."""
+"""From this ratio of width to height on, the map takes the whole width, and the rest is below it."""
 
 SETTINGS_THAT_STAY = ("backend", "backend_fallback", "interactive", "toolbar", "webagg", "tk.", "savefig.directory")
 
@@ -58,7 +58,7 @@ def draw_report(
 ) -> None:
     """Draw the report of a run as a PNG of 1600 x 1000 pixels: the same run gives the same bytes.
 
-    `comparison` of trajectory and reference gives the error curves, `localised` (n,) says which poses are known.
+    `comparison` of trajectory and reference gives the error curves, `localised` (n,) marks the known poses.
     `points`, shape (n, 2) in metres, are drawn as a map of points. All poses are in the map frame, but for the
     reference, which `comparison` aligns. Raises `OutputError` where `path` cannot be written.
     """
@@ -71,7 +71,7 @@ def draw_report(
         warnings.catch_warnings(),
         matplotlib.rc_context({**defaults, "font.family": style.FONT, "axes.unicode_minus": True}),
     ):
-        # A letter that the font lacks becomes a box in the picture: no reason to speak to the user.
+        # A letter that the font lacks becomes a box in the picture: the user need not be warned.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         figure = _figure(title, data, grid, points, metrics)
         # Without the version of matplotlib in the file.
@@ -145,7 +145,7 @@ def _place(figure: Figure, extent: Extent, panels: list[Panel], rows: list[Row],
 
 
 def _draw_panels(figure: Figure, panels: list[Panel], data: ReportData, box: Box) -> None:
-    """The panels one below the other; their headings stand within the box, the time of the last below it."""
+    """The panels one below the other; their headings are within the box, the time of the last below it."""
     left, bottom, width, height = box
     heading = 0.036
     each = height / max(len(panels), 1)

@@ -74,7 +74,7 @@ def _draw_grid(axes: Axes, grid: OccupancyGrid, pixels: float) -> None:
 
 
 def _draw_paths(axes: Axes, data: ReportData, width: float, pixel: float) -> None:
-    """In the order of the legend; what lies over what is said by zorder. Nothing finer than half a pixel is drawn."""
+    """In the order of the legend; zorder gives what covers what. Nothing finer than half a pixel is drawn."""
 
     def seen(xy: Floats) -> Floats:
         return joined(pieces_of(xy, 0.5 * pixel))

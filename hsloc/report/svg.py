@@ -213,7 +213,7 @@ def _line(curve: Curve, x: Callable[[float], float], scale: Callable[[float], fl
 MOST_PIXELS = 4000
 """Longest side of the embedded picture."""
 FINEST = 3000
-"""A path is drawn as finely as this part of the map's larger side; nobody sees more, even enlarged."""
+"""A path is drawn as finely as this part of the map's larger side; more is not visible, even enlarged."""
 MOST_VERTICES, MOST_MARKS = 30_000, 2_000
 
 
@@ -273,7 +273,7 @@ def _local(xy: Floats, middle: Floats) -> Floats:
 
 
 def _path(xy: Floats, middle: Floats, finest: float) -> str:
-    """A path's `d`; NaN breaks the line, and points nearer than `finest` to the last one drawn are left out."""
+    """A path's `d`; NaN breaks the line, and points closer than `finest` to the last one drawn are left out."""
     local = _local(xy, middle)
     while sum(map(len, pieces := pieces_of(local, finest))) > MOST_VERTICES:
         finest *= 2.0

@@ -176,7 +176,7 @@ def scan_rows(scans: ScanCounts) -> list[Row]:
 def _map_rows(found: MapMetrics) -> list[Row]:
     rows, residuals = [], found.residuals
     if residuals.median is not None and residuals.p95 is not None and residuals.within_15_cm is not None:
-        # The distance is that from cell to cell: what falls into a wall's own cell is no nearer than that.
+        # The distance is that from cell to cell: a point in an occupied cell has no smaller distance.
         near = ["in the cell" if value == 0.0 else format_length(value) for value in (residuals.median, residuals.p95)]
         rows.append(Row("scan to map, median, 95 %", (", ".join(dict.fromkeys(near)),)))
         rows.append(Row("points within 15 cm of a wall", (f"{100.0 * residuals.within_15_cm:.1f} %",)))

@@ -1,4 +1,4 @@
-"""The table that a sweep ends with: a row for each run, as text, CSV or JSON."""
+"""The table of a sweep: a row for each run, as text, CSV or JSON."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ _SHOWN = (
 
 
 def as_text(outcomes: Sequence[Outcome]) -> str:
-    """For people; columns that no run has a value for are left out, and reasons of failures stand below."""
+    """For people; columns that no run has a value for are left out, and reasons of failures are below."""
     found = rows(outcomes)
     shown = [item for item in _SHOWN if any(row[item[0]] is not None for row in found)]
     lines = [[title for _, title, _ in shown]]

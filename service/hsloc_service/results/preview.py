@@ -1,4 +1,4 @@
-"""What the web page draws: the map as a picture, and paths and errors short enough for a telephone."""
+"""What the web page draws: the map as a picture, and paths and errors of limited length."""
 
 from __future__ import annotations
 

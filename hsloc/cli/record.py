@@ -126,8 +126,8 @@ def run(arguments: argparse.Namespace) -> int:
     world = load_world(arguments.world or preset(arguments.scenario).world, arguments.waypoints)
     scenario = build_scenario(arguments, world)
     if not arguments.quiet:
-        for note in world.notes:
-            print(f"hsloc: warning: {note}", file=sys.stderr)
+        for warning in world.warnings:
+            print(f"hsloc: warning: {warning}", file=sys.stderr)
     way = world.lap_length() * scenario.laps_needed(world.lap_length())
     with ProgressLine(arguments.quiet) as line:
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from hsloc.cli import BEGIN
 from hsloc.cli.arguments import add_no_progress, add_options, request
-from hsloc.cli.folders import default_folder, link_latest, refuse_early
+from hsloc.cli.output import default_folder, link_latest, print_warnings, refuse_early
 from hsloc.cli.progress import ProgressLine
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from hsloc.options import Door
     from hsloc.replay.run import Progress, Result
+    from hsloc.warnings import RunWarning
 
 HELP = "localise the robot of a recorded log, or build a map"
 
@@ -50,9 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser, door: Door = "replay") -> Non
 def run(arguments: argparse.Namespace) -> int:
     """Run, write the results, print the table; 4 where a limit is not kept, else 3 where part of the input was lost."""
     from hsloc.cli.main import EXIT_DATA_LOST, EXIT_OK
-    from hsloc.cli.table import print_summary
+    from hsloc.cli.output import print_summary
     from hsloc.evaluation.metrics import format_json
-    from hsloc.export.results_folder import timings, write_results
+    from hsloc.export.results_folder import write_results
     from hsloc.replay.run import run as run_replay
 
     spec = request(arguments)
@@ -72,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
             )
 
         result = run_replay(spec, show)
-        metrics = write_results(
+        written = write_results(
             result,
             folder,
             overwrite=arguments.overwrite,
@@ -80,21 +81,21 @@ def run(arguments: argparse.Namespace) -> int:
         )
     if arguments.out is None:
         link_latest(folder)
-    _tell(result, metrics["warnings"], arguments)
+    _warn(result, written.metrics.warnings, arguments)
     if arguments.json:
-        print(format_json({**metrics, "timings": timings(result), "results": str(folder)}), end="")
+        values = {**written.metrics.to_json(), "timings": written.timings.to_json(), "results": str(folder)}
+        print(format_json(values), end="")
     elif not arguments.quiet:
-        print_summary(metrics, timings(result), folder)
+        print_summary(written.metrics, written.timings, folder)
         print(f"whole command: {time.perf_counter() - BEGIN:.1f} s, reading and writing included")
     return EXIT_DATA_LOST if result.losses.data_lost else EXIT_OK
 
 
-def _tell(result: Result, warnings: object, arguments: argparse.Namespace) -> None:
+def _warn(result: Result, warnings: tuple[RunWarning, ...], arguments: argparse.Namespace) -> None:
     """Warnings and losses, on stderr."""
     if arguments.quiet:
         return
-    for warning in warnings if isinstance(warnings, list) else ():
-        print(f"hsloc: warning: {warning}", file=sys.stderr)
+    print_warnings(warnings)
     candidates = result.summary.reference_candidates
     if result.reference is None and candidates:
         print(f"hsloc: the log has poses to compare with: --truth-topic {' or '.join(candidates)}", file=sys.stderr)

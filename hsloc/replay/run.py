@@ -31,6 +31,7 @@ from hsloc.request import RunRequest
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.parameters import Resume
 from hsloc.slam.point_mapper import PointMapper
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -80,7 +81,7 @@ class Result:
     grid: OccupancyGrid
     diagnostics: ScanDiagnostics
     losses: Losses
-    warnings: tuple[str, ...]
+    warnings: tuple[RunWarning, ...]
     seconds: dict[str, float]
     mode: str = "localise"
     mapping: MappingResult | None = None
@@ -127,16 +128,16 @@ def _run(spec: RunRequest, progress: Callable[[Progress], None] | None) -> Resul
     log = open_log(spec.logs, spec.reading())
     reference = None if spec.reference is None else read_reference(spec.reference, spec.logs)
     grid, warnings = find_map(spec, log)
-    state, remarks = load_state(spec)
-    warnings = (*warnings, *remarks)
+    state, of_state = load_state(spec)
+    warnings = (*warnings, *of_state)
     draws = spec.mode == "slam" or spec.no_odometry or state is not None
     localise = spec.mode == "localise" or (grid is not None and not draws)
     opened = time.perf_counter()
     if progress is not None:
         progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
     if localise:
-        start, doubts = find_start(spec, log, require_map(grid))
-        warnings = (*warnings, *doubts)
+        start, of_start = find_start(spec, log, require_map(grid))
+        warnings = (*warnings, *of_start)
         likelihood = LikelihoodField.from_grid(
             require_map(grid), spec.config.likelihood_field.sigma, spec.config.likelihood_field.margin
         )
@@ -180,7 +181,7 @@ def _run(spec: RunRequest, progress: Callable[[Progress], None] | None) -> Resul
         grid=require_map(grid),
         diagnostics=history.diagnostics(),
         losses=log.losses,
-        warnings=(*log.summary.warnings, *warnings, *events.doubt()),
+        warnings=(*log.summary.warnings, *warnings, *events.warnings()),
         seconds=seconds,
         mode="localise" if localise else "slam",
         mapping=mapping,
@@ -211,8 +212,8 @@ def _share(progress: Callable[[Progress], None] | None, total: float, scans: int
     return lambda share: progress(Progress("refine", share * total, total, scans))
 
 
-def find_map(spec: RunRequest, log: Log) -> tuple[OccupancyGrid | None, tuple[str, ...]]:
-    """The map that is given or that the log carries, and what there is to warn of."""
+def find_map(spec: RunRequest, log: Log) -> tuple[OccupancyGrid | None, tuple[RunWarning, ...]]:
+    """The map that is given or that the log carries, and warnings."""
     if spec.map_path is not None:
         return load_grid(spec.map_path)
     grid = log.map()
@@ -226,8 +227,9 @@ def find_map(spec: RunRequest, log: Log) -> tuple[OccupancyGrid | None, tuple[st
         raise MapError(f"{spec.logs[0]}: {what}; give one with --map {given}")
     if spec.mode == "slam" or spec.resume is not None or not (unread or beside):
         return None, ()
-    hint = f"{what}, so one is drawn; to localise on a map give it with --map {given}"
-    return None, (hint + ("" if not beside[1:] else f" (also there: {', '.join(p.name for p in beside[1:])})"),)
+    remedy = f"to localise on a map give it with --map {given}"
+    remedy += "" if not beside[1:] else f" (also there: {', '.join(p.name for p in beside[1:])})"
+    return None, (RunWarning(WarningCode.MAP_NOT_USED, f"{what}, so a map is built", remedy),)
 
 
 def require_map(grid: OccupancyGrid | None) -> OccupancyGrid:

@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.config import to_dict
 from hsloc.errors import HslocError
-from hsloc.export.results_folder import timings, write_results
+from hsloc.export.results_folder import write_results
 from hsloc.log import open_log
 from hsloc.options import OPTIONS
 from hsloc.replay.map_sources import map_file, state_file
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
+from hsloc.run_metrics import RunMetrics, RunTimings
 from hsloc.version import __version__
 
 if TYPE_CHECKING:
@@ -52,20 +53,20 @@ class SweepRun:
 class Outcome:
     """What became of a run: `done`, `skipped` (it was done before) or `failed` with the reason in `error`.
 
-    `metrics` and `timings` are the contents of the files of these names; None where the run failed.
+    `metrics` and `timings` are None where the run failed.
     """
 
     run: SweepRun
     state: str
     folder: Path
-    metrics: dict[str, Any] | None = None
-    timings: dict[str, Any] | None = None
+    metrics: RunMetrics | None = None
+    timings: RunTimings | None = None
     error: str = ""
 
     @property
     def data_lost(self) -> bool:
         """Whether part of the input could not be read."""
-        return self.metrics is not None and bool(self.metrics["losses"]["data_lost"])
+        return self.metrics is not None and self.metrics.losses.data_lost
 
 
 def plan(
@@ -159,9 +160,9 @@ def do_run(item: SweepRun, folder: Path, key: str) -> Outcome:
     try:
         result = run(item.spec, _heed_stop)
         # Only what looks like a run of ours is replaced.
-        values = write_results(result, target, overwrite=(target / "metrics.json").exists(), progress=_heed_stop)
+        written = write_results(result, target, overwrite=(target / "metrics.json").exists(), progress=_heed_stop)
         (target / KEY_FILE).write_text(json.dumps({"key": key}) + "\n", encoding="utf-8")
-        return Outcome(item, DONE, target, values, timings(result))
+        return Outcome(item, DONE, target, written.metrics, written.timings)
     except HslocError as error:
         return Outcome(item, FAILED, target, error=str(error))
     except Exception as error:  # A defect of ours must not end the sweep; its trace is kept for the report of it.
@@ -182,11 +183,11 @@ def finished(item: SweepRun, folder: Path, key: str) -> Outcome | None:
     try:
         if json.loads((target / KEY_FILE).read_text(encoding="utf-8"))["key"] != key:
             return None
-        metrics = json.loads((target / "metrics.json").read_text(encoding="utf-8"))
-        times = json.loads((target / "timings.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, KeyError, TypeError):
+        metrics = RunMetrics.read(target / "metrics.json")
+        timings = RunTimings.from_json(json.loads((target / "timings.json").read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError, HslocError):
         return None
-    return Outcome(item, SKIPPED, target, metrics, times)
+    return Outcome(item, SKIPPED, target, metrics, timings)
 
 
 def run_key(spec: RunRequest, hashes: dict[Path, str] | None = None) -> str:

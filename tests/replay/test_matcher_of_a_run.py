@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from hsloc.analysis.extrinsics_check import MountingCheck
+from hsloc.analysis.scan_statistics import ExtrinsicsCheck
 from hsloc.cli.main import main
 from hsloc.config import Config
 from hsloc.errors import ConfigError
@@ -86,7 +86,7 @@ def test_the_check_of_the_mounting_uses_the_runs_matcher() -> None:
     cells[[10, 50], 10:51] = 100
     cells[10:51, [10, 50]] = 100
     matcher = Counting()
-    check = MountingCheck(OccupancyGrid(cells, 0.1, IDENTITY), None, matcher, 0.2, 100, 2)
+    check = ExtrinsicsCheck(OccupancyGrid(cells, 0.1, IDENTITY), None, matcher, 0.2, 100, 2)
     scan = Scan(0, np.full(90, 2.0, dtype=np.float32), 0.0, 0.07, 0.1, 10.0, frame_id="front")
     check.add(scan, IDENTITY)
     assert matcher.calls == 1

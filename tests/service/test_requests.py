@@ -119,7 +119,7 @@ def test_two_parts_then_an_extended_map_scored_by_relations(
     same_bytes(client, extended.json()["id"], tmp_path / "extended")
     metrics = json.loads((tmp_path / "extended" / "metrics.json").read_text())
     assert metrics["run"]["map"] == "map.npz, extended"
-    assert any(text.startswith("map.npz: drawn with other parameters") for text in metrics["warnings"])
+    assert any(each["code"] == "map_parameters_differ" for each in metrics["warnings"])
     assert (metrics["relations"]["matched"], metrics["relations"]["unmatched"]) == (1, 1)
     summary = client.get(f"/v1/jobs/{extended.json()['id']}").json()["summary"]
     assert summary["metrics"]["relations"] == metrics["relations"]

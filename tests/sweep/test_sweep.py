@@ -20,6 +20,7 @@ import hsloc.sweep.runs as sweeping
 from hsloc.cli.main import main
 from hsloc.config import Config
 from hsloc.log import ReadOptions
+from hsloc.run_metrics import RunMetrics
 from hsloc.sweep.process_pool import sweep_in_processes
 from hsloc.sweep.runs import DONE, FAILED, SKIPPED, plan, run_key, sweep
 from hsloc.sweep.table import COLUMNS, as_csv, as_json, as_text
@@ -64,7 +65,7 @@ def test_finished_runs_are_known_again_and_others_are_not(tmp_path):
     first = sweep_in_threads(runs, tmp_path, progress=seen.append)
     assert states(first) == [DONE, DONE]
     assert {outcome.run.name for outcome in seen} == {item.name for item in runs}
-    assert first[0].metrics == json.loads((tmp_path / "office-default-seed0" / "metrics.json").read_text())
+    assert first[0].metrics == RunMetrics.read(tmp_path / "office-default-seed0" / "metrics.json")
     written = (tmp_path / "office-default-seed0" / "report.html").stat().st_mtime_ns
     second = sweep_in_threads(runs, tmp_path)
     assert states(second) == [SKIPPED, SKIPPED]
@@ -144,7 +145,9 @@ def test_the_table_in_three_forms(tmp_path):
     outcomes = sweep_in_threads(plan([OFFICE, tmp_path / "missing.mcap"], DEFAULT, read=SHORT), tmp_path)
     good, bad = json.loads(as_json(outcomes))
     assert tuple(good) == COLUMNS
-    assert good["ape_m"] == outcomes[0].metrics["ape"]["trans_part"]["rmse"]
+    assert good["ape_m"] == outcomes[0].metrics.errors.ape.trans_part.rmse
+    assert good["localised"] == 1.0
+    assert good["verdict"] == "good"
     assert good["rpe_m"] is not None
     assert (bad["state"], bad["ape_m"]) == ("failed", None)
     table = list(csv.DictReader(io.StringIO(as_csv(outcomes))))

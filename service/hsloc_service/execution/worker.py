@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from hsloc.replay.run import Progress
     from hsloc.request import RunRequest
+    from hsloc.run_metrics import RunMetrics, RunTimings
 
 EVERY_S = 0.25
 """Progress is told this often at most."""
@@ -60,7 +61,7 @@ def main(argv: list[str] | None = None) -> int:
 def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, float, int], None]) -> dict[str, Any]:
     """Replay and write the results into `folder/output`; returns the summary for the job's row."""
     from hsloc.evaluation import read_relations
-    from hsloc.export.results_folder import timings, write_results
+    from hsloc.export.results_folder import write_results
     from hsloc.replay.run import run
     from hsloc_service.results.preview import write_viewer
 
@@ -74,22 +75,45 @@ def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, 
 
     result = run(spec, replayed)
     # Warnings are a part of the results, which are to be the same in every folder.
-    result = dataclasses.replace(result, warnings=tuple(plain_names(each) for each in result.warnings))
+    plain = tuple(dataclasses.replace(each, text=plain_names(each.text)) for each in result.warnings)
+    result = dataclasses.replace(result, warnings=plain)
     scans = len(result.diagnostics)
-    metrics = write_results(
+    written = write_results(
         result,
         folder / "output",
         progress=lambda share: report("write", share, 1.0, scans),
     )
-    write_viewer(result, folder / "output", metrics)
+    write_viewer(result, written.analysis, folder / "output")
+    return summarise(written.metrics, written.timings)
+
+
+_SUMMARISED = ("verdict", "run", "log", "scans", "localised", "ape", "relations", "losses")
+"""Keys of metrics.json that the job's row holds, too."""
+_MOST_LINES = 50
+
+
+def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
+    """The summary of a job: the figures as the reports show them, the verdict, and all warnings of the run."""
+    from hsloc.dataclass_json import to_json
+    from hsloc.report.table import table_rows
+
+    values = metrics.to_json()
     return {
-        "metrics": {
-            key: metrics[key] for key in ("run", "log", "scans", "ape", "relations", "losses") if key in metrics
-        },
-        "data_lost": result.losses.data_lost,
-        "warnings": [str(warning)[:500] for warning in result.warnings][:50],
-        "notes": [line[:500] for line in result.losses.lines()][:50],
-        "timings": timings(result),
+        "metrics": {key: values[key] for key in _SUMMARISED if key in values},
+        "figures": [{"name": row.label, "values": list(row.values)} for row in table_rows(metrics)],
+        "verdict_reasons": [_shortened(each) for each in values["verdict_reasons"]][:_MOST_LINES],
+        "data_lost": metrics.losses.data_lost,
+        "warnings": [_shortened(to_json(each)) for each in metrics.warnings][:_MOST_LINES],
+        "notes": [line[:500] for line in metrics.losses.notes][:_MOST_LINES],
+        "timings": timings.to_json(),
+    }
+
+
+def _shortened(values: dict[str, Any]) -> dict[str, Any]:
+    """Texts of at most 500 letters, lists of at most 50 entries: the row of a job stays small."""
+    return {
+        key: value[:500] if isinstance(value, str) else value[:_MOST_LINES] if isinstance(value, list) else value
+        for key, value in values.items()
     }
 
 

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
+    from hsloc.warnings import RunWarning
+
 _RUN = 1024
 """Messages in one run."""
 
@@ -45,7 +47,7 @@ class Db3Container:
         self.statistics: dict[int, TopicStatistics] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self.losses_at_opening = Losses()
-        self.warnings: list[str] = []
+        self.warnings: list[RunWarning] = []
         self._in_order_of_time = True
         self._lowest, self._highest = -(1 << 63), (1 << 63) - 1
         with self._guarded(), self._connected() as connection:

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING
 
 from hsloc.errors import ConfigError
 from hsloc.model import IDENTITY, Pose2
+from hsloc.options import STAMPS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from hsloc.warnings import RunWarning
+
 NANOSECONDS = 1_000_000_000
-STAMPS = ("header", "log")
 LONGEST_OFFSET_S = 1e6
 """Clocks that are farther apart (s) are of different epochs: the log's time is the way out."""
 
@@ -32,9 +34,9 @@ class ReadOptions:
     are moved to where the robot was when each beam was measured.
 
     `scan_fix` overrides fields of scans (see `hsloc.log.session.scan_geometry.ScanFixes`). `slice` are two heights
-    above the base (m): point clouds are read as scans, the nearest point of each direction between them.
-    `time_offset` adds seconds to the stamps of a topic; `stamps` takes the log's time in place of header stamps
-    ("log") or not ("header").
+    above the base [m], `LOW,HIGH`: point clouds are read as scans, the nearest point of each direction between them.
+    `time_offset` (`TOPIC=SECONDS`, several with commas) is added to the stamps of a topic. With `stamps` "log" the
+    log's times are used in place of the header stamps.
     """
 
     scan_topic: str | None = None
@@ -47,18 +49,45 @@ class ReadOptions:
     require_scan: bool = True
     require_odometry: bool = True
     deskew: bool = False
-    scan_fix: tuple[str, ...] = ()
-    slice: tuple[float, float] | None = None
-    time_offset: tuple[tuple[str, float], ...] = ()
+    scan_fix: str | None = None
+    slice: str | None = None
+    time_offset: str | None = None
     stamps: str = "header"
 
     def __post_init__(self) -> None:
         if self.stamps not in STAMPS:
             raise ConfigError(f"stamps is {self.stamps!r}; it must be one of {', '.join(STAMPS)}")
-        if self.slice is not None and not self.slice[0] < self.slice[1]:
-            raise ConfigError(f"--slice is {self.slice[0]:g},{self.slice[1]:g}; the first must be the lower height")
-        if any(not abs(seconds) <= LONGEST_OFFSET_S for _, seconds in self.time_offset):
-            raise ConfigError(f"--time-offset must be a number of seconds, at most {LONGEST_OFFSET_S:g}")
+        self.heights()
+        self.offsets_s()
+
+    def heights(self) -> tuple[float, float] | None:
+        """The two heights of `slice` [m]. Raises ConfigError."""
+        if self.slice is None:
+            return None
+        try:
+            low, high = (float(part) for part in self.slice.split(","))
+        except ValueError:
+            low = high = 0.0
+        if not low < high:
+            raise ConfigError(f"--slice {self.slice}: must be LOW,HIGH, two heights above the base in metres")
+        return low, high
+
+    def offsets_s(self) -> dict[str, float]:
+        """Seconds to add by topic, its name without the leading slash. Raises ConfigError."""
+        found = {}
+        for item in (self.time_offset or "").split(",") if self.time_offset else ():
+            topic, _, seconds = item.rpartition("=")
+            try:
+                value = float(seconds)
+            except ValueError:
+                value = float("nan")
+            if not topic or not abs(value) <= LONGEST_OFFSET_S:
+                raise ConfigError(
+                    f"--time-offset {item}: must be TOPIC=SECONDS, with at most {LONGEST_OFFSET_S:g} seconds; "
+                    "--stamps log is the way out for clocks that are farther apart"
+                )
+            found[topic.strip().lstrip("/")] = value
+        return found
 
 
 @dataclass(slots=True)
@@ -141,7 +170,8 @@ class LogSummary:
     T_base_laser comes from: `/tf_static`, `/tf`, `option`, `file format` or `identity`. `order` is `stamp` (events
     in the order of their header stamps) or `log` (in the order of the log, where that is the true one). Where several
     lasers are merged, `scan_topic` names them all, `lasers` tells of each, and the other fields tell of the first.
-    `parts` are the files that hold scans or odometry that are read, in the order of time.
+    `parts` are the files that hold scans or odometry that are read, in the order of time. `segments` is how many
+    messages make a turn of the lidar, where these were joined.
     """
 
     paths: tuple[Path, ...]
@@ -164,8 +194,9 @@ class LogSummary:
     lasers: tuple[LaserSummary, ...] = ()
     parts: tuple[PartSummary, ...] = ()
     order: str = "stamp"
+    segments: int = 1
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[RunWarning, ...] = ()
 
     @property
     def duration_s(self) -> float:

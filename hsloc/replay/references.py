@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from hsloc.log import LinkMessage, Log
+    from hsloc.warnings import RunWarning
 
     Stamped = tuple[int, Pose2]
 
@@ -31,7 +32,7 @@ _OF_FILES = (".tum", ".csv", ".txt", ".gz", ".mcap", ".bag", ".db3")
 _ANY = ReadOptions(require_scan=False, require_odometry=False)
 
 
-def read_reference(text: str, logs: Sequence[Path] = (), warnings: list[str] | None = None) -> Trajectory:
+def read_reference(text: str, logs: Sequence[Path] = (), warnings: list[RunWarning] | None = None) -> Trajectory:
     """The poses that `text` names, see above; topics alone are those of `logs`.
 
     What there is to know of how a file was read is added to `warnings`.

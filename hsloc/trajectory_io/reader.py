@@ -16,6 +16,7 @@ import numpy as np
 from hsloc.errors import EvaluationError
 from hsloc.model import Pose2, Trajectory
 from hsloc.trajectory_io.tum import QUATERNION_TOLERANCE, parse_numbers, parse_stamp, read_comments, read_lines
+from hsloc.warnings import RunWarning, WarningCode
 
 _UNITS = (("ns", 10**17, 0), ("us", 10**14, 3), ("ms", 10**11, 6))
 """Stamps of our time in these units are larger than the second (those in seconds are some 10^9); digits to ns."""
@@ -32,7 +33,7 @@ class LoadedTrajectory:
     """A trajectory, and what its user should know about how it was read."""
 
     trajectory: Trajectory
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[RunWarning, ...] = ()
 
 
 class _Columns(NamedTuple):
@@ -72,10 +73,15 @@ def read_trajectory(path: Path | str) -> LoadedTrajectory:
         raise EvaluationError(f"{path}: holds no pose; a TUM file has lines `t x y z qx qy qz qw`")
     if head is None and len(rows[0]) == 12:
         return _read_kitti(path, rows, numbers)
-    warnings: list[str] = []
+    warnings: list[RunWarning] = []
     columns = head or _by_count(path, rows[0], numbers[0])
     if head is None and columns is _TUM and _begins_with_w(rows):
-        warnings.append(f"{path}: its quaternions begin with w (the robot would lean otherwise); they are read so")
+        warnings.append(
+            RunWarning(
+                WarningCode.REFERENCE_READ_AS,
+                f"{path}: its quaternions begin with w (the robot would lean otherwise); they are read so",
+            )
+        )
         columns = _TUM._replace(quaternion=(5, 6, 7, 4))
     stamps, poses = [], []
     unit = _unit(rows, columns)
@@ -88,10 +94,14 @@ def read_trajectory(path: Path | str) -> LoadedTrajectory:
             raise EvaluationError(f"{path}, line {number}: {reason if type(error) is IndexError else error}") from None
     trajectory = Trajectory(np.array(stamps, dtype=np.int64), np.array(poses, dtype=np.float64).reshape(-1, 3))
     if columns.heading >= 0 and not columns.in_degrees and _is_in_degrees(trajectory.poses, _headings(rows, columns)):
-        warnings.append(f"{path}: its headings fit the way only as degrees; they are read so")
+        warnings.append(
+            RunWarning(
+                WarningCode.REFERENCE_READ_AS, f"{path}: its headings fit the way only as degrees; they are read so"
+            )
+        )
         trajectory = Trajectory(trajectory.stamps_ns, _from_degrees(trajectory.poses, _headings(rows, columns)))
     if unit:
-        warnings.append(f"{path}: its stamps are read as {unit}")
+        warnings.append(RunWarning(WarningCode.REFERENCE_READ_AS, f"{path}: its stamps are read as {unit}"))
     return LoadedTrajectory(trajectory, (*warnings, *_repeated(path, trajectory.stamps_ns)))
 
 
@@ -242,13 +252,15 @@ def _from_degrees(poses: np.ndarray, raw: list[float]) -> np.ndarray:
     return turned
 
 
-def _repeated(path: Path, stamps: np.ndarray) -> list[str]:
+def _repeated(path: Path, stamps: np.ndarray) -> list[RunWarning]:
     distinct = len(np.unique(stamps))
     if len(stamps) < 2 or distinct >= _LEAST_DISTINCT * len(stamps):
         return []
-    warning = (
+    warning = RunWarning(
+        WarningCode.REFERENCE_STAMPS_REPEAT,
         f"{path}: {len(stamps)} poses have only {distinct} different stamps: they were written with too few digits, so "
-        "that figures compare poses of different times; write stamps with at least three decimals"
+        "that figures compare poses of different times",
+        "write stamps with at least three decimals",
     )
     return [warning]
 
@@ -283,5 +295,7 @@ def _read_kitti(path: Path, rows: list[list[str]], numbers: list[int]) -> Loaded
         poses = np.column_stack((m[:, 0, 3], m[:, 1, 3], np.arctan2(m[:, 1, 0], m[:, 0, 0])))
         return LoadedTrajectory(Trajectory(stamps, poses), tuple(_repeated(path, stamps)))
     poses = np.column_stack((m[:, 2, 3], -m[:, 0, 3], np.arctan2(-m[:, 0, 2], m[:, 2, 2])))
-    warning = f"{path}: its poses are of a camera's frame (z ahead); x is taken from z, and y from -x"
-    return LoadedTrajectory(Trajectory(stamps, poses), (warning, *_repeated(path, stamps)))
+    text = f"{path}: its poses are of a camera's frame (z ahead); x is taken from z, and y from -x"
+    return LoadedTrajectory(
+        Trajectory(stamps, poses), (RunWarning(WarningCode.REFERENCE_READ_AS, text), *_repeated(path, stamps))
+    )

@@ -81,15 +81,15 @@ def test_sound_scans_raise_no_word(changes: dict[str, float]) -> None:
 @pytest.mark.parametrize(
     ("changes", "code", "flag"),
     [
-        ({"increment": -TURN / 360, "high": pi}, "angle_increment", "increment=negate"),
-        ({"increment": TURN / 720, "high": pi}, "angle_increment", "increment=angles"),
-        ({"increment": TURN / 180, "high": pi}, "angle_increment", "increment=angles"),
-        ({"low": -180.0, "increment": 1.0}, "angles_unit", "angles=degrees"),
-        ({"beams": 271, "low": -135.0, "increment": 1.0}, "angles_unit", "angles=degrees"),
-        ({"step": 0.1 / 360 / 1000}, "time_increment", "time_increment=interval"),
-        ({"step": 0.1 / 360 / 20}, "time_increment", "time_increment=interval"),
-        ({"step": 0.1 / 360 * 50}, "time_increment", "time_increment=interval"),
-        ({"far": 0.3}, "range_max", "range_max="),
+        ({"increment": -TURN / 360, "high": pi}, "scan_angle_increment", "increment=negate"),
+        ({"increment": TURN / 720, "high": pi}, "scan_angle_increment", "increment=angles"),
+        ({"increment": TURN / 180, "high": pi}, "scan_angle_increment", "increment=angles"),
+        ({"low": -180.0, "increment": 1.0}, "scan_angle_unit", "angles=degrees"),
+        ({"beams": 271, "low": -135.0, "increment": 1.0}, "scan_angle_unit", "angles=degrees"),
+        ({"step": 0.1 / 360 / 1000}, "scan_time_increment", "time_increment=interval"),
+        ({"step": 0.1 / 360 / 20}, "scan_time_increment", "time_increment=interval"),
+        ({"step": 0.1 / 360 * 50}, "scan_time_increment", "time_increment=interval"),
+        ({"far": 0.3}, "scan_range_max", "range_max="),
     ],
 )
 def test_what_does_not_fit_is_named_with_the_flag(changes: dict[str, float], code: str, flag: str) -> None:
@@ -109,12 +109,12 @@ def test_what_does_not_fit_is_named_with_the_flag(changes: dict[str, float], cod
 )
 def test_the_flag_makes_the_scan_what_it_should_be(changes: dict[str, float], fix: str) -> None:
     (right, *_), (wrong, *_) = scans(), scans(**changes)  # type: ignore[arg-type]
-    fixed = ScanFixes.parse([fix]).apply(wrong, 0.1)
+    fixed = ScanFixes.parse(fix).apply(wrong, 0.1)
     assert fixed.angle_min == pytest.approx(right.angle_min)
     assert fixed.angle_increment == pytest.approx(right.angle_increment)
     if "time" in fix:
         assert fixed.time_increment == pytest.approx(right.time_increment)
-    assert codes([ScanFixes.parse([fix]).apply(scan, 0.1) for scan in scans(**changes)]) == []  # type: ignore[arg-type]
+    assert codes([ScanFixes.parse(fix).apply(scan, 0.1) for scan in scans(**changes)]) == []  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_the_flag_makes_the_scan_what_it_should_be(changes: dict[str, float], fi
 )
 def test_a_wrong_flag_is_named(item: str) -> None:
     with pytest.raises(ConfigError, match=f"--scan-fix {item}"):
-        ScanFixes.parse([item])
+        ScanFixes.parse(item)
 
 
 def in_segments(whole: list[ScanMessage], count: int) -> list[ScanMessage]:

@@ -10,6 +10,7 @@ from hsloc.log.messages import cdr_batch_decode as columns
 from hsloc.log.messages import decode, definitions, foxglove, from_objects, point_cloud, ros_json
 from hsloc.log.messages import definition_compatibility as schema
 from hsloc.log.messages.definitions import long_name
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -48,7 +49,7 @@ def is_decodable(channel: Channel) -> bool:
     return channel.message_encoding in _ENCODINGS and canonical_type(channel.typename) in BY_HAND
 
 
-def decoder_for(channel: Channel, warnings: list[str] | None = None) -> Decoder:
+def decoder_for(channel: Channel, warnings: list[RunWarning] | None = None) -> Decoder:
     """A function from payload to one of the tuples of `hsloc.log.messages.decode`; it raises `Undecodable` alone.
 
     A definition of a standard type that is incomplete is replaced by the standard one, which is added to `warnings`.
@@ -63,9 +64,10 @@ def decoder_for(channel: Channel, warnings: list[str] | None = None) -> Decoder:
         return _by_hand(channel, typename)
     if _is_incomplete(channel, typename):
         if warnings is not None:
-            warnings.append(
+            text = (
                 f"{channel.topic}: the log's definition of {channel.typename} is incomplete; the standard one is used"
             )
+            warnings.append(RunWarning(WarningCode.DEFINITION_INCOMPLETE, text))
         channel = dataclasses.replace(channel, schema=b"", schema_encoding="")
         return _by_hand(channel, typename) if channel.message_encoding == "cdr" else _by_rosbags(channel, typename)
     return _by_rosbags(channel, typename)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from hsloc.log.session.transform_topics import BASE_FRAMES, last_name, read_links
 from hsloc.log.transforms import FrameTree, Mounting, Transform3, laser_mounting
 from hsloc.model import IDENTITY, Pose2
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -35,8 +36,8 @@ class Extrinsics:
         self._override = override
         self._assumed = assumed
         self._static = FrameTree()
-        self.warnings: list[str] = []
-        for link in read_links(containers, topics.static, problems=self.warnings):
+        self.warnings: list[RunWarning] = []
+        for link in read_links(containers, topics.static, warnings=self.warnings):
             self._static.add(link.parent, link.child, link.transform)
         self._all: FrameTree | None = None
         self._known: dict[str, tuple[Mounting, str]] = {}
@@ -94,19 +95,30 @@ class Extrinsics:
                 mounting = laser_mounting(transform)
                 if mounting.tilt > TILT_WARNING:
                     self.warnings.append(
-                        f"the laser {laser} is tilted by {degrees(mounting.tilt):.1f} deg; "
-                        "ranges are used as if it were level"
+                        RunWarning(
+                            WarningCode.LASER_TILTED,
+                            f"the laser {laser} is tilted by {degrees(mounting.tilt):.1f} deg; "
+                            "ranges are used as if it were level",
+                        )
                     )
                 if laser in self._assumed:
                     self.warnings.append(
-                        f"the mounting of {laser} was assumed when this log was converted; give --laser-pose x,y,yaw"
+                        RunWarning(
+                            WarningCode.EXTRINSICS_ASSUMED,
+                            f"the mounting of {laser} was assumed when this log was converted",
+                            "give --laser-pose x,y,yaw",
+                        )
                     )
                     return mounting, "identity"
                 topics = self._topics.static if tree is self._static else self._topics.dynamic
                 return mounting, ", ".join(sorted(topics))
         self.warnings.append(
-            f"no transform from {base or 'the base'} to {laser or 'the laser'} in {self._topics.names}: the laser is "
-            "taken to be in the base's place; give --laser-pose x,y,yaw"
+            RunWarning(
+                WarningCode.EXTRINSICS_ASSUMED,
+                f"no transform from {base or 'the base'} to {laser or 'the laser'} in {self._topics.names}: the laser "
+                "is assumed to be at the origin of the base",
+                "give --laser-pose x,y,yaw",
+            )
         )
         return Mounting(IDENTITY), "identity"
 
@@ -115,7 +127,7 @@ class Extrinsics:
         if self._all is None:
             self._all = FrameTree()
             static = self._static.children()
-            for link in read_links(self._containers, self._topics.dynamic, problems=self.warnings):
+            for link in read_links(self._containers, self._topics.dynamic, warnings=self.warnings):
                 if link.child not in static:
                     self._all.add(link.parent, link.child, link.transform)
             for link in read_links(self._containers, self._topics.static):
@@ -127,7 +139,10 @@ class Extrinsics:
         moving = sorted(frame for frame in (path[0] + path[1] if path else ()) if tree.is_moving(frame))
         if moving:
             self.warnings.append(
-                f"the laser's mounting moves during the log ({', '.join(moving)}); its last pose is taken for all"
+                RunWarning(
+                    WarningCode.LASER_MOVES,
+                    f"the laser's mounting moves during the log ({', '.join(moving)}); its last pose is used for all",
+                )
             )
 
     def _warn_if_restated(self, tree: FrameTree, base: str, laser: str) -> None:
@@ -140,8 +155,12 @@ class Extrinsics:
                     f"{parent} -> {frame} at {_in_plane(transform)}" for parent, transform in statements
                 )
                 self.warnings.append(
-                    f"{', '.join(sorted(self._topics.static))} states the place of {frame} {len(statements)} times: "
-                    f"{listed}; the last that leads to {base} is taken: choose with --laser-pose x,y,yaw"
+                    RunWarning(
+                        WarningCode.EXTRINSICS_RESTATED,
+                        f"{', '.join(sorted(self._topics.static))} states the place of {frame} {len(statements)} "
+                        f"times: {listed}; the last that leads to {base} is used",
+                        "choose with --laser-pose x,y,yaw",
+                    )
                 )
 
     def _guessed_base(self) -> str | None:

@@ -23,6 +23,7 @@ from hsloc.log.session.topic_selection import (
 from hsloc.log.session.transform_topics import choose_transforms, is_map_frame, is_odometry_frame
 from hsloc.log.summary import LaserSummary, LogSummary, Losses, ReadOptions, TopicSummary
 from hsloc.model import IDENTITY
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -70,7 +71,7 @@ class LogSession:
     def __init__(self, containers: Sequence[Container], options: ReadOptions) -> None:
         self.containers = containers
         self.options = options
-        self._warnings = [warning for container in containers for warning in container.warnings]
+        self._warnings: list[RunWarning] = [warning for container in containers for warning in container.warnings]
         self._decoders: dict[tuple[int, int], Decoder] = {}
         self.active = [
             channel
@@ -91,15 +92,15 @@ class LogSession:
         self._warnings += self.transforms.warnings
         self.tf_frames = self.transforms.odometry
         self.choice = choose_topics(where, self.active, options, self.tf_frames is not None)
-        self._warnings += self.choice.problems
+        self._warnings += self.choice.warnings
         odom = self.choice.odom
-        self._parts, doubts = check_parts(
+        self._parts, of_parts = check_parts(
             containers,
             self.choice.scans,
             () if odom is None else self.transforms.dynamic if odom == TF else (odom,),
             self.tf_frames if odom == TF else None,
         )
-        self._warnings += doubts
+        self._warnings += of_parts
         self.fixes = ScanFixes.parse(options.scan_fix)
         self.surveys = {topic: self._survey(topic) for topic in scans}
         self.odom_type = self._pose_type(self.choice.odom)
@@ -173,11 +174,14 @@ class LogSession:
         first = [message for _, message in islice(self.messages(topic, kind), _SCANS_AT_OPENING)]
         interval = survey(first).interval_s
         found = survey(self.fixes.apply(message, interval) for message in first)
-        self._warnings += [f"{topic}: {problem.text}; {problem.remedy}" for problem in found.problems]
+        self._warnings += [RunWarning(p.code, f"{topic}: {p.text}", p.remedy) for p in found.problems]
         if found.segments > 1:
             self._warnings.append(
-                f"{topic}: a turn comes in {found.segments} segments, which are joined; record the topic of whole "
-                "turns if the driver has one"
+                RunWarning(
+                    WarningCode.SCAN_SEGMENTS,
+                    f"{topic}: a turn comes in {found.segments} segments, which are joined and deskewed",
+                    "record the topic of whole turns if the driver has one",
+                )
             )
         return found
 
@@ -203,7 +207,11 @@ class LogSession:
         transform = self.mountings.between(child, base)
         if transform is None:
             self._warnings.append(
-                f"no transform from {child}, which the odometry speaks of, to {base}: they are taken to be one"
+                RunWarning(
+                    WarningCode.ODOMETRY_FRAME_ASSUMED,
+                    f"no transform from {child}, the odometry's child frame, to {base}: they are assumed to be the "
+                    "same",
+                )
             )
             return None
         return transform.to_pose2()
@@ -212,14 +220,17 @@ class LogSession:
         statistics = self._topics()
         lasers = [self._laser(topic, first) for topic, first in self.scans.items() if first is not None]
         if len(lasers) > 1 and self.options.laser_pose is not None:
-            self._warnings.append(f"--laser-pose is taken for all {len(lasers)} lasers")
+            self._warnings.append(
+                RunWarning(WarningCode.LASER_POSE_SHARED, f"--laser-pose is used for all {len(lasers)} lasers")
+            )
         laser = lasers[0] if lasers else LaserSummary("", "", IDENTITY, False, "identity")
         converted = any(c.metadata.get(CONVERTED, {}).get("order") == "log" for c in self.containers)
         self._warn_of_clocks()
         self.initial_pose = self.find_initial_pose()
         self.maps, others = self.map_topics()
         if others and not self.maps:
-            self._warnings.append(f"{', '.join(others)} is a costmap, not a map: it is not used; give a map with --map")
+            text = f"{', '.join(others)} is a costmap, not a map: it is not used"
+            self._warnings.append(RunWarning(WarningCode.MAP_IS_COSTMAP, text, "give a map with --map"))
         starts = [topic.first_ns for topic in statistics if topic.first_ns is not None]
         ends = [topic.last_ns for topic in statistics if topic.last_ns is not None]
         formats = list(dict.fromkeys(container.format for container in self.containers))
@@ -244,6 +255,7 @@ class LogSession:
             lasers=tuple(lasers),
             parts=self._parts,
             order="log" if converted else "stamp",
+            segments=max((found.segments for found in self.surveys.values()), default=1),
             metadata={name: dict(v) for c in self.containers for name, v in c.metadata.items()},
             warnings=tuple(dict.fromkeys(self._warnings + self.mountings.warnings)),
         )
@@ -321,8 +333,12 @@ class LogSession:
                 if T_map_frame is not None:
                     return stamp, T_map_frame @ message.pose
                 self._warnings.append(
-                    f"{name} gives a pose in the frame {frame}, not in the map's, and no transform leads there: it is "
-                    "left out; give the start with --initial-pose x,y,yaw"
+                    RunWarning(
+                        WarningCode.START_FRAME,
+                        f"{name} gives a pose in the frame {frame}, not in the map's, and no transform leads there: it "
+                        "is not used",
+                        "give the start with --initial-pose x,y,yaw",
+                    )
                 )
         return None
 
@@ -368,6 +384,9 @@ class LogSession:
             apart = (first.stamp_ns - first.log_time_ns) - (self.odom.stamp_ns - self.odom.log_time_ns)
             if abs(apart) > _CLOCKS_APART_NS:
                 self._warnings.append(
-                    f"the stamps of {topic} and {self.choice.odom} are {apart / 1e9:.1f} s apart, measured by the "
-                    "log's clock: they may be of different clocks"
+                    RunWarning(
+                        WarningCode.CLOCKS_APART,
+                        f"the stamps of {topic} and {self.choice.odom} are {apart / 1e9:.1f} s apart, measured by the "
+                        "log's clock: they may come from different clocks",
+                    )
                 )

@@ -104,7 +104,7 @@ class RosSource:
         for topic, first in survey.scans.items():
             clock = self._clock(topic, KIND_SCAN, first, losses)
             if survey.scan_types[topic] == definitions.POINT_CLOUD2:
-                feeds.append(CloudFeed(clock, survey.mountings, losses, survey.options.slice or (-inf, inf)))
+                feeds.append(CloudFeed(clock, survey.mountings, losses, survey.options.heights() or (-inf, inf)))
                 continue
             feed = ScanFeed(clock, survey.mountings, losses, survey.options.deskew, survey.fixes, survey.surveys[topic])
             feed.typename = survey.scan_types[topic]
@@ -126,7 +126,8 @@ class RosSource:
             topic.lstrip("/"),
             *(name.lstrip("/") for name in (self._survey.transforms.dynamic if topic == TF else ())),
         }
-        offset_s = sum(seconds for name, seconds in options.time_offset if name.lstrip("/") in names)
+        offsets = options.offsets_s()
+        offset_s = sum(seconds for name, seconds in offsets.items() if name in names)
         shares = first is None or first.shares_log_clock
         return TopicClock(topic, kind, losses, shares, round(offset_s * NANOSECONDS), options.stamps == "log")
 

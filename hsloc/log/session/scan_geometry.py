@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hsloc.errors import ConfigError
+from hsloc.warnings import WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -62,8 +63,9 @@ class ScanFixes:
     range_max: float | None = None
 
     @staticmethod
-    def parse(items: Sequence[str]) -> ScanFixes:
-        """From `name=value` items. Raises ConfigError naming the item."""
+    def parse(text: str | None) -> ScanFixes:
+        """From `name=value` items with commas between. Raises ConfigError naming the item."""
+        items = [item.strip() for item in text.split(",")] if text else []
         values: dict[str, float | str | bool] = {}
         words = {"increment": ("angles", "negate"), "time_increment": ("interval",), "angles": ("degrees",)}
         for item in items:
@@ -151,7 +153,9 @@ def _angles(scan: ScanMessage) -> Problem | None:
     if max(map(abs, known)) > _TURN + _LEAST_DISAGREEMENT and abs(increment) * (beams - 1) > 1.5 * _TURN:
         fits = abs(increment) * (beams - 1) <= 360.0 + _SPARE_BEAMS * abs(increment)
         text = f"angles from {low:g} to {high:g} with steps of {increment:g} are no radians"
-        return Problem("angles_unit", text, "--scan-fix angles=degrees reads them as degrees" if fits else _REPAIR)
+        return Problem(
+            WarningCode.SCAN_ANGLE_UNIT, text, "--scan-fix angles=degrees reads them as degrees" if fits else _REPAIR
+        )
     if not isfinite(high):
         return None
     end = low + (beams - 1) * increment
@@ -168,7 +172,7 @@ def _angles(scan: ScanMessage) -> Problem | None:
     if abs(low - (beams - 1) * increment - high) <= tolerance:
         text += ": they differ by the sign of the increment, and the scan is mirrored if that is wrong"
         remedy = "--scan-fix increment=negate takes the sign of angle_max's"
-    return Problem("angle_increment", text, remedy)
+    return Problem(WarningCode.SCAN_ANGLE_INCREMENT, text, remedy)
 
 
 _REPAIR = "repair the driver; --scan-fix overrides a field"
@@ -188,7 +192,7 @@ def _ranges(scans: Sequence[ScanMessage]) -> Problem | None:
         return None
     share, farthest = 100.0 * len(beyond) / len(readings), float(np.percentile(beyond, 99.0))
     return Problem(
-        "range_max",
+        WarningCode.SCAN_RANGE_MAX,
         f"{share:.0f} % of the finite readings lie beyond range_max, {limit:g} m, and are discarded, as the message's "
         "definition asks",
         f"--scan-fix range_max={np.ceil(farthest + 0.5):g} uses them, if the lidar measures as far",
@@ -205,7 +209,7 @@ def _sweep(scan: ScanMessage, interval_s: float | None) -> Problem | None:
     if _SHORTEST_SWEEP * expected <= sweep <= max(_LONGEST_SWEEP * expected, 1.05 * interval_s):
         return None
     return Problem(
-        "time_increment",
+        WarningCode.SCAN_TIME_INCREMENT,
         f"{beams} beams of time_increment {step:g} s take {sweep:g} s, a scan comes every {interval_s:.3f} s",
         "--scan-fix time_increment=interval takes the time between scans; it matters for --deskew alone",
     )

@@ -15,6 +15,7 @@ from hsloc.errors import LogError
 from hsloc.log.messages.decode import OdometryMessage, PoseMessage
 from hsloc.log.messages.decoders import Undecodable, decoder_for, is_decodable
 from hsloc.log.summary import NANOSECONDS, Losses, PartSummary
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -40,6 +41,8 @@ _RESET, _AWAY = 0.01, 0.5
 _ENDS = 200
 """Messages looked at on either end of a part."""
 
+_ANOTHER_RUN = "if that is another run, replay each file by itself"
+
 
 class _Edge(NamedTuple):
     """Odometry at one end of a part."""
@@ -53,8 +56,8 @@ def check_parts(
     scan_topics: Iterable[str],
     odometry: Collection[str],
     tf_frames: tuple[str, str] | None,
-) -> tuple[tuple[PartSummary, ...], list[str]]:
-    """The files in the order of time, and what is doubtful about their being parts of one run.
+) -> tuple[tuple[PartSummary, ...], list[RunWarning]]:
+    """The files in the order of time, and warnings where they may not be parts of one run.
 
     `odometry` are the topics that carry it, `tf_frames` its frames where these are transforms. Raises LogError for
     files that are not parts of one run.
@@ -102,15 +105,16 @@ def _refuse_same_time(a: PartSummary, b: PartSummary, topic: str) -> None:
         )
 
 
-def _gaps(parts: Sequence[PartSummary]) -> list[str]:
+def _gaps(parts: Sequence[PartSummary]) -> list[RunWarning]:
     warnings = []
     last = parts[0]
     for part in parts[1:]:
         gap = part.start_ns - last.end_ns
         if gap > GAP_NS:
             warnings.append(
-                f"{part.path} begins {_duration(gap)} after {last.path} ends: if that is another drive, run each by "
-                "itself"
+                RunWarning(
+                    WarningCode.PARTS_GAP, f"{part.path} begins {_duration(gap)} after {last.path} ends", _ANOTHER_RUN
+                )
             )
         last = max(last, part, key=lambda item: item.end_ns)
     return warnings
@@ -126,30 +130,34 @@ def _duration(nanoseconds: int) -> str:
 
 def _jumps(
     found: Sequence[tuple[PartSummary, Container]], odometry: Collection[str], tf_frames: tuple[str, str] | None
-) -> list[str]:
+) -> list[RunWarning]:
     ends = [(part, *_edges(container, odometry, tf_frames)) for part, container in found]
     told = [(part, first, last) for part, first, last in ends if first is not None and last is not None]
     return [
-        doubt
+        warning
         for (before, _, end), (after, begin, _) in pairwise(sorted(told, key=lambda entry: entry[1].log_time_ns))
-        for doubt in _jump(before, end, after, begin)
+        for warning in _jump(before, end, after, begin)
     ]
 
 
-def _jump(a: PartSummary, end: _Edge, b: PartSummary, begin: _Edge) -> list[str]:
+def _jump(a: PartSummary, end: _Edge, b: PartSummary, begin: _Edge) -> list[RunWarning]:
     """What the odometry says to one part following the other."""
     # Where the edges overlap, too, the robot was at either end of so much time.
     seconds = abs(begin.log_time_ns - end.log_time_ns) / NANOSECONDS
     way = hypot(begin.pose.x - end.pose.x, begin.pose.y - end.pose.y)
     if hypot(begin.pose.x, begin.pose.y) < _RESET and hypot(end.pose.x, end.pose.y) > _AWAY:
-        return [f"the odometry begins anew with {b.path}: if that is another drive, run each by itself"]
+        return [
+            RunWarning(
+                WarningCode.PARTS_ODOMETRY_RESET, f"the odometry starts again from zero with {b.path}", _ANOTHER_RUN
+            )
+        ]
     what = f"the odometry is {way:.1f} m away when {b.path} goes on, {seconds:.1f} s from the end of {a.path}"
     if way > POSSIBLE_JUMP + POSSIBLE_SPEED * seconds:
         raise LogError(
             f"{what}, so they are not parts of one run; run each by itself, or all with `hsloc sweep {a.path} {b.path}`"
         )
     if way > LIKELY_JUMP + LIKELY_SPEED * seconds:
-        return [f"{what}: if that is another drive, run each by itself"]
+        return [RunWarning(WarningCode.PARTS_ODOMETRY_JUMP, what, _ANOTHER_RUN)]
     return []
 
 

@@ -10,6 +10,7 @@ from hsloc.errors import TopicError
 from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import canonical_type, is_decodable
 from hsloc.log.session.transform_topics import is_static_topic, is_transform_topic, namespace
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,12 +33,12 @@ _LISTED = 12
 
 @dataclass(slots=True)
 class TopicSelection:
-    """Topics to read; `TF` stands for transforms in place of a topic. `problems` are what stood in the way."""
+    """Topics to read; `TF` stands for transforms in place of a topic. `warnings` are what stood in the way."""
 
     scans: tuple[str, ...] = ()
     odom: str | None = None
     truth: str | None = None
-    problems: list[str] = field(default_factory=list)
+    warnings: list[RunWarning] = field(default_factory=list)
 
 
 def has_name(channel: Channel, name: str) -> bool:
@@ -70,7 +71,7 @@ def choose_topics(
     """
     choice = TopicSelection()
     choice.truth = _truth(where, channels, options)
-    choice.scans = tuple(choose_scans(where, channels, options, choice.problems))
+    choice.scans = tuple(choose_scans(where, channels, options, choice.warnings))
     if names_transforms(channels, options.odom_topic) is not None:
         choice.odom = TF
     else:
@@ -88,7 +89,7 @@ def choose_topics(
                 candidates,
                 options.odom_topic,
                 options.require_odometry,
-                choice.problems,
+                choice.warnings,
             )
     if choice.truth is not None and choice.truth == choice.odom != TF:
         if options.truth_topic is not None:
@@ -102,7 +103,9 @@ def is_truth_name(topic: str) -> bool:
     return _TRUTH_NAME.search(topic) is not None
 
 
-def choose_scans(where: str, channels: Sequence[Channel], options: ReadOptions, problems: list[str]) -> dict[str, str]:
+def choose_scans(
+    where: str, channels: Sequence[Channel], options: ReadOptions, warnings: list[RunWarning]
+) -> dict[str, str]:
     """The scan topics with their types: the only one, or those that are named, separated by commas.
 
     Plain scans come first; several echoes or clouds of points are read where there are no others, or if they are named.
@@ -120,11 +123,15 @@ def choose_scans(where: str, channels: Sequence[Channel], options: ReadOptions, 
         echoes = [topic for topic in candidates if topic.rpartition("/")[2] in _ECHOES]
         if len(echoes) == len(candidates) and len({namespace(topic) for topic in echoes}) == 1:
             first_echo = min(echoes, key=lambda topic: _ECHOES.index(topic.rpartition("/")[2]))
-            problems.append(
-                f"{', '.join(echoes)} are echoes of one laser; {first_echo} is read: choose with --scan-topic"
+            warnings.append(
+                RunWarning(
+                    WarningCode.SCAN_ECHOES,
+                    f"{', '.join(echoes)} are echoes of one laser; {first_echo} is used",
+                    "choose with --scan-topic",
+                )
             )
             names = [first_echo]
-    chosen = [_pick(where, channels, "scan", first, candidates, name, options.require_scan, problems) for name in names]
+    chosen = [_pick(where, channels, "scan", first, candidates, name, options.require_scan, warnings) for name in names]
     return {topic: kinds[topic] for topic in chosen if topic is not None}
 
 
@@ -145,7 +152,7 @@ def _pick(
     candidates: list[str],
     named: str | None,
     required: bool,
-    problems: list[str],
+    warnings: list[RunWarning],
 ) -> str | None:
     flag = f"--{kind}-topic"
     if named is not None:
@@ -158,19 +165,22 @@ def _pick(
     what = {"scan": "scan", "odom": "odometry"}[kind]
     if candidates:
         listing = ", ".join(candidates[:_LISTED])
-        problem = f"{where}: {len(candidates)} {what} topics ({listing}); choose with {flag} {candidates[0]}"
-        problem += f", or take all with {flag} {','.join(candidates[:_LISTED])}" if kind == "scan" else ""
+        remedy = f"choose with {flag} {candidates[0]}"
+        remedy += f", or take all with {flag} {','.join(candidates[:_LISTED])}" if kind == "scan" else ""
+        text = f"{where}: {len(candidates)} {what} topics ({listing})"
+        warning = RunWarning(WarningCode.TOPIC_AMBIGUOUS, text, remedy)
     else:
-        problem = f"{where}: no {what} topic ({typename}); the log holds {listed(channels)}"
+        remedy = "without odometry a map can be built (--no-odom)" if kind == "odom" and required else ""
         if kind == "scan" and of_type(channels, definitions.POINT_CLOUD2):
-            problem += (
-                "; point clouds are read as scans with --slice LOW,HIGH, the heights above the base (m) between which "
+            remedy = (
+                "point clouds are read as scans with --slice LOW,HIGH, the heights above the base [m] between which "
                 "walls are seen"
             )
-        problem += "; without odometry a map can be drawn (--no-odom)" if kind == "odom" and required else ""
+        text = f"{where}: no {what} topic ({typename}); the log holds {listed(channels)}"
+        warning = RunWarning(WarningCode.TOPIC_MISSING, text, remedy)
     if required:
-        raise TopicError(problem)
-    problems.append(problem)
+        raise TopicError(str(warning))
+    warnings.append(warning)
     return None
 
 

@@ -13,6 +13,7 @@ from hsloc.errors import LogFormatError
 from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import Undecodable, canonical_type, decoder_for, is_decodable
 from hsloc.log.summary import Losses
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -62,11 +63,11 @@ def read_links(
     containers: Sequence[Container],
     topics: Collection[str],
     limit: int | None = None,
-    problems: list[str] | None = None,
+    warnings: list[RunWarning] | None = None,
 ) -> Iterator[LinkMessage]:
     """All transforms on some topics, in the order of the log; at most `limit` messages of each file.
 
-    A log can be read without them: what stands in the way goes to `problems`.
+    A log can be read without them: what prevents reading them is added to `warnings`.
     """
     for container in containers:
         decoders: dict[int, Decoder] = {}
@@ -77,8 +78,8 @@ def read_links(
                 if is_decodable(channel):
                     decoders[channel.id] = decoder_for(channel)
             except LogFormatError as error:
-                if problems is not None:
-                    problems.append(f"transforms are not read: {error}")
+                if warnings is not None:
+                    warnings.append(RunWarning(WarningCode.TRANSFORMS_UNREADABLE, f"transforms are not read: {error}"))
         if not decoders:
             continue
         # Damage is counted when the log is read for its events.
@@ -103,7 +104,7 @@ class TransformTopics:
     static: frozenset[str] = frozenset()
     odometry: tuple[str, str] | None = None
     has_map_to_odometry: bool = False
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[RunWarning] = field(default_factory=list)
 
     @property
     def names(self) -> str:
@@ -155,7 +156,7 @@ def _nearest(
     groups: dict[str, list[str]],
     links: dict[str, list[tuple[str, str]]],
     scans: Sequence[tuple[str, str]],
-    warnings: list[str],
+    warnings: list[RunWarning],
 ) -> list[str]:
     """The topics of the namespace that the scans belong to."""
     if len(groups) < 2:
@@ -175,8 +176,12 @@ def _nearest(
     tied = [name for name in order if knows(name) and distance(name)[0] == 1]
     if len(tied) > 1 and order[0] in tied:
         warnings.append(
-            f"transforms in {len(tied)} namespaces hold the scans' frame; those on "
-            f"{', '.join(groups[order[0]])} are taken: choose others with --odom-topic"
+            RunWarning(
+                WarningCode.TRANSFORMS_AMBIGUOUS,
+                f"transforms in {len(tied)} namespaces hold the frame of the scans; those on "
+                f"{', '.join(groups[order[0]])} are used",
+                "choose others with --odom-topic",
+            )
         )
     return groups[order[0]]
 

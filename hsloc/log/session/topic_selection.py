@@ -170,7 +170,7 @@ def _pick(
         text = f"{where}: {len(candidates)} {what} topics ({listing})"
         warning = RunWarning(WarningCode.TOPIC_AMBIGUOUS, text, remedy)
     else:
-        remedy = "without odometry a map can be built (--no-odom)" if kind == "odom" and required else ""
+        remedy = "motion can be estimated from the scans alone: --no-odom" if kind == "odom" and required else ""
         if kind == "scan" and of_type(channels, definitions.POINT_CLOUD2):
             remedy = (
                 "point clouds are read as scans with --slice LOW,HIGH, the heights above the base [m] between which "

@@ -35,12 +35,11 @@ from hsloc.run_metrics import RunMetrics
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
     from hsloc.analysis.second_pass import PosedEvent
-    from hsloc.evaluation import Comparison
+    from hsloc.evaluation import Comparison, RelationsResult
     from hsloc.replay.run import Result
 
     Convergence = dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -66,19 +65,17 @@ class Analysis:
 def analyse(
     result: Result,
     *,
-    alignment: str | None = None,
-    relations: Path | None = None,
     observer: Callable[[PosedEvent], None] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Analysis:
     """Read the scans of the log a second time, and measure how well they, the map and the reference agree.
 
-    `alignment` of the trajectory with the reference is by default none on a given map, and se2 on a built one, whose
-    frame is its own. `relations` is a file for the metric [K]. `observer` sees each event of the second pass, for a
+    Alignment with the reference and relations are those of the request; the alignment is by default none on a given
+    map, and se2 on a built one, whose frame is its own. `observer` sees each event of the second pass, for a
     recording of it. Raises EvaluationError for relations that cannot be used, and LogError where the log has changed.
     """
-    scans, config, lasers = len(result.diagnostics), result.spec.config, len(result.summary.lasers)
-    likelihood, matcher = _likelihood(result), config.make_matcher()
+    scans, spec, lasers = len(result.diagnostics), result.spec, len(result.summary.lasers)
+    likelihood, matcher = _likelihood(result), spec.matcher
     residuals = Residuals(result.grid)
     check = ExtrinsicsCheck(likelihood, matcher, scans, lasers)
     sample = ConvergenceSample(likelihood, matcher, scans)
@@ -88,7 +85,7 @@ def analyse(
         if posed.localised and isinstance(posed.event, PairedScan):
             for statistics in (residuals, check, sample):
                 statistics.add(posed.event.scan, posed.T_map_base)
-    errors = _Errors(result, alignment or ("se2" if result.mode == "slam" else "none"))
+    errors = _Errors(result, spec.alignment or ("se2" if result.mode == "slam" else "none"))
     warnings = (*result.warnings, *quality_warnings(result), *residuals.warnings(), *check.warnings())
     reasons = verdict_reasons(result, warnings)
     metrics = RunMetrics(
@@ -108,20 +105,25 @@ def analyse(
         localised_only=_metrics_of(errors.localised),
         localised_only_error=errors.localised_reason,
         odometry_alone=_metrics_of(errors.odometry_alone),
-        relations=None if relations is None else evaluate_relations(result.trajectory, read_relations(relations)),
+        relations=_relations(result),
     )
     return Analysis(
-        metrics, errors.whole, errors.odometry_alone, errors.odometry, sample.curves(config.matcher.upper())
+        metrics, errors.whole, errors.odometry_alone, errors.odometry, sample.curves(spec.matcher_name.upper())
     )
 
 
 def _likelihood(result: Result) -> LikelihoodField | None:
     """The field that was matched on, else one of the built map, which may take seconds; None where nothing needs it."""
-    needed = isinstance(result.spec.config.make_matcher(), HarmonySearch) or len(result.summary.lasers) > 1
+    needed = isinstance(result.spec.matcher, HarmonySearch) or len(result.summary.lasers) > 1
     if not needed or not result.grid.occupied().any():
         return None
     parameters = result.spec.config.likelihood_field
     return result.likelihood or LikelihoodField.from_grid(result.grid, parameters.sigma)
+
+
+def _relations(result: Result) -> RelationsResult | None:
+    path = result.spec.relations
+    return None if path is None else evaluate_relations(result.trajectory, read_relations(path))
 
 
 class _Errors:

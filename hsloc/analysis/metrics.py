@@ -46,7 +46,7 @@ def run_identity(result: Result) -> RunIdentity:
         map=_map_name(result),
         seed=spec.seed,
         preset=spec.preset,
-        matcher=spec.config.matcher,
+        matcher=result.matcher_name,
     )
 
 

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from hsloc.log import Conversion, LogSummary
 
 HELP = "convert a log to MCAP"
+EXAMPLES = """
+  hsloc convert intel.clf intel.mcap
+  hsloc convert bag_folder run.mcap --start 10 --duration 60
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

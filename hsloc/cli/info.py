@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from hsloc.model import Pose2
 
 HELP = "say what is in a log"
+EXAMPLES = """
+  hsloc info run.mcap
+  hsloc info bag_folder --quick --json
+"""
 
 YEAR_2000_NS = 946_684_800_000_000_000
 

@@ -25,6 +25,11 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound="DataclassInstance")
 
 HELP = "drive a simulated robot and write its log"
+EXAMPLES = """
+  hsloc record office.mcap --world office --seed 3
+  hsloc record floor.mcap --world floor.yaml --waypoints path.txt
+  hsloc record --list
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

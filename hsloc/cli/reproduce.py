@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from hsloc.reproduction import Material
 
 HELP = "run the experiments of the papers again"
+EXAMPLES = """
+  hsloc reproduce                              all experiments, about an hour
+  hsloc reproduce E1 --seeds 20 --out results/e1
+"""
 
 _EXPERIMENTS = ("E1", "E2", "E3", "E4", "M1")
 

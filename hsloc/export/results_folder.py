@@ -51,8 +51,6 @@ def write_results(
     folder: Path,
     *,
     overwrite: bool = False,
-    alignment: str | None = None,
-    relations: Path | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> WrittenResults:
     """Analyse the result and write it into `folder`, which must not exist yet unless `overwrite`.
@@ -64,7 +62,7 @@ def write_results(
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
         partial.mkdir(parents=True)
-        written = _write(result, partial, alignment, relations, progress)
+        written = _write(result, partial, progress)
         if folder.exists():
             shutil.rmtree(folder)
         partial.rename(folder)
@@ -89,16 +87,10 @@ def refuse_folder(folder: Path, overwrite: bool) -> None:
         raise OutputError(f"{folder}: holds no results of hsloc, so it is not overwritten; choose another --out")
 
 
-def _write(
-    result: Result,
-    folder: Path,
-    alignment: str | None,
-    relations: Path | None,
-    progress: Callable[[float], None] | None,
-) -> WrittenResults:
+def _write(result: Result, folder: Path, progress: Callable[[float], None] | None) -> WrittenResults:
     begin = time.perf_counter()
     with RunRecording(result, folder / "run.mcap") as recording:
-        analysis = analyse(result, alignment=alignment, relations=relations, observer=recording.add, progress=progress)
+        analysis = analyse(result, observer=recording.add, progress=progress)
     seconds = {"analyse": time.perf_counter() - begin - recording.seconds, "run_mcap": recording.seconds}
     begin = time.perf_counter()
     write_tum(folder / "trajectory.tum", result.trajectory)

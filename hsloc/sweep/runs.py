@@ -19,6 +19,7 @@ from hsloc.config import to_dict
 from hsloc.errors import HslocError
 from hsloc.export.results_folder import write_results
 from hsloc.log import open_log
+from hsloc.options import OPTIONS
 from hsloc.replay.map_sources import map_file, state_file
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
@@ -70,11 +71,14 @@ class Outcome:
 
 def plan(
     logs: Sequence[Path | Sequence[Path]],
-    configs: Mapping[str, Config],
+    configs: Mapping[str, Config | tuple[str, Config]],
     seeds: Iterable[int] = (0,),
     **common: Any,
 ) -> list[SweepRun]:
-    """All combinations; a sequence of paths is one log in parts. `common` are further fields of `RunRequest`."""
+    """All combinations; a sequence of paths is one log in parts. `common` are further options, or `read`.
+
+    A configuration may come with the name of its preset.
+    """
     runs: list[SweepRun] = []
     seeds = list(seeds)
     labels: dict[str, int] = {}
@@ -84,9 +88,11 @@ def plan(
         labels[label] = labels.get(label, 0) + 1
         if labels[label] > 1:
             label = f"{label}-{labels[label]}"
-        for name, config in configs.items():
+        for name, item in configs.items():
+            preset, config = item if isinstance(item, tuple) else ("default", item)
             for seed in seeds:
-                spec = RunRequest(logs=parts, config=config, seed=seed, **common)
+                values = {**common, "preset": preset, "config": config, "seed": seed}
+                spec = RunRequest.from_values(parts, values)
                 runs.append(SweepRun(f"{label}-{name}-seed{seed}".replace("/", "_"), label, name, spec))
     return runs
 
@@ -191,9 +197,11 @@ def run_key(spec: RunRequest, hashes: dict[Path, str] | None = None) -> str:
     """
     hashes = {} if hashes is None else hashes
     values: dict[str, Any] = {"hsloc": __version__}
+    limits = {option.target for option in OPTIONS if option.place == "check"}
     for item in fields(spec):
-        value = getattr(spec, item.name)
-        values[item.name] = to_dict(value) if item.name != "logs" else [path.name for path in value]
+        if item.name not in limits:  # They decide no file.
+            value = getattr(spec, item.name)
+            values[item.name] = to_dict(value) if item.name != "logs" else [path.name for path in value]
     if spec.map_path is not None:
         values["map_path"] = [
             spec.map_path.name,
@@ -201,6 +209,9 @@ def run_key(spec: RunRequest, hashes: dict[Path, str] | None = None) -> str:
         ]
     if spec.resume is not None:
         values["resume"] = [spec.resume.name, _digest(state_file(spec.resume), hashes)]
+    for name, path in (("relations", spec.relations), ("reference", spec.reference)):
+        if path is not None and Path(path).is_file():
+            values[name] = [Path(path).name, _digest(Path(path), hashes)]
     values["input"] = [_log_digest(path, hashes) for path in spec.logs]
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 

@@ -18,6 +18,7 @@ import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hsloc.options import BY_NAME
 from hsloc_service.execution import limits
 
 if TYPE_CHECKING:
@@ -66,9 +67,8 @@ def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, 
 
     report("open", 0.0, 1.0, 0)
     spec = make_spec(job, folder)
-    relations = None if job.get("relations") is None else folder / "relations" / job["relations"]
-    if relations is not None:
-        read_relations(relations)  # what cannot be read is told now, not after an hour of replay
+    if spec.relations is not None:
+        read_relations(spec.relations)  # what cannot be read is told now, not after an hour of replay
 
     def replayed(progress: Progress) -> None:
         report(progress.phase, progress.done_s, progress.total_s, progress.scans)
@@ -81,8 +81,6 @@ def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, 
     written = write_results(
         result,
         folder / "output",
-        alignment=job["request"].get("alignment"),
-        relations=relations,
         progress=lambda share: report("write", share, 1.0, scans),
     )
     write_viewer(result, written.analysis, folder / "output")
@@ -121,36 +119,18 @@ def _shortened(values: dict[str, Any]) -> dict[str, Any]:
 
 def make_spec(job: Mapping[str, Any], folder: Path) -> RunRequest:
     """The run that the job asks for. Raises ConfigError or MapError for what does not fit."""
-    from dataclasses import replace
-
-    from hsloc.config import Config, from_dict, preset
-    from hsloc.log import ReadOptions
-    from hsloc.model.pose2 import Pose2, wrap_angle
     from hsloc.request import RunRequest
 
     request = job["request"]
-    config = from_dict(Config, request.get("config") or {}, preset(request["preset"]))
-    chosen = {name: request[name] for name in ("matcher", "mapper") if request.get(name) is not None}
-    config = replace(config, **chosen)
-    pose = request.get("initial_pose")
-    read = request.get("read") or {}
-    laser = read.get("laser_pose")
-    options = {key: value for key, value in read.items() if key != "laser_pose"}
-    return RunRequest(
-        logs=tuple(folder / place for place in job["logs"]),
-        resume=None if job.get("resume") is None else folder / job["resume"],
-        map_path=None if job.get("map") is None else linked_map(folder, job["map"], job["map_image"]),
-        config=config,
-        read=ReadOptions(
-            **options, laser_pose=None if laser is None else Pose2(laser[0], laser[1], wrap_angle(laser[2]))
-        ),
-        initial_pose=None if pose is None else Pose2(pose[0], pose[1], wrap_angle(pose[2])),
-        unknown_start=request["unknown_start"],
-        seed=request["seed"],
-        preset=request["preset"],
-        mode=request.get("mode", "auto"),
-        no_odometry=request.get("no_odometry", False),
+    values = {name: request.get(name) for name in BY_NAME if name not in ("map", "resume")} | (
+        request.get("read") or {}
     )
+    values |= {name: folder / name / job[name] for name in BY_NAME if BY_NAME[name].is_upload and job.get(name)}
+    if job.get("map") is not None:
+        values["map"] = linked_map(folder, job["map"], job["map_image"])
+    if job.get("resume") is not None:
+        values["resume"] = folder / job["resume"]
+    return RunRequest.from_values([folder / place for place in job["logs"]], {**values, "bare_names": True})
 
 
 def linked_map(folder: Path, name: str, image: str) -> Path:
@@ -200,7 +180,7 @@ def explain(error: Exception) -> dict[str, Any]:
 
 def plain_names(text: str) -> str:
     """A message with the files' own names: the folder is the server's business, and differs from run to run."""
-    return re.sub(rf"{re.escape(str(Path.cwd()))}/(?:(?:input(?:-\d+)?|map|relations|output)/)?", "", text)
+    return re.sub(rf"{re.escape(str(Path.cwd()))}/(?:(?:input(?:-\d+)?|map|relations|reference|output)/)?", "", text)
 
 
 def _throttled(tell: Callable[[dict[str, Any]], None]) -> Callable[[str, float, float, int], None]:

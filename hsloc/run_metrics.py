@@ -11,9 +11,10 @@ import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from hsloc.dataclass_json import Measured, from_json, json_schema, to_json
+from hsloc.dataclass_json import from_json, json_schema, to_json
 from hsloc.errors import HslocError
-from hsloc.evaluation import Evaluation, PoseStatistics, RelationsResult, RelativeError
+from hsloc.evaluation import RelationsResult
+from hsloc.evaluation.error_metrics import ErrorMetrics
 from hsloc.evaluation.map_quality import Crispness, MapComparison
 from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.slam.result import MappingQuality
@@ -196,85 +197,6 @@ class LossMetrics:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlanarValues:
-    """A value for each degree of freedom in the plane."""
-
-    x: float
-    """Along x [m]."""
-    y: float
-    """Along y [m]."""
-    theta: float
-    """Of the heading [rad]."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PathLengths:
-    """Lengths of the compared trajectories."""
-
-    reference: float
-    """Length of the reference [m]."""
-    estimate: float
-    """Length of the estimate [m]."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ErrorMetrics:
-    """Errors of a trajectory against the reference, by the definitions of evo."""
-
-    alignment: str
-    """How the estimate was aligned with the reference: none, origin or se2."""
-    alignment_transform: PlanarValues
-    """The alignment, as the pose of the estimate's frame in the reference's frame."""
-    association: str
-    """How poses were paired: nearest in time, or by interpolation of the denser trajectory."""
-    t_max_diff: float
-    """Largest time difference of a pair [s]."""
-    t_offset: float
-    """Time added to the stamps of the estimate [s]."""
-    matched: int
-    """Number of pairs."""
-    unmatched_reference: int
-    """Number of reference poses without a partner."""
-    unmatched_estimate: int
-    """Number of estimated poses without a partner."""
-    ape: PoseStatistics
-    """Absolute pose error."""
-    rpe: RelativeError
-    """Relative pose error from pair to pair."""
-    rpe_1m: RelativeError
-    """Relative pose error over pieces of 1 m."""
-    rpe_1s: RelativeError
-    """Relative pose error over pieces of 1 s."""
-    axis_rmse: PlanarValues
-    """Root mean square error of each axis."""
-    path_length: PathLengths
-    """Lengths of both trajectories."""
-
-    @staticmethod
-    def of(found: Evaluation) -> ErrorMetrics:
-        """Of an evaluation with RPE per frame, per metre and per second."""
-        moved = found.T_reference_estimate
-        per_frame, per_metre, per_second = found.rpe
-        x, y, theta = found.axis_rmse
-        return ErrorMetrics(
-            alignment=found.alignment,
-            alignment_transform=PlanarValues(x=moved.x, y=moved.y, theta=moved.theta),
-            association=found.association,
-            t_max_diff=found.max_difference_s,
-            t_offset=found.offset_s,
-            matched=found.matched,
-            unmatched_reference=found.unmatched_reference,
-            unmatched_estimate=found.unmatched_estimate,
-            ape=found.ape,
-            rpe=per_frame,
-            rpe_1m=per_metre,
-            rpe_1s=per_second,
-            axis_rmse=PlanarValues(x=x, y=y, theta=theta),
-            path_length=PathLengths(reference=found.length_reference, estimate=found.length_estimate),
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RunMetrics:
     """What a run measured. The same run gives the same bytes: wall times are in timings.json.
 
@@ -385,9 +307,6 @@ def write_schemas(folder: Path) -> None:
     """Write the schema as docs/schemas has it."""
     text = json.dumps(schema(), indent=2, ensure_ascii=False) + "\n"
     (folder / "run-metrics.json").write_text(text, encoding="utf-8")
-
-
-__all__ = ["SCHEMA_VERSION", "ErrorMetrics", "Measured", "RunMetrics", "RunTimings", "schema"]
 
 
 if __name__ == "__main__":

@@ -23,12 +23,13 @@ from hsloc.analysis.second_pass import posed_events
 from hsloc.errors import EvaluationError
 from hsloc.evaluation import evaluate_relations, read_relations
 from hsloc.evaluation.association import interpolate_poses
+from hsloc.evaluation.error_metrics import ErrorMetrics
 from hsloc.evaluation.metrics import compare_run
 from hsloc.model.events import PairedScan
 from hsloc.model.pose2 import Pose2, compose_poses
 from hsloc.model.trajectory import Trajectory
 from hsloc.model.verdict import verdict_of
-from hsloc.run_metrics import ErrorMetrics, RunMetrics
+from hsloc.run_metrics import RunMetrics
 
 if TYPE_CHECKING:
     from collections.abc import Callable

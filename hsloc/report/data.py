@@ -35,20 +35,23 @@ class Curve:
 
     def thinned(self, most: int) -> Curve:
         """At most about `most` points, of which each stretch's lowest and highest are kept: no peak is lost."""
-        n = len(self.seconds)
-        if n <= most:
-            return self
-        edges = np.linspace(0, n, max(most // 2, 1) + 1).astype(int)
-        start, stretch = edges[:-1], np.repeat(np.arange(len(edges) - 1), np.diff(edges))
-        known = np.isfinite(self.values)
-        # By stretch, and within it by value; the sort is stable, so that of equal values the first counts.
-        lowest, highest = (
-            np.lexsort((np.where(known, sign * self.values, np.inf), stretch))[start] for sign in (1.0, -1.0)
-        )
-        nothing = ~np.logical_or.reduceat(known, start)
-        lowest[nothing] = highest[nothing] = start[nothing]
-        rows = np.unique(np.concatenate(([0, n - 1], lowest, highest)))
+        rows = peak_rows(self.values, most)
         return Curve(self.seconds[rows], self.values[rows])
+
+
+def peak_rows(values: Floats, most: int) -> NDArray[np.intp]:
+    """Rows of at most about `most` of n values in order: the lowest and highest of each stretch, and both ends."""
+    n = len(values)
+    if n <= most:
+        return np.arange(n)
+    edges = np.linspace(0, n, max(most // 2, 1) + 1).astype(int)
+    start, stretch = edges[:-1], np.repeat(np.arange(len(edges) - 1), np.diff(edges))
+    known = np.isfinite(values)
+    # By stretch, and within it by value; the sort is stable, so that of equal values the first counts.
+    lowest, highest = (np.lexsort((np.where(known, sign * values, np.inf), stretch))[start] for sign in (1.0, -1.0))
+    nothing = ~np.logical_or.reduceat(known, start)
+    lowest[nothing] = highest[nothing] = start[nothing]
+    return np.unique(np.concatenate(([0, n - 1], lowest, highest)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,9 +26,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.evaluation import Comparison
+    from hsloc.evaluation.error_metrics import ErrorMetrics
     from hsloc.model import OccupancyGrid, ScanDiagnostics, Trajectory
     from hsloc.report.data import ReportData
-    from hsloc.run_metrics import ErrorMetrics, LaserMetrics, RunMetrics
+    from hsloc.run_metrics import LaserMetrics, RunMetrics
 
     Floats = NDArray[np.float64]
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hsloc.analysis import analyse
+from hsloc.evaluation import compare
 from hsloc.log import ReadOptions
 from hsloc.model import Trajectory
 from hsloc.replay.run import run
@@ -42,6 +43,18 @@ def test_no_error_is_made_up_where_the_reference_has_a_gap(hall, tmp_path):
     assert len(times) == metrics.errors.matched
     assert max(shown["errors"]["position"]) == pytest.approx(metrics.errors.ape.trans_part.max, abs=1e-4)
     assert max(shown["errors"]["heading"]) == pytest.approx(metrics.errors.ape.angle_deg.max, abs=1e-4)
+
+
+def test_no_peak_is_left_out_of_a_long_run(hall, tmp_path):
+    reference = Trajectory(np.arange(40_000, dtype=np.int64) * 20_000_000, np.zeros((40_000, 3)))
+    poses = np.zeros((40_000, 3))
+    poses[12_345, 0], poses[34_567, 2] = 7.0, 1.0
+    comparison = compare(Trajectory(reference.stamps_ns, poses), reference)
+    write_viewer(hall, replace(analyse(hall), comparison=comparison), tmp_path)
+    shown = json.loads((tmp_path / "viewer.json").read_text())["errors"]
+    assert len(shown["t"]) <= 3000
+    assert max(shown["position"]) == 7.0
+    assert max(shown["heading"]) == pytest.approx(np.degrees(1.0), abs=1e-3)
 
 
 def test_odometry_and_reference_are_those_of_the_report(hall, tmp_path):

@@ -6,9 +6,9 @@ from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from hsloc.evaluation.error_metrics import ErrorMetrics
 from hsloc.model.verdict import Verdict
 from hsloc.run_metrics import (
-    ErrorMetrics,
     EvaluationCounts,
     FitnessMetrics,
     LaserMetrics,

@@ -144,4 +144,4 @@ def test_the_same_command_writes_the_same_bytes(tmp_path, threads):
     same, different, missing = filecmp.cmpfiles(tmp_path / "here", tmp_path / "there", names, shallow=False)
     assert (different, missing) == ([], [])
     assert len(same) == len(names)
-    assert found["scans"]["total"] == 601
+    assert found.metrics.scans.total == 601

@@ -9,6 +9,7 @@ import numpy as np
 
 from hsloc.model.pose2 import compose_poses
 from hsloc.model.trajectory import Trajectory
+from hsloc.report.data import peak_rows
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -70,11 +71,13 @@ def _draw_map(result: Result, path: Path) -> dict[str, Any]:
 
 
 def _errors(comparison: Comparison, start: int) -> dict[str, list[float | None]]:
-    """Distance (m) and heading difference (deg) of each pair that metrics.json counts."""
+    """Distance (m) and heading difference (deg) of the pairs that metrics.json counts; no peak is left out."""
     order = np.argsort(comparison.pairs.stamps_ns, kind="stable")
     seconds = (comparison.pairs.stamps_ns[order] - start) / 1e9
-    errors = comparison.errors
-    return _columns(seconds, position=errors.trans_part[order], heading=errors.angle_deg[order])
+    position, heading = comparison.errors.trans_part[order], comparison.errors.angle_deg[order]
+    each = POSES // 2 - 4  # room for the ends of both
+    rows = np.union1d(peak_rows(position, each), peak_rows(heading, each))
+    return _columns(seconds[rows], position=position[rows], heading=heading[rows])
 
 
 def _path(trajectory: Trajectory, start: int) -> dict[str, list[float | None]]:

@@ -60,6 +60,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, float, int], None]) -> dict[str, Any]:
     """Replay and write the results into `folder/output`; returns the summary for the job's row."""
+    from hsloc.analysis.limits import exceeded_limits
     from hsloc.evaluation import read_relations
     from hsloc.export.results_folder import write_results
     from hsloc.replay.run import run
@@ -84,7 +85,9 @@ def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, 
         progress=lambda share: report("write", share, 1.0, scans),
     )
     write_viewer(result, written.analysis, folder / "output")
-    return summarise(written.metrics, written.timings)
+    limits = exceeded_limits(spec, written.metrics)
+    found = {"outcome": "below_threshold" if limits else "ok", "limits": [line[:500] for line in limits]}
+    return found | summarise(written.metrics, written.timings)
 
 
 _SUMMARISED = ("verdict", "run", "log", "scans", "localised", "ape", "relations", "losses")

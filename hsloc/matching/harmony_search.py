@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import ceil, log, radians
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 
 import numpy as np
 
-from hsloc.errors import ConfigError
 from hsloc.kernels.fitness import normal_equations
 from hsloc.kernels.search import STOPPED_AGREEMENT, SearchParameters, search, search_boxes
 from hsloc.matching.covariance import match_covariance
 from hsloc.matching.match import Match, StopReason
+from hsloc.parameters import LARGEST, Count, CountOrNone, Parameters, Positive, Range, Ratio
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -31,7 +31,7 @@ _ONE_BASIN = 0.2 * 0.2 * radians(8.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HarmonySearch:
+class HarmonySearch(Parameters):
     """Harmony Search; the algorithm is its parameters.
 
     A memory of `memory_size` poses (HMS), the prediction first, the others uniform in the box. Each improvisation takes
@@ -56,29 +56,32 @@ class HarmonySearch:
     PAPER_BUDGET: ClassVar[int] = 250
     """NI of the scan matching in [P] and [M]."""
 
-    memory_size: int = 30
-    consideration_rate: float = 0.88
-    par_min: float = 0.55
-    par_max: float = 0.98
-    bandwidth_max: float = 0.3
-    bandwidth_min: float = 0.003
+    memory_size: Annotated[int, Range(2, LARGEST)] = 30
+    """Number of poses in the harmony memory (HMS)."""
+    consideration_rate: Ratio = 0.88
+    """Probability that a coordinate is taken from the memory (HMCR); otherwise it is uniform in the window."""
+    par_min: Ratio = 0.55
+    """Probability at the beginning that a coordinate from the memory is moved (PAR)."""
+    par_max: Ratio = 0.98
+    """Probability at the end that a coordinate from the memory is moved (PAR)."""
+    bandwidth_max: Positive = 0.3
+    """Maximum move of a coordinate at the beginning, as a ratio to the window's half-width or in metres and radians."""
+    bandwidth_min: Positive = 0.003
+    """Maximum move of a coordinate at the end, as a ratio to the window's half-width or in metres and radians."""
     relative_bandwidth: bool = True
-    budget: int = 240
+    """Whether the bandwidths are ratios to the window's half-width; otherwise they are metres and radians alike."""
+    budget: Count = 240
+    """Number of fitness evaluations in each restart (NI, NFE)."""
     count_improvisations: bool = False
-    restarts: int = 24
-    agreement: int = 2
-    search_points: int = 80
-    polish_iterations: int = 15
-
-    def __post_init__(self) -> None:
-        check(self.memory_size >= 2, "memory_size", self.memory_size, "at least 2")
-        for name in ("consideration_rate", "par_min", "par_max"):
-            check(0.0 <= getattr(self, name) <= 1.0, name, getattr(self, name), "in [0, 1]")
-        check(self.bandwidth_max > 0.0, "bandwidth_max", self.bandwidth_max, "positive")
-        check(self.bandwidth_min > 0.0, "bandwidth_min", self.bandwidth_min, "positive")
-        for name in ("budget", "restarts", "agreement", "search_points"):
-            check(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        check(self.polish_iterations >= 0, "polish_iterations", self.polish_iterations, "0 or more")
+    """Whether the budget counts improvisations alone; otherwise it counts every fitness evaluation."""
+    restarts: Count = 24
+    """Maximum number of searches in a match."""
+    agreement: Count = 2
+    """Number of restarts with the same best pose that end a match; larger windows ask for more."""
+    search_points: Count = 80
+    """Maximum number of points of a scan that the search uses; the result is refined on all of them."""
+    polish_iterations: CountOrNone = 15
+    """Maximum number of Gauss-Newton steps at the end of each restart, and on all points at the end of a match."""
 
     @classmethod
     def paper(cls) -> Self:
@@ -166,12 +169,6 @@ class HarmonySearch:
             agreement=self.agreement + _more_to_agree(window),
             polish_iterations=self.polish_iterations,
         )
-
-
-def check(ok: bool, name: str, value: object, rule: str) -> None:
-    """Raise ConfigError for a parameter outside its range."""
-    if not ok:
-        raise ConfigError(f"matcher: {name} is {value}; it must be {rule}")
 
 
 def half_widths_in(field: LikelihoodField, window: Window) -> F64:

@@ -15,6 +15,7 @@ import numpy as np
 from hsloc.errors import ConfigError
 from hsloc.kernels.normal_equations import add_edges, assemble_pairs
 from hsloc.model.pose2 import wrap_angles
+from hsloc.parameters import Count, CountOrNone, NonNegative, Parameters, Positive
 from hsloc.slam.pose_graph import apply_increment, solve_anchored
 from hsloc.slam.sparse_solver import BlockSystem
 
@@ -31,40 +32,36 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JointRegistrationParameters:
-    """Which scans are compared, and how they are pulled onto each other."""
+class JointRegistrationParameters(Parameters):
+    """Which scans are compared, and how their differences are weighted."""
 
-    radius: float = 3.0
-    """Scans taken so near to each other are compared (m)."""
-    max_partners: int = 8
-    """Each scan chooses so many of them, of different places and headings."""
-    max_scans_per_view: int = 16
-    """Of more scans of one place and heading, so many stand for all: a room crossed all day is known by then."""
-    temporal: int = 3
-    """And is compared with so many scans before it."""
-    gates: tuple[float, ...] = (0.3, 0.2, 0.15)
-    """Points farther than this from the other scan's wall are not paired (m), round by round; the last one stays."""
-    scale_of_gate: float = 0.33
-    """Scale of the Geman-McClure weight, as a part of the gate."""
-    sigma: float = 0.02
-    """Standard deviation of a point from a wall (m)."""
-    correlated_points: float = 20.0
-    """So many points count as one: neighbouring beams, and pairs of neighbouring scans, share their errors."""
-    points_per_scan: int = 90
-    """About so many hits of a scan are used."""
-    rounds: int = 6
-    """At most, in a pass."""
-    convergence_tolerance: float = 0.002
-    """Nothing moves when 99 of 100 poses move less than this (m; rad: a fifth)."""
+    radius: Positive = 3.0
+    """Maximum distance between the poses of two scans that are compared [m]."""
+    max_partners: Count = 8
+    """Maximum number of scans that each scan is compared with, each in another place or with another heading."""
+    max_scans_per_view: Count = 16
+    """Maximum number of scans with one place and heading that are used as partners."""
+    temporal: CountOrNone = 3
+    """Number of scans just before a scan that it is compared with in any case."""
+    gates: tuple[Positive, ...] = (0.3, 0.2, 0.15)
+    """Maximum distance of a point to the wall that it is paired with [m], round by round; the last one stays."""
+    scale_of_gate: Positive = 0.33
+    """Scale of the Geman-McClure weight as a ratio to the gate."""
+    sigma: Positive = 0.02
+    """Standard deviation of a point's distance to its wall [m]."""
+    correlated_points: Positive = 20.0
+    """Number of points that count as one independent measurement, as neighbouring beams share their errors."""
+    points_per_scan: Count = 90
+    """Approximate number of hits of a scan that are used."""
+    rounds: Count = 6
+    """Maximum number of rounds in a pass."""
+    convergence_tolerance: NonNegative = 0.002
+    """Step below which a pass has converged [m], the 99th percentile over the poses; angles count 5 m/rad."""
 
-    def __post_init__(self) -> None:
-        for name in ("radius", "sigma", "correlated_points", "scale_of_gate"):
-            if not getattr(self, name) > 0.0:
-                raise ConfigError(f"joint_registration: {name} is {getattr(self, name)}; it must be positive")
-        if not self.gates or min(self.gates) <= 0.0:
-            raise ConfigError(f"joint_registration: gates is {self.gates}; it must hold at least one positive length")
-        if min(self.points_per_scan, self.rounds, self.max_scans_per_view) < 1:
-            raise ConfigError("joint_registration: points_per_scan, rounds and max_scans_per_view must be at least 1")
+    def check_relations(self) -> None:
+        """At least one gate."""
+        if not self.gates:
+            raise ConfigError("JointRegistrationParameters.gates is empty; it must hold at least one length")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,6 +22,7 @@ from hsloc.matching.harmony_search import low_discrepancy_order
 from hsloc.matching.hide import Hide
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2, compose_poses, relative_poses
+from hsloc.parameters import Count, NonNegative, Parameters, Positive, Ratio
 from hsloc.slam.pose_graph import Edges, solve_edges
 
 if TYPE_CHECKING:
@@ -39,50 +40,51 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LoopParameters:
-    """Where loops are looked for, and when one is believed."""
+class LoopParameters(Parameters):
+    """Where loops are searched for, and when one is accepted."""
 
-    submap_length: float = 3.0
-    """A place is so much of the way (m)."""
-    min_path_length: float = 12.0
-    """Places nearer along the way or over loops already closed are let be (m)."""
-    search_radius: float = 3.0
-    """Places are compared that could lie so near (m)."""
-    drift: float = 0.02
-    """Assumed standard deviation of the drift, as a part of the way."""
-    drift_angle: float = radians(0.3)
-    """And of the heading, times the square root of the way in metres (rad)."""
-    sigmas: float = 3.0
-    """Half-width of the window in these standard deviations."""
-    max_candidates: int = 3
-    """Old places searched for each place, the nearest ones of different times."""
-    resolution: float = 0.1
-    """Of the field of a place (m)."""
-    sigma: float = 0.2
-    """Decay of its score (m)."""
-    scan_range: float = 15.0
-    """Hits farther away are left out (m)."""
-    min_fitness: float = 0.5
-    """Of a place's points on the other place's field."""
-    max_rival: float = 0.85
-    """Another pose may reach at most this part of the fitness."""
-    wide: float = 2.0
-    """A window with half-widths of more metres is a wide one (m): where so much is possible, more is asked."""
-    min_margin: float = 0.11
-    """In a wide window the fitness must be so much above that of any other pose."""
-    max_conflict: float = 0.1
-    """At most this part of the points may lie where the other place looked through."""
-    min_paired: float = 0.15
-    """At least this part of the points seen by the other place must lie on its walls."""
-    sigma_edge: float = 0.05
-    """Standard deviation of a loop beside that of its match (m)."""
-    sigma_edge_angle: float = radians(0.5)
-    """And of its angle (rad)."""
-    robust: float = 2.0
-    """Scale of Cauchy's weight on chi."""
+    submap_length: Positive = 3.0
+    """Path length of a submap [m]."""
+    min_path_length: NonNegative = 12.0
+    """Minimum path length between two submaps that are compared [m], measured over accepted loops as well."""
+    search_radius: NonNegative = 3.0
+    """Distance between two submaps up to which they are compared [m], to which the assumed drift is added."""
+    drift: NonNegative = 0.02
+    """Assumed standard deviation of the drift in position per path length."""
+    drift_angle: NonNegative = radians(0.3)
+    """Assumed standard deviation of the drift in heading after 1 m [rad]; it grows with the root of the path length."""
+    sigmas: Positive = 3.0
+    """Half-width of the search window in standard deviations of the drift."""
+    max_candidates: Count = 3
+    """Maximum number of earlier submaps that are searched for each submap, the nearest ones of different times."""
+    resolution: Positive = 0.1
+    """Distance of two nodes of a submap's likelihood field [m]."""
+    sigma: Positive = 0.2
+    """Decay length of a point's score with its distance from a wall of the submap [m]."""
+    scan_range: Positive = 15.0
+    """Maximum range of the hits that are compared [m]."""
+    min_fitness: Ratio = 0.5
+    """Minimum fitness of a submap's points on the other submap's field."""
+    max_rival: Ratio = 0.85
+    """Maximum fitness of any other pose in the window as a ratio to that of the match."""
+    wide: NonNegative = 2.0
+    """Half-width above which a window counts as wide [m], so that `min_margin` applies."""
+    min_margin: Ratio = 0.11
+    """Minimum difference in a wide window between the fitness of the match and that of any other pose."""
+    max_conflict: Ratio = 0.1
+    """Maximum ratio of points that lie where the other submap saw free space."""
+    min_paired: Ratio = 0.15
+    """Minimum ratio of points in the other submap's view that lie on its walls."""
+    sigma_edge: Positive = 0.05
+    """Standard deviation of a loop edge in x and y in addition to that of its match [m]."""
+    sigma_edge_angle: Positive = radians(0.5)
+    """Standard deviation of a loop edge in heading in addition to that of its match [rad]."""
+    robust: Positive = 2.0
+    """Scale of the Cauchy weight of a loop edge, in standard deviations of its residual."""
     hide: Hide = field(
         default_factory=lambda: Hide(restarts=12, agreement=3, budget=600, memory_size=40, search_points=150)
     )
+    """Search of the window of a loop."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

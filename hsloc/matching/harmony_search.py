@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 import numpy as np
 
 from hsloc.kernels.fitness import normal_equations
-from hsloc.kernels.search import STOPPED_AGREEMENT, SearchParameters, search, search_boxes
+from hsloc.kernels.search import STOPPED_AGREEMENT, Box, Found, SearchParameters, search, search_boxes
 from hsloc.matching.covariance import match_covariance
 from hsloc.matching.match import Match, StopReason
 from hsloc.parameters import LARGEST, Count, CountOrNone, Parameters, Positive, Range, Ratio
@@ -134,8 +134,7 @@ class HarmonySearch(Parameters):
             field.packed,
             scaled,
             scaled[: self.search_points],
-            cells,
-            half_widths_in(field, windows[0]) * (1.0 / field.resolution, 1.0 / field.resolution, 1.0),
+            Box(cells, half_widths_in(field, windows[0]) * (1.0 / field.resolution, 1.0 / field.resolution, 1.0)),
             self._parameters(field, windows[0]),
             rng,
             poses,
@@ -205,13 +204,10 @@ def run_search(
         field.packed,
         scaled,
         few,
-        field.to_cells(window.centre),
-        half * (1.0 / field.resolution, 1.0 / field.resolution, 1.0),
+        Box(field.to_cells(window.centre), half * (1.0 / field.resolution, 1.0 / field.resolution, 1.0)),
         parameters,
         rng,
-        pose,
-        information,
-        history,
+        Found(pose, information, history),
     )
     if parameters.polish_iterations == 0:
         information = information_at(field, scaled, pose)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import ConfigError
-from hsloc.kernels.normal_equations import add_edges, assemble_pairs
+from hsloc.kernels.normal_equations import Equations, add_edges, assemble_pairs
 from hsloc.model.pose2 import wrap_angles
 from hsloc.parameters import Count, CountOrNone, NonNegative, Parameters, Positive
 from hsloc.slam.pose_graph import apply_increment, solve_anchored
@@ -66,7 +66,7 @@ class JointRegistrationParameters(Parameters):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """What a pass found; `counts` (m, 5) of the pairs (m, 2) as in `kernels.surfels.pair_terms`."""
+    """What a pass found; `counts` (m, 5) of the pairs (m, 2) as in `kernels.point_to_line.pair_terms`."""
 
     poses: F64
     pairs: I64
@@ -101,7 +101,7 @@ def refine(
     system = BlockSystem(
         len(poses), np.concatenate((pairs[:, 0], edges.pairs[:, 0])), np.concatenate((pairs[:, 1], edges.pairs[:, 1]))
     )
-    chosen, chosen_start = scans.chosen(p.points_per_scan)
+    arrays = scans.arrays(p.points_per_scan)
     weights = np.full(len(pairs), 1.0 / (p.sigma**2 * p.correlated_points))
     counts = np.zeros((len(pairs), 5))
     pair_blocks, edge_blocks = np.empty((len(pairs), 3, 3)), np.empty((len(edges), 3, 3))
@@ -109,12 +109,10 @@ def refine(
     for rounds in range(1, p.rounds + 1):
         gate = p.gates[min(rounds, len(p.gates)) - 1]
         diagonal, right = np.zeros((len(poses), 3, 3)), np.zeros((len(poses), 3))
-        add_edges(poses, edges.pairs, edges.measured, edges.information, edges.scale, diagonal, edge_blocks, right)
-        assemble_pairs(
-            poses, pairs, weights, scans.points, scans.normals, scans.centroids, scans.start, scans.hit_of_beam,
-            scans.ranges, scans.table_start, scans.geometry, chosen, chosen_start, gate, p.scale_of_gate * gate,
-            diagonal, pair_blocks, right, counts,
-        )  # fmt: skip
+        of_edges = Equations(diagonal, edge_blocks, right)
+        add_edges(poses, edges.pairs, edges.measured, edges.information, edges.scale, of_edges)
+        of_pairs = Equations(diagonal, pair_blocks, right)
+        assemble_pairs(poses, pairs, weights, arrays, gate, p.scale_of_gate * gate, of_pairs, counts)
         step = solve_anchored(system, diagonal, np.concatenate((pair_blocks, edge_blocks)), right)
         poses = apply_increment(poses, step)
         moved = moved_scans(step)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.point_to_line import choose_hits, fit_surfels
+from hsloc.kernels.point_to_line import ScanArrays, choose_hits, fit_surfels
 from hsloc.model.events import Scan
 from hsloc.model.pose2 import Pose2
 
@@ -119,8 +119,15 @@ class KeyScans:
         """Hits of a scan in the base's frame, shape (n, 2)."""
         return self.points[self.start[index] : self.start[index + 1]]
 
+    def arrays(self, most: int) -> ScanArrays:
+        """All of it for the kernels, with about `most` chosen hits of each scan."""
+        return ScanArrays(
+            self.points, self.normals, self.centroids, self.start, self.hit_of_beam, self.ranges, self.table_start,
+            self.geometry, *self.chosen(most),
+        )  # fmt: skip
+
     def chosen(self, most: int) -> tuple[I32, I64]:
-        """About `most` hits of each scan, evenly by the directions of their walls (`kernels.surfels.choose_hits`).
+        """About `most` hits of each scan, evenly by the directions of their walls (`choose_hits`).
 
         Returns the rows within each scan, one scan after the other, and where each begins, shape (n + 1,).
         """

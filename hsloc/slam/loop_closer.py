@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.branch_and_bound import best_on_lattice, pool
-from hsloc.kernels.point_to_line import pair_terms
+from hsloc.kernels.branch_and_bound import Excluded, Lattice, best_on_lattice, pool
+from hsloc.kernels.point_to_line import Term, pair_terms
 from hsloc.matching.harmony_search import low_discrepancy_order
 from hsloc.matching.hide import Hide
 from hsloc.matching.window import Window
@@ -139,7 +139,7 @@ class LoopCloser:
         self.poses = places.poses[places.reference].copy()
         self.loops = [loop for loop in known if (loop.first, loop.second) not in banned]
         self._first = first
-        self._chosen = scans.chosen(_COMPARED)
+        self._arrays = scans.arrays(_COMPARED)
         self._fields: dict[int, tuple[LikelihoodField, NDArray[np.float32]]] = {}
 
     @property
@@ -291,20 +291,20 @@ class LoopCloser:
         near = np.array((1.0, 1.0, step))
         nowhere = np.array((-1.0, -1.0, -1.0))
         here, found = likelihood.to_cells(pose), np.empty(3)
-        own, _ = best_on_lattice(pooled[:1], few, here, near, step / 2.0, here, nowhere, 0.0, _VISITS, found)
+        finer = Lattice(here, near, step / 2.0)
+        own, _ = best_on_lattice(pooled[:1], few, finer, Excluded(here, nowhere), 0.0, _VISITS, found)
         if own <= 0.0:
             return float("nan")
         needed = 0.7 * own
         box = np.array((ceil(half / cell), ceil(half / cell), half_angle))
         distinct = np.array((_DISTINCT[0] / cell, _DISTINCT[0] / cell, _DISTINCT[1]))
-        other, _ = best_on_lattice(
-            pooled, few, likelihood.to_cells(centre), box, step, here, distinct, needed, _VISITS, found
-        )
+        lattice = Lattice(likelihood.to_cells(centre), box, step)
+        other, _ = best_on_lattice(pooled, few, lattice, Excluded(here, distinct), needed, _VISITS, found)
         return float("nan") if other < 0.0 else float(other / own)
 
     def _compare(self, old: int, place: int, pose: Pose2) -> tuple[float, float]:
         """Of the points that either place sees of the other: the part on walls, the part where it looked through."""
-        places, s = self._places, self._scans
+        places = self._places
         first, second = places.members(old, 1), places.members(place, 1)
         T_old = compose_poses(
             np.zeros(3),
@@ -319,7 +319,7 @@ class LoopCloser:
                 places.poses[second.start : second.stop],
             ),
         )
-        information, gradient, counts, total = np.empty((3, 3)), np.empty(3), np.zeros(5), np.zeros(5)
+        term, counts, total = Term(np.empty((3, 3)), np.empty(3)), np.zeros(5), np.zeros(5)
         for a in range(0, len(first), max(len(first) // 7, 1)):
             for b in range(0, len(second), max(len(second) // 7, 1)):
                 for i, j, x, y in (
@@ -327,10 +327,7 @@ class LoopCloser:
                     (first[a], second[b], T_old[a], T_new[b]),
                 ):
                     rel = relative_poses(y[None], x[None])[0]
-                    pair_terms(
-                        i, j, rel[0], rel[1], rel[2], s.points, s.normals, s.centroids, s.start, s.hit_of_beam,
-                        s.ranges, s.table_start, s.geometry, *self._chosen, 0.3, 0.1, information, gradient, counts,
-                    )  # fmt: skip
+                    pair_terms(i, j, rel, self._arrays, 0.3, 0.1, term, counts)
                     total += counts
         seen = max(total[2], 1.0)
         return float(total[0] / seen), float(total[1] / seen)

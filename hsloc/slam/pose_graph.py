@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import LogFormatError, OutputError
-from hsloc.kernels.normal_equations import add_edges
+from hsloc.kernels.normal_equations import Equations, add_edges
 from hsloc.model.pose2 import wrap_angles
 from hsloc.slam.sparse_solver import BlockSystem
 
@@ -141,7 +141,8 @@ def solve_edges(poses: F64, edges: Edges, rounds: int = 20, still: float = 1e-5)
     blocks = np.empty((len(edges), 3, 3))
     for _ in range(rounds):
         diagonal, right = np.zeros((len(poses), 3, 3)), np.zeros((len(poses), 3))
-        add_edges(poses, edges.pairs, edges.measured, edges.information, edges.scale, diagonal, blocks, right)
+        equations = Equations(diagonal, blocks, right)
+        add_edges(poses, edges.pairs, edges.measured, edges.information, edges.scale, equations)
         step = solve_anchored(system, diagonal, blocks, right)
         poses = apply_increment(poses, step)
         if np.abs(step).max() < still:

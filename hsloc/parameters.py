@@ -123,6 +123,8 @@ def check(value: object, hint: Any, where: str) -> None:
             return
         hint = next(kind for kind in hint.__args__ if kind is not type(None))
     if typing.get_origin(hint) is tuple:
+        if not value:
+            raise ConfigError(f"{where} is empty; it must hold at least one value")
         for item in typing.cast("tuple[object, ...]", value):
             check(item, typing.get_args(hint)[0], where)
         return

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.errors import ConfigError
 from hsloc.kernels.normal_equations import Equations, add_edges, assemble_pairs
 from hsloc.model.pose2 import wrap_angles
 from hsloc.parameters import Count, CountOrNone, NonNegative, Parameters, Positive
@@ -57,11 +56,6 @@ class JointRegistrationParameters(Parameters):
     """Maximum number of rounds in a pass."""
     convergence_tolerance: NonNegative = 0.002
     """Step below which a pass has converged [m], the 99th percentile over the poses; angles count 5 m/rad."""
-
-    def check_relations(self) -> None:
-        """At least one gate."""
-        if not self.gates:
-            raise ConfigError("JointRegistrationParameters.gates is empty; it must hold at least one length")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -83,3 +83,8 @@ def test_what_is_no_number_is_refused(value):
 def test_a_fraction_is_no_count():
     with pytest.raises(ConfigError, match=r"Hide\.restarts is 2\.5; it must be a whole number from 1"):
         Config().hide.__class__(restarts=2.5)
+
+
+def test_a_list_must_not_be_empty():
+    with pytest.raises(ConfigError, match=r"gates is empty; it must hold at least one value"):
+        Config().graph_mapper.joint_registration.__class__(gates=())

@@ -53,6 +53,10 @@ class LocaliserParameters(Parameters):
     """Minimum ratio of an accepted match's fitness to the usual fitness, the running mean of accepted matches."""
     recovery_fitness_ratio: Ratio = 0.9
     """Minimum ratio to the usual fitness of a match in the wide window that is searched after a refused match."""
+    wide_window: Positive = 0.5
+    """Half-width of the window that is searched after a refused match [m]; wheels may slip by as much."""
+    wide_window_angle: Angle = radians(20.0)
+    """Half-width in heading of the window that is searched after a refused match [rad]."""
     max_consecutive_rejections: Count = 5
     """Number of refused matches in a row after which the pose counts as lost and the whole map is searched."""
     fuse: bool = True
@@ -65,8 +69,6 @@ class LocaliserParameters(Parameters):
     relocaliser: RelocaliserParameters = field(default_factory=RelocaliserParameters)
 
 
-_WIDER = (0.5, radians(20.0))
-"""Half-widths (m, rad) of the window tried after a refused match: what a wheel may slip."""
 _BETTER = 0.1
 """So much fitter must a match outside the window of the prediction be: ambiguous places look alike."""
 _FORGET = 0.05
@@ -167,9 +169,9 @@ class Localiser:
         if self._usual is not None and self._refusal(best):
             wide = Window(
                 predicted,
-                max(window.half_x, _WIDER[0]),
-                max(window.half_y, _WIDER[0]),
-                max(window.half_theta, _WIDER[1]),
+                max(window.half_x, p.wide_window),
+                max(window.half_y, p.wide_window),
+                max(window.half_theta, p.wide_window_angle),
             )
             match = self._matcher.match(points, self._field, wide, self._rng)
             evaluations += match.evaluations

@@ -26,6 +26,7 @@ FREE_PIXEL, UNKNOWN_PIXEL, OCCUPIED_PIXEL = 254, 205, 0
 UNKNOWN_PROBABILITY = (255 - UNKNOWN_PIXEL) / 255
 """0.19608: what pixel 205 says. A free_thresh at or above makes the unknown free."""
 MAX_CELLS = 100_000_000
+"""Maximum number of cells of a map that is read. Internal: guards the memory against a damaged file."""
 IMAGES = (".pgm", ".png", ".bmp", ".pnm")
 
 

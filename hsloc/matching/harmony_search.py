@@ -25,9 +25,12 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
 
 _GOLDEN = 0.6180339887498949
+"""The golden ratio less 1, which spreads a sequence most evenly."""
 _ALL = 10**9
+"""Number of points that no scan has."""
 _ONE_BASIN = 0.2 * 0.2 * radians(8.0)
-"""A window of +-0.2 m and 8 degrees, m^2 rad: about what one optimum of an indoor scan draws in."""
+"""Size of a window of +-0.2 m and 8 degrees (m^2 rad), about the basin of one optimum of an indoor scan. Internal:
+`agreement` is what is to be set, this scales it with the window."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
 
 _MOST_CELLS = 2e8
-"""A field needs about 30 bytes a cell while it is made: 6 GB."""
+"""Maximum number of cells of a field. Internal: 30 bytes a cell while it is made, 6 GB."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)

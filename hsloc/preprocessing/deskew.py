@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     Paired = Odometry | PairedScan | Truth
 
 _RECENT = 512
-"""Odometry messages remembered: a fifth of a second at 2.5 kHz."""
+"""Odometry messages that are kept. Internal: a fifth of a second at 2.5 kHz, longer than a sweep."""
 _WAITING = 16
-"""Scans that may wait for odometry; then what has been told must do."""
+"""Maximum number of scans that wait for odometry; then the odometry until now is used. Internal: bounds the memory."""
 _LONGEST_NS = 2_000_000_000
-"""A turn that takes longer is an error of the log."""
+"""Maximum duration of a sweep. Internal: no lidar turns more slowly, a longer one is an error of the log."""
 
 
 def deskewed(events: Iterable[Paired]) -> Iterator[Paired]:

@@ -20,12 +20,14 @@ if TYPE_CHECKING:
     Paired = Odometry | PairedScan | Truth
 
 _JITTER = 0.1
-"""Scans of n lasers are one cloud within (n - 1) / n of the slowest one's period and this part of it: where all turn
-equally fast, (n - 1) / n of it always hold a scan of each, and stamps jitter."""
+"""Tolerance for jitter of stamps as a ratio to the period.
+
+Scans of n lasers are merged within (n - 1) / n of the slowest laser's period plus this: where all turn equally fast,
+(n - 1) / n of it always contain a scan of each. Internal: it follows from how drivers stamp."""
 _USUAL_NS, _LONGEST_NS = 100_000_000, 400_000_000
-"""A laser's period before it is known, and at most."""
+"""A laser's period before it is known, and its maximum. Internal: 2D lidars turn at 5 to 40 Hz."""
 _SILENT_NS = 500_000_000
-"""A laser that has told nothing for so long is not waited for."""
+"""Silence after which a laser is not waited for. Internal: longer than the longest period."""
 
 
 def clouds(events: Iterable[Paired]) -> Iterator[Paired]:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from hsloc.slam.front_end import LocalMatch
     from hsloc.slam.keyscans import KeyScan, KeyScans
+    from hsloc.slam.loop_closer import LoopParameters
     from hsloc.slam.map_session import MapSession
     from hsloc.slam.parameters import GraphMapperParameters, Resume
     from hsloc.slam.submaps import Submaps
@@ -36,12 +37,10 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
-MAX_EDGE_CHI = 6.0
-"""A loop whose chi is larger than this once the graph is solved was wrong."""
 _MOST_TORN = 5
-"""So often at most the loops are looked for anew, each time without the worst wrong one."""
+"""Maximum number of repeated loop searches, each without the worst wrong loop. Internal: bounds the time."""
 _RESIDUAL_SCANS = 400
-"""Scans whose residuals are measured."""
+"""Scans whose residuals are measured. Internal: a sample for the metrics, no result depends on it."""
 
 
 def finish(
@@ -121,7 +120,7 @@ def _close_loops(
         banned = frozenset((loop.first, loop.second) for loop in torn)
         closer = LoopCloser(places, gathered.scans, p, rng, banned, gathered.known, gathered.first_place)
         closer.close(progress)
-        solved, edges, worst = _solved(closer, places, chain, p.robust)
+        solved, edges, worst = _solved(closer, places, chain, p)
         if worst is None or len(torn) >= _MOST_TORN:
             break
         # What was searched for after a wrong loop was searched for in wrong places: all of it once more, without it.
@@ -130,16 +129,18 @@ def _close_loops(
     while worst is not None:
         loops = [loop if loop.first != worst.first or loop.second != worst.second else worst for loop in loops]
         closer.loops = loops
-        solved, edges, worst = _solved(closer, places, chain, p.robust)
+        solved, edges, worst = _solved(closer, places, chain, p)
     return solved, [*loops, *torn], edges
 
 
-def _solved(closer: LoopCloser, places: Submaps, chain: Edges, robust: float) -> tuple[F64, Edges, Loop | None]:
+def _solved(
+    closer: LoopCloser, places: Submaps, chain: Edges, parameters: LoopParameters
+) -> tuple[F64, Edges, Loop | None]:
     """The graph of keyscans solved with the loops, and the loop that tears worst, if any does, as refused."""
-    edges = _between_keyscans(closer.loops, places, robust)
+    edges = _between_keyscans(closer.loops, places, parameters.robust)
     solved = solve_edges(places.expand(closer.poses), Edges.concatenate([chain, edges]))
     _, _, chi = edge_errors(solved, edges)
-    if not (chi > MAX_EDGE_CHI).any():
+    if not (chi > parameters.max_edge_chi).any():
         return solved, edges, None
     loop = closer.accepted[int(np.argmax(chi))]
     return solved, edges, replace(loop, accepted=False, reason=f"torn: {chi.max():.0f} sigma off, the graph solved")

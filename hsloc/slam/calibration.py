@@ -33,17 +33,17 @@ class OdometryCalibration:
 
 
 _FEWEST = 100
-"""Steps without which nothing is said."""
+"""Minimum number of steps of an estimate. Internal: with fewer its standard error is larger than usual errors."""
 _DELAYS = np.arange(-10, 11) / 10.0
-"""Delays tried (messages)."""
+"""Delays that are tried, in periods of the odometry. Internal: more than a period apart, stamps are wrong."""
 _OUTLIER = 0.1
-"""A step whose turn the scans see so differently (rad) slipped."""
+"""Difference (rad) between odometry and scans above which a step slipped. Internal: far above the noise of both."""
 _STRETCH = 20
-"""Steps in a row over which turns are compared."""
+"""Steps in a row over which rotations are compared. Internal: it averages the noise of the single steps."""
 _GAIN = 0.97
-"""A delay must bring the error of the turns below this part of what it is without one."""
+"""Ratio of the rotation error with a delay to that without one that is enough. Internal: a test of significance."""
 _WORST_SCALE = 0.15
-"""A scale farther from 1 is not believed."""
+"""Maximum difference of a scale from 1. Internal: wheels are not wrong by more, such an estimate is an artefact."""
 
 
 def calibrate(index: F64, odometry: F64, keys: I64, key_poses: F64) -> OdometryCalibration:

@@ -101,13 +101,13 @@ class LocalMatch:
 
 
 FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
-"""No motion is known better than this (m^2, rad^2)."""
+"""Least covariance of a motion (m^2, rad^2). Internal: the repeatability of a match on a 5 cm field."""
 _FORGET = 0.05
-"""Weight of a new match in the usual fitness."""
+"""Weight of a new match in the usual fitness. Internal: a memory of about 20 matches."""
 _KNOWN = 0.85
-"""A point is spared whose nearest node scores as much: the local map has one within a part of a cell."""
+"""Score of a node above which a new point is not added near it. Internal: the local map has a point there already."""
 _CONVINCING = 0.9
-"""A match in the wide window must reach this part of the usual fitness."""
+"""Minimum ratio to the usual fitness of a match in the wide window. Internal: as the localiser's default."""
 
 
 class FrontEnd:

@@ -126,8 +126,9 @@ def moved_scans(step: F64) -> float:
 
 
 _HEADINGS = 8
+"""Sectors of heading that count as different views. Internal: `max_partners` is what is to be set."""
 _AT_ONCE = 512
-"""Scans whose neighbours are listed together: of all at once the lists would fill the memory."""
+"""Scans whose neighbours are listed together. Internal: memory alone, the results are the same."""
 
 
 def neighbour_pairs(poses: F64, radius: float, most: int, temporal: int, crowd: int) -> I64:

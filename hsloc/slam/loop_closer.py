@@ -22,7 +22,7 @@ from hsloc.matching.harmony_search import low_discrepancy_order
 from hsloc.matching.hide import Hide
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2, compose_poses, relative_poses
-from hsloc.parameters import Count, NonNegative, Parameters, Positive, Ratio
+from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive, Ratio
 from hsloc.slam.pose_graph import Edges, solve_edges
 
 if TYPE_CHECKING:
@@ -79,6 +79,14 @@ class LoopParameters(Parameters):
     """Standard deviation of a loop edge in x and y in addition to that of its match [m]."""
     sigma_edge_angle: Positive = radians(0.5)
     """Standard deviation of a loop edge in heading in addition to that of its match [rad]."""
+    distinct_distance: Positive = 0.8
+    """Distance from the match beyond which another pose is a rival [m]."""
+    distinct_angle: Angle = radians(12.0)
+    """Difference in heading from the match beyond which another pose is a rival [rad]."""
+    max_edge_chi: Positive = 6.0
+    """Maximum residual of a loop edge in the solved graph, in standard deviations; a loop with more is removed."""
+    refused_path_length: NonNegative = 5.0
+    """Path length that a refused match counts as when loops are searched for [m], as it may hide a slip."""
     robust: Positive = 2.0
     """Scale of the Cauchy weight of a loop edge, in standard deviations of its residual."""
     hide: Hide = field(
@@ -106,15 +114,17 @@ class Loop:
 
 
 _CACHED = 48
-"""Fields of places kept."""
+"""Likelihood fields of submaps that are kept. Internal: memory against time, the results are the same."""
 _COMPARED = 90
-"""Points of a scan that are looked up in another."""
+"""Points of a scan that are looked up in another one. Internal: a sample that fixes ratios to some percent."""
 _VISITS = 3_000_000
-"""Bounds computed for a window before it counts as ambiguous."""
-_CONNECTED_WAY = 12.0
-"""A place that was found on the whole map is known as well as after so many metres of the way."""
-_DISTINCT = (0.8, radians(12.0))
-"""A pose farther from the match than this is another one (m, rad)."""
+"""Bounds computed for a window before it counts as ambiguous. Internal: bounds the time of one search to seconds."""
+_CONNECTED_PATH_LENGTH = 12.0
+"""Path length (m) after which a pose is as uncertain as one that the global search found. Internal: it only sizes the
+window of the first loops of a map that is extended, which are checked as all loops are."""
+_PAIR_GATE, _PAIR_SCALE = 0.3, 0.1
+"""Gate and scale (m) of the points of two submaps that are compared. Internal: a submap drifts by centimetres, so that
+a tighter gate refuses right loops, while `max_conflict` and `min_paired` are what is to be set."""
 
 
 class LoopCloser:
@@ -165,7 +175,7 @@ class LoopCloser:
         near = [
             int(old) for old in np.argsort(distance, kind="stable") if distance[old] < self._parameters.search_radius
         ]
-        return [self._search(old, place, _CONNECTED_WAY) for old in near[: self._parameters.max_candidates]]
+        return [self._search(old, place, _CONNECTED_PATH_LENGTH) for old in near[: self._parameters.max_candidates]]
 
     def edges(self) -> Edges:
         """The accepted loops as edges between the places."""
@@ -297,7 +307,7 @@ class LoopCloser:
             return float("nan")
         needed = 0.7 * own
         box = np.array((ceil(half / cell), ceil(half / cell), half_angle))
-        distinct = np.array((_DISTINCT[0] / cell, _DISTINCT[0] / cell, _DISTINCT[1]))
+        distinct = np.array((p.distinct_distance / cell, p.distinct_distance / cell, p.distinct_angle))
         lattice = Lattice(likelihood.to_cells(centre), box, step)
         other, _ = best_on_lattice(pooled, few, lattice, Excluded(here, distinct), needed, _VISITS, found)
         return float("nan") if other < 0.0 else float(other / own)
@@ -327,7 +337,7 @@ class LoopCloser:
                     (first[a], second[b], T_old[a], T_new[b]),
                 ):
                     rel = relative_poses(y[None], x[None])[0]
-                    pair_terms(i, j, rel, self._arrays, 0.3, 0.1, term, counts)
+                    pair_terms(i, j, rel, self._arrays, _PAIR_GATE, _PAIR_SCALE, term, counts)
                     total += counts
         seen = max(total[2], 1.0)
         return float(total[0] / seen), float(total[1] / seen)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
 
 VERSION = 1
+"""Version of the format of a saved map."""
 STATE_FILE = "map.npz"
 _FLAT = {
     "points": "f4", "hit_of_beam": "i4", "ranges": "f4", "point_start": "i8", "beam_start": "i8", "geometry": "f8",

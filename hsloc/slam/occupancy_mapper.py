@@ -42,6 +42,7 @@ class OccupancyMapperParameters(Parameters):
 
 
 _MOST_CELLS = 400_000_000
+"""Maximum number of cells of a map. Internal: 3.6 GB of memory."""
 
 
 def draw_grid(poses: F64, scans: KeyScans, parameters: OccupancyMapperParameters) -> OccupancyGrid:
@@ -56,7 +57,7 @@ def draw_grid(poses: F64, scans: KeyScans, parameters: OccupancyMapperParameters
     width, height = (int(n) for n in np.ceil(high / p.resolution + p.margin / p.resolution) - corner)
     if width * height > _MOST_CELLS:
         raise ConfigError(
-            f"drawing: the map would have {width} x {height} cells of {p.resolution} m; choose a larger resolution"
+            f"occupancy: the map would have {width} x {height} cells of {p.resolution} m; choose a larger resolution"
         )
     hits, misses = np.zeros((height, width), dtype=np.int32), np.zeros((height, width), dtype=np.int32)
     for k in range(len(scans)):

@@ -65,7 +65,7 @@ class PointMapperParameters(Parameters):
 
 
 _START = np.diag((1e-6, 1e-6, 1e-8))
-"""The pose of the first scan is taken as known."""
+"""Covariance of the first pose (m^2, rad^2). Internal: the map begins there, so that it is known by definition."""
 
 
 class PointMapper:

@@ -20,13 +20,10 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
 
 
-REFUSED_WAY = 5.0
-"""A refused match may hide a slip: loops are looked for as if so many metres more had been driven."""
-
 UNKNOWN_STEP = 1e6 * np.eye(3)
-"""Covariance of a step of which nothing is known (m^2, rad^2)."""
+"""Covariance of a step that nothing measured (m^2, rad^2). Internal: larger than any building."""
 _FAR = 1e4
-"""Two logs count as so many metres of the way apart, until a loop connects them."""
+"""Path length (m) between two logs that no loop connects yet. Internal: any length beyond all drift."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +42,7 @@ class Submaps:
     doubted: NDArray[np.bool_]
     """Steps (m - 1,) on which a match was refused: odometry alone, which may have slipped."""
     way: F64
-    """Metres driven until each reference, shape (m,), a refused match counting as `REFUSED_WAY` more."""
+    """Metres driven until each reference, shape (m,), with `refused_path_length` more for each refused match."""
     piece: I64
     """Shape (m,): where one log ends and the next begins the number changes; nothing is rigid across that."""
 
@@ -53,15 +50,19 @@ class Submaps:
         return len(self.reference)
 
     @staticmethod
-    def along(
+    def split_by_path_length(
         poses: F64,
         motions: F64,
         covariances: F64,
         length: float,
         turn_length: float,
         refused: NDArray[np.bool_] | None = None,
+        refused_path_length: float = 0.0,
     ) -> Submaps:
-        """Cut the way of keyscans into places of `length` metres; `motions` and `covariances` lead to each keyscan."""
+        """Submaps of `length` metres of the path; `motions` and `covariances` lead to each keyscan.
+
+        A rotation of one radian counts as `turn_length` metres, a refused match as `refused_path_length`.
+        """
         refused = np.zeros(len(poses), dtype=bool) if refused is None else refused
         way = np.cumsum(np.hypot(motions[:, 0], motions[:, 1]) + turn_length * np.abs(motions[:, 2]))
         index = np.floor(way / length).astype(np.int64)
@@ -79,7 +80,9 @@ class Submaps:
         count = np.cumsum(refused)
         doubted = np.diff(count[reference]) > 0
         piece = np.zeros(len(reference), dtype=np.int64)
-        return Submaps(start, reference, poses, steps, chained, doubted, (way + REFUSED_WAY * count)[reference], piece)
+        return Submaps(
+            start, reference, poses, steps, chained, doubted, (way + refused_path_length * count)[reference], piece
+        )
 
     @staticmethod
     def concatenate(first: Submaps, second: Submaps) -> Submaps:

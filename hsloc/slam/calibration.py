@@ -33,9 +33,9 @@ class OdometryCalibration:
 
 
 _FEWEST = 100
-"""Minimum number of steps of an estimate. Internal: with fewer its standard error is larger than usual errors."""
+"""Minimum number of steps of an estimate. Internal: fewer do not average the noise out."""
 _DELAYS = np.arange(-10, 11) / 10.0
-"""Delays that are tried, in periods of the odometry. Internal: more than a period apart, stamps are wrong."""
+"""Delays that are tried, in periods of the odometry. Internal: the grid of a line search."""
 _OUTLIER = 0.1
 """Difference (rad) between odometry and scans above which a step slipped. Internal: far above the noise of both."""
 _STRETCH = 20

@@ -101,7 +101,7 @@ class LocalMatch:
 
 
 FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
-"""Least covariance of a motion (m^2, rad^2). Internal: the repeatability of a match on a 5 cm field."""
+"""Least covariance of a motion (m^2, rad^2). Internal: a part of a cell, keeps the equations solvable."""
 _FORGET = 0.05
 """Weight of a new match in the usual fitness. Internal: a memory of about 20 matches."""
 _KNOWN = 0.85

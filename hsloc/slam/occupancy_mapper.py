@@ -42,7 +42,7 @@ class OccupancyMapperParameters(Parameters):
 
 
 _MOST_CELLS = 400_000_000
-"""Maximum number of cells of a map. Internal: 3.6 GB of memory."""
+"""Maximum number of cells of a map. Internal: its counts take 3.2 GB of memory."""
 
 
 def draw_grid(poses: F64, scans: KeyScans, parameters: OccupancyMapperParameters) -> OccupancyGrid:

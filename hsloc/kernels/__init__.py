@@ -1,1 +1,1 @@
-"""COMPILED: the only package that imports numba. Arrays in, arrays out."""
+"""Compiled kernels on arrays; the only package that imports numba."""

@@ -1,8 +1,8 @@
-"""Is there another pose that fits as well? Branch and bound over a lattice of poses.
+"""Branch and bound over a lattice of poses, to find whether another pose fits as well.
 
 The scores of a field are pooled: level k holds at each node the maximum over the 2^k x 2^k nodes from it on. The sum of
 pooled scores under the points bounds the score of all 2^k x 2^k shifts at once, so that most of the window is
-ruled out unseen (Olson 2009; Hess et al. 2016). On the lattice the answer is exact.
+excluded at once (Olson 2009; Hess et al. 2016). On the lattice the answer is exact.
 Lengths are in cells of the field, as in hsloc/kernels/fitness.py.
 """
 

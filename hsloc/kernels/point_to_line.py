@@ -162,8 +162,8 @@ def bearing(y: float, x: float) -> float:
 def choose_hits(normals: F32, most: int, chosen: I32) -> int:
     """Choose about `most` hits that have a surfel, evenly by the directions of their walls; returns how many.
 
-    In a corridor nearly all hits lie on its two sides, and only a handful, on door frames and at its end, tell
-    how far along it one is: of a crowded direction every so-many-th hit is taken, of a rare one all (normal-space
+    In a corridor nearly all hits lie on its two sides, and only a handful, on door frames and at its end, fix
+    the position along it: of a frequent direction every n-th hit is taken, of a rare one all (normal-space
     sampling, Rusinkiewicz and Levoy 2001). Writes the rows into `chosen`, in ascending order.
     """
     n = len(normals)

@@ -93,7 +93,7 @@ def _improvise(memory: F64, low: F64, high: F64, par: float, bw: F64, hmcr: floa
             value = memory[int(rng.random() * len(memory)), j]
             if rng.random() < par:
                 value += (2.0 * rng.random() - 1.0) * bw[j]
-            # The papers say nothing of a pitch that leaves the box: it stays at its border.
+            # The papers do not treat a pitch that leaves the box: it stays at its border.
             new[j] = min(max(value, low[j]), high[j])
         else:
             new[j] = low[j] + rng.random() * (high[j] - low[j])
@@ -112,7 +112,7 @@ def improve_memory(
 ) -> tuple[int, int]:
     """One run of HS or HIDE: fills the memory `harmonies`.
 
-    Row 0 is the centre, the prediction, if `with_centre`; else it is drawn like the others.
+    Row 0 is the centre, the prediction, if `with_centre`; else it is uniform in the box like the others.
     Returns the index of the best row and the number of fitness evaluations, the initial ones included. `history`
     takes the best sum after each evaluation as far as it is long; pass an empty array for none.
     """
@@ -211,7 +211,7 @@ def search(
     The restarts improvise on `few_points` (an even choice of the points, for speed), each ends with a polish on
     these; the pose that is fittest on all `points` wins and is polished on all of them. With `agreement` = k the
     search ends as soon as k restarts have arrived at the same best pose: an easy match stops early, a hard one goes
-    on. Only the first restart is told the prediction, or agreement would be no evidence.
+    on. Only the first restart starts with the prediction, or agreement would be no evidence.
     Returns the fitness on all points, the evaluations, the restarts made and why it stopped.
     """
     p = parameters

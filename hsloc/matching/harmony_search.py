@@ -39,7 +39,7 @@ class HarmonySearch(Parameters):
 
     A memory of `memory_size` poses (HMS), the prediction first, the others uniform in the box. Each improvisation takes
     every coordinate from a random row with probability `consideration_rate` (HMCR), and then moves it by up to the
-    bandwidth with probability PAR; otherwise it draws it anew. It replaces the worst row if it is fitter.
+    bandwidth with probability PAR; otherwise it is uniform in the box. It replaces the worst row if it is fitter.
     PAR rises linearly from `par_min` to `par_max`, the bandwidth falls exponentially ([IHS]).
 
     Readings of the papers (design choices, all of them can be set):
@@ -52,7 +52,7 @@ class HarmonySearch(Parameters):
 
     Ours, and off in the presets of the papers: `restarts` of the whole search, ended early when `agreement` of them
     found the same best pose (one more for each time the window is four times as large as +-0.2 m, 8 degrees);
-    `search_points`, at most so many of the scan's points, evenly chosen, while searching; `polish_iterations`
+    `search_points`, the maximum number of the scan's points, evenly chosen, while searching; `polish_iterations`
     Gauss-Newton steps on the interpolated field at the end of each restart, and for the winner on all points.
     """
 
@@ -121,7 +121,7 @@ class HarmonySearch(Parameters):
         *,
         keep_history: bool = False,
     ) -> Match:
-        """See `Matcher`. With `keep_history` the Match tells the best fitness after each evaluation."""
+        """See `Matcher`. With `keep_history` the Match has the best fitness after each evaluation."""
         return run_search(self, self._parameters(field, window), points, field, window, rng, keep_history)
 
     def match_boxes(
@@ -194,7 +194,7 @@ def run_search(
     rng: Generator,
     keep_history: bool,
 ) -> Match:
-    """Scale to cells, search, and dress the answer."""
+    """Scale to cells, search, and convert the result to metres."""
     half = half_widths_in(field, window)
     if len(points) == 0:
         return Match(window.centre, 0.0, np.diag(half**2 / 3.0), 0, StopReason.NO_POINTS)

@@ -131,7 +131,7 @@ class LikelihoodField:
         return float(fitness_many(self.packed, self.scale(points), self.to_cells(pose)[None, :])[0])
 
     def distances(self, points: F64, pose: Pose2 = IDENTITY) -> F64:
-        """Distance in metres from each point, seen from `pose`, to the nearest wall, as the field tells it.
+        """Distance in metres from each point, seen from `pose`, to the nearest wall, from the field's score.
 
         Infinite outside the field.
         """

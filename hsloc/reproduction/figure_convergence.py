@@ -25,7 +25,7 @@ TITLES = {
 
 
 def draw_convergence(figure: Figure, convergence: Convergence) -> None:
-    """A panel for each way to count; the mean of the seeds, and between which values 80 % of them lie."""
+    """A panel for each kind of count; the mean of the seeds, and between which values 80 % of them lie."""
     seeds = len(convergence.curves[0].fitness)
     head(
         figure,

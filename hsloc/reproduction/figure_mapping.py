@@ -1,4 +1,4 @@
-"""Fig. 7 and 8 of [P]: the map of points that was drawn on the way, and the error over the time."""
+"""Fig. 7 and 8 of [P]: the map of points, and the error over the time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report's figures 2 to 8, drawn from our own results. Colours and type as in report.png."""
+"""Figures 2 to 8 of [P] from our own results. Colours and type as in report.png."""
 
 from __future__ import annotations
 

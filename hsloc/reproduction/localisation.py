@@ -36,7 +36,7 @@ MATCHERS = ("hide", "harmony_search")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
-    """A drive to draw: the points of the map are in the material, all else is here."""
+    """A run for a figure: the points of the map are in the material, all else is here."""
 
     estimate: Trajectory
     truth: Trajectory

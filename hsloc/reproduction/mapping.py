@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
 
 RANGE = 60.0
-"""Every point within so many metres is seen, through walls [P]."""
+"""Distance (m) within which every point is seen, through walls, as in [P]."""
 NOISE = SteeringNoise(0.2, radians(1.0))
 """Of the wheels (m/s) and of the steering (rad) [P]."""
 NEAR = 3.0

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def office() -> World:
-    """Nine rooms on both sides of a corridor, 27 x 16 m, with doors, furniture and one way from room to room."""
+    """Nine rooms on both sides of a corridor, 27 x 16 m, with doors, furniture and one path from room to room."""
     rooms: list[Box] = [
         (0.523, 7.034, 27.317, 9.171),  # the corridor
         (0.523, 9.312, 5.631, 15.874),
@@ -220,9 +220,9 @@ def figure_of_eight() -> World:
 
 
 def symmetric_corridor() -> World:
-    """A corridor of 60 m whose every 5 m look the same, with a room at each end that are twins too but for a box.
+    """A corridor of 60 m whose every 5 m look the same, with a room at each end that look alike, too, but for a box.
 
-    What is nearby never tells where along it one is: a mapper that believes in likeness closes wrong loops here.
+    Scans do not determine the position along it: a mapper that accepts every likeness closes wrong loops here.
     """
     rooms: list[Box] = [
         (0.0, 0.0, 60.117, 2.043),

@@ -42,7 +42,7 @@ class Sensor(Protocol):
 
     @property
     def upside_down(self) -> bool:
-        """Whether it hangs head down: its beams then turn clockwise, seen from above."""
+        """Whether it is mounted upside down: its beams then turn clockwise, seen from above."""
         ...
 
     @property
@@ -184,5 +184,5 @@ def within_reach(segments: Array, origin: Array, reach: float) -> Array:
 
 
 def _single(value: float) -> float:
-    """As the message's 32 bits hold it: what the log says is then exactly what was done."""
+    """As the message's 32 bits hold it: the log is then exact."""
     return float(np.float32(value))

@@ -1,4 +1,4 @@
-"""Drive a scenario: what the robot does, what its wheels tell and what it sees, in order of time."""
+"""Simulate a scenario: motion, odometry and scans in order of time."""
 
 from __future__ import annotations
 

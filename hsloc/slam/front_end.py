@@ -233,7 +233,7 @@ class FrontEnd:
         )
 
     def _keep(self, paired: PairedScan, points: F64, found: LocalMatch) -> LocalMatch:
-        """Make the scan a keyscan: draw it into the local maps."""
+        """Make the scan a keyscan: add it to the local maps."""
         p = self._parameters
         self._way += hypot(found.motion.x, found.motion.y) + p.turn_length * abs(wrap_angle(found.motion.theta))
         if self._refused >= p.restart_after:
@@ -246,7 +246,7 @@ class FrontEnd:
         moved = found.pose @ points[np.hypot(points[:, 0], points[:, 1]) < p.local_range]
         if found.status is Status.MATCHED or len(self._maps) == 1:
             for local, _ in self._maps:
-                local.draw(moved, _KNOWN)
+                local.add(moved, _KNOWN)
         return found
 
 

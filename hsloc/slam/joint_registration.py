@@ -1,7 +1,7 @@
-"""All scans against all: the poses at which every scan agrees best with all the scans that see the same walls.
+"""Joint registration: the poses at which every scan agrees best with all the scans that see the same walls.
 
 Where a scan-to-map matcher holds the map fixed, here both sides of each pair may move, and all pairs are solved for
-at once (a bundle adjustment of planar scans). Each round associates anew, assembles the normal equations of all pairs
+at once (a bundle adjustment of planar scans). Each round associates again, assembles the normal equations of all pairs
 (hsloc/kernels/normal_equations.py) and of the edges, the odometry among them, and solves them sparsely.
 """
 
@@ -135,8 +135,8 @@ def neighbour_pairs(poses: F64, radius: float, most: int, temporal: int, crowd: 
     """Pairs of scans that should see the same walls: those just before, and the near ones in space.
 
     Among the scans within `radius` metres the nearest of each of `most` sorts is taken, the sorts being
-    places (a grid) and headings: a hundred scans from one spot say less than ten from ten. Of a sort with more than
-    `crowd` scans only so many, even in time, are taken as partners, so that the equations stay sparse.
+    places (a grid) and headings: a hundred scans from one place add less than ten from ten. Of a sort with more than
+    `crowd` scans only `crowd`, even in time, are taken as partners, so that the equations stay sparse.
     Returns (m, 2), the earlier first, sorted.
     """
     from scipy.spatial import cKDTree
@@ -145,7 +145,7 @@ def neighbour_pairs(poses: F64, radius: float, most: int, temporal: int, crowd: 
     sector = np.floor(poses[:, 2] / (2.0 * np.pi) * _HEADINGS).astype(np.int64) % _HEADINGS
     cell = np.floor(poses[:, :2] / (0.5 * radius)).astype(np.int64)
     sort = (cell[:, 0] * 1000003 + cell[:, 1]) * _HEADINGS + sector
-    known = _standing_for_all(sort, crowd)
+    known = _thinned(sort, crowd)
     tree = cKDTree(poses[known, :2])
     keys = [np.arange(n - gap) * n + np.arange(gap, n) for gap in range(1, temporal + 1)]
     for begin in range(0, n, _AT_ONCE):
@@ -165,7 +165,7 @@ def neighbour_pairs(poses: F64, radius: float, most: int, temporal: int, crowd: 
     return np.column_stack((unique // n, unique % n)).astype(np.int64)
 
 
-def _standing_for_all(sort: I64, crowd: int) -> I64:
+def _thinned(sort: I64, crowd: int) -> I64:
     """Of each sort all scans, or `crowd` of them, even in time; ascending."""
     order = np.argsort(sort, kind="stable")
     _, start, count = np.unique(sort[order], return_index=True, return_counts=True)

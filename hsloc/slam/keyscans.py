@@ -1,4 +1,4 @@
-"""The scans that carry the map, in the flat arrays that the kernels want."""
+"""Keyscans, the scans that make up the map, in the flat arrays that the kernels take."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Closing loops: is this place one that was seen before, long ago on the way?
+"""Loop closing: submaps that were visited before.
 
 Places are visited in their order. Those seen before that could be near, by a drift that is assumed too large rather
 than too small, are searched by HIDE over the whole window in which they could lie. A match is believed if it is fit,
@@ -140,7 +140,7 @@ class LoopCloser:
         known: tuple[Loop, ...] = (),
         first: int = 0,
     ) -> None:
-        """`banned` pairs are let be, `known` loops believed, and places before `first` visited already."""
+        """`banned` pairs are left out, `known` loops accepted, and submaps before `first` visited already."""
         self._places = places
         self._scans = scans
         self._parameters = parameters
@@ -162,7 +162,7 @@ class LoopCloser:
         if self.loops:
             self.solve()
         for place in range(self._first, len(self._places)):
-            found = [self._search(old, place, way) for old, way in self._candidates(place)]
+            found = [self._search(old, place, path_length) for old, path_length in self._candidates(place)]
             self.loops += found
             if any(loop.accepted for loop in found):
                 self.solve()
@@ -192,52 +192,56 @@ class LoopCloser:
     def solve(self) -> None:
         """Solve the graph of the places: the front end's steps, and the loops with robust weights."""
         places = self._places
-        steps = Edges.chain(places.steps, places.covariances, places.doubted)
+        steps = Edges.chain(places.steps, places.covariances, places.uncertain)
         self.poses = solve_edges(self.poses, Edges.concatenate([steps, self.edges()]))
 
     def _candidates(self, place: int) -> list[tuple[int, float]]:
-        """Old places that could be near, nearest first, with the way to each over the graph."""
+        """Old places that could be near, nearest first, with the path length to each over the graph."""
         p = self._parameters
-        way = self._ways(place)
+        path_length = self._path_lengths(place)
         old = np.arange(place)
         distance = np.hypot(*(self.poses[:place, :2] - self.poses[place, :2]).T)
-        # Places next to each other are drawn from the same scans: those would match themselves.
+        # Submaps next to each other contain the same scans: those would match themselves.
         apart = place - old > 3
-        could = apart & (way >= p.min_path_length) & (distance <= p.search_radius + p.sigmas * p.drift * way)
+        could = (
+            apart
+            & (path_length >= p.min_path_length)
+            & (distance <= p.search_radius + p.sigmas * p.drift * path_length)
+        )
         order = np.lexsort((old[could], distance[could]))
         chosen: list[tuple[int, float]] = []
         for candidate in old[could][order]:
             if (int(candidate), place) in self._banned:
                 continue
             if all(abs(candidate - other) > 2 for other, _ in chosen):
-                chosen.append((int(candidate), float(way[candidate])))
+                chosen.append((int(candidate), float(path_length[candidate])))
             if len(chosen) == p.max_candidates:
                 break
         return chosen
 
-    def _ways(self, place: int) -> F64:
-        """Metres from a place to each earlier one along the way and over closed loops, shape (place,)."""
+    def _path_lengths(self, place: int) -> F64:
+        """Metres from a submap to each earlier one along the path and over closed loops, shape (place,)."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra
 
         loops = self.accepted
-        # Where two logs are connected the way may lead over places that are still to be visited.
+        # Where two logs are connected the path may lead over submaps that are still to be visited.
         last = place if self._first == 0 else len(self._places) - 1
         rows = [*range(last), *(loop.first for loop in loops)]
         columns = [*range(1, last + 1), *(loop.second for loop in loops)]
         lengths = [
-            *np.maximum(np.diff(self._places.way[: last + 1]), 1e-3),
+            *np.maximum(np.diff(self._places.path_length[: last + 1]), 1e-3),
             *(max(hypot(loop.T_first_second.x, loop.T_first_second.y), 0.1) for loop in loops),
         ]
         graph = coo_array((lengths, (rows, columns)), shape=(len(self._places), len(self._places)))
         distances: F64 = dijkstra(graph.tocsr(), directed=False, indices=np.array([place]))
         return distances[0, :place]
 
-    def _search(self, old: int, place: int, way: float) -> Loop:
+    def _search(self, old: int, place: int, path_length: float) -> Loop:
         p = self._parameters
         centre = Pose2.from_array(relative_poses(self.poses[None, old], self.poses[None, place])[0])
-        half = p.sigmas * p.drift * way + 0.3
-        half_angle = min(p.sigmas * p.drift_angle * sqrt(way) + radians(2.0), np.pi)
+        half = p.sigmas * p.drift * path_length + 0.3
+        half_angle = min(p.sigmas * p.drift_angle * sqrt(path_length) + radians(2.0), np.pi)
         likelihood, pooled = self._field(old)
         points = self._places.cloud(place, 1, self._scans, p.scan_range, 2.0 * p.resolution)
         match = p.hide.match(points, likelihood, Window(centre, half, half, half_angle), self._rng)
@@ -276,8 +280,8 @@ class LoopCloser:
         found = self._fields.pop(place, None)
         if found is None:
             p = self._parameters
-            drawn = self._places.field(place, 1, self._scans, p.scan_range, p.resolution, p.sigma)
-            found = (drawn.field, pool(drawn.scores, 5))
+            local = self._places.field(place, 1, self._scans, p.scan_range, p.resolution, p.sigma)
+            found = (local.field, pool(local.scores, 5))
         self._fields[place] = found
         if len(self._fields) > _CACHED:
             del self._fields[next(iter(self._fields))]

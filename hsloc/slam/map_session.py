@@ -132,7 +132,7 @@ def concatenate(old: MapSession, new: MapSession) -> MapSession:
 
 
 def _loops(state: MapState, places: Submaps) -> tuple[Loop, ...]:
-    """The saved loops, carried from their keyscans to the references of the places in which those lie."""
+    """The saved loops, moved from their keyscans to the references of the submaps that contain those."""
     owner = np.repeat(np.arange(len(places)), np.diff(places.start))
     loops = []
     nan = float("nan")
@@ -153,7 +153,7 @@ def _loops(state: MapState, places: Submaps) -> tuple[Loop, ...]:
 def _odometry_edges(
     motions: F64, covariances: F64, refused: NDArray[np.bool_], track: EventLog, parameters: GraphMapperParameters
 ) -> Edges:
-    """Steps from keyscan to keyscan by odometry alone, the scans being compared anew; without it, the matches'."""
+    """Steps from keyscan to keyscan by odometry alone, as the scans are compared again; without it, the matches'."""
     if not parameters.use_odometry:
         return Edges.chain(motions[1:], covariances[1:] + _ODOMETRY_FLOOR, refused[1:])
     odometry = track.key_odometry()

@@ -45,7 +45,7 @@ _MOST_CELLS = 400_000_000
 """Maximum number of cells of a map. Internal: its counts take 3.2 GB of memory."""
 
 
-def draw_grid(poses: F64, scans: KeyScans, parameters: OccupancyMapperParameters) -> OccupancyGrid:
+def build_grid(poses: F64, scans: KeyScans, parameters: OccupancyMapperParameters) -> OccupancyGrid:
     """The occupancy grid of keyscans at `poses` (n, 3), n at least 1; what no beam met stays unknown.
 
     Each cell's log odds are `hits * logit(hit) + misses * logit(miss)`, clamped: people who walked through

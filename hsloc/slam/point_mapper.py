@@ -1,8 +1,8 @@
-"""The report's SLAM ([P] V): a map of points, each scan matched against the points so far.
+"""The SLAM of [P] V: a map of points, each scan matched against the points so far.
 
 The first scan is the map. Each later scan is localised against it inside the box of the prediction; where its fitness
 is at least 0.5, the points farther than a threshold from the map are added. A scan with too few points leaves the
-prediction. There is no way back: a bad pose spoils the map, as [P] says itself; the graph mapper is the answer to that.
+prediction. A bad pose spoils the map for good, as [P] states itself; the graph mapper corrects poses.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class PointMapper:
         return estimate
 
     def grid(self, resolution: float = 0.1) -> OccupancyGrid:
-        """The points as occupied cells; all else is unknown, for points tell nothing of what is free."""
+        """The points as occupied cells; all else is unknown, for points do not show what is free."""
         points = self.points
         if len(points) == 0:
             return OccupancyGrid(np.full((1, 1), UNKNOWN, dtype=np.int8), resolution)
@@ -139,4 +139,4 @@ class PointMapper:
     def _add(self, points: F64) -> None:
         if len(points):
             self._points.append(points)
-            self._map.draw(points, saturation_score=2.0)
+            self._map.add(points, saturation_score=2.0)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class MappingQuality:
-    """How good a map is, as far as it can be told without the truth. NaN where nothing can be said.
+    """How good a map is, as far as it can be measured without the truth. NaN where it cannot.
 
     `residual_*` (m): distance of the scans' points to the nearest occupied cell of the final map. `scan_rms` (m):
     of points to the walls of other scans, robustly weighted. `conflict`: part of the points that lie where
@@ -57,7 +57,7 @@ class MappingResult:
     """The map, and the whole trajectory as it is known at the end.
 
     `odometry_poses` (k, 3) and `scan_poses` (m, 3) are the base in the map at every odometry message and at every
-    scan, in the order of the log. `revision` says the same as pairs (k, T_map_odom), each valid from the k-th odometry
+    scan, in the order of the log. `revision` is the same as pairs (k, T_map_odom), each valid from the k-th odometry
     message (from 0) on; empty without odometry. `keyscan_poses` (n, 3) are the nodes of `graph`.
     """
 
@@ -72,6 +72,6 @@ class MappingResult:
     """All that were searched for, accepted or not."""
     quality: MappingQuality
     calibration: OdometryCalibration
-    """What the map says of the odometry."""
+    """Calibration of the odometry by the map."""
     state: MapState | None
     """What is saved to go on from; None if no scan had a return."""

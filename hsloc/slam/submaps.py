@@ -28,10 +28,10 @@ _FAR = 1e4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Submaps:
-    """Place k holds keyscans start[k] to start[k + 1]; its frame is that of its middle one, `reference[k]`.
+    """Submap k holds keyscans start[k] to start[k + 1]; its frame is that of its middle one, `reference[k]`.
 
     `poses` (n, 3) are the front end's, of the keyscans; within a few places they are taken to be rigid. `steps`
-    (m - 1, 3) and `covariances` (m - 1, 3, 3) tell each place's reference in the frame of the one before.
+    (m - 1, 3) and `covariances` (m - 1, 3, 3) lead to each submap's reference in the frame of the one before.
     """
 
     start: I64
@@ -39,9 +39,9 @@ class Submaps:
     poses: F64
     steps: F64
     covariances: F64
-    doubted: NDArray[np.bool_]
+    uncertain: NDArray[np.bool_]
     """Steps (m - 1,) on which a match was refused: odometry alone, which may have slipped."""
-    way: F64
+    path_length: F64
     """Metres driven until each reference, shape (m,), with `refused_path_length` more for each refused match."""
     piece: I64
     """Shape (m,): where one log ends and the next begins the number changes; nothing is rigid across that."""
@@ -78,15 +78,15 @@ class Submaps:
                 pose = pose @ motion
             chained[k] = covariance
         count = np.cumsum(refused)
-        doubted = np.diff(count[reference]) > 0
+        uncertain = np.diff(count[reference]) > 0
         piece = np.zeros(len(reference), dtype=np.int64)
         return Submaps(
-            start, reference, poses, steps, chained, doubted, (way + refused_path_length * count)[reference], piece
+            start, reference, poses, steps, chained, uncertain, (way + refused_path_length * count)[reference], piece
         )
 
     @staticmethod
     def concatenate(first: Submaps, second: Submaps) -> Submaps:
-        """Those of two logs in one map; the step from the first's last to the second's first says nothing."""
+        """Those of two logs in one map; the step from the first's last to the second's first is unknown."""
         scans = len(first.poses)
         seam = relative_poses(first.poses[None, first.reference[-1]], second.poses[None, second.reference[0]])
         return Submaps(
@@ -95,8 +95,8 @@ class Submaps:
             np.concatenate((first.poses, second.poses)),
             np.concatenate((first.steps, seam, second.steps)),
             np.concatenate((first.covariances, UNKNOWN_STEP[None], second.covariances)),
-            np.concatenate((first.doubted, [False], second.doubted)),
-            np.concatenate((first.way, first.way[-1] + _FAR + second.way)),
+            np.concatenate((first.uncertain, [False], second.uncertain)),
+            np.concatenate((first.path_length, first.path_length[-1] + _FAR + second.path_length)),
             np.concatenate((first.piece, first.piece[-1] + 1 + second.piece)),
         )
 
@@ -129,9 +129,9 @@ class Submaps:
         self, place: int, around: int, scans: KeyScans, max_range: float, resolution: float, sigma: float
     ) -> LocalMap:
         """The field of a place and its neighbours, in its frame."""
-        drawn = LocalMap(resolution, sigma, 3.0 * sigma)
-        drawn.draw(self.cloud(place, around, scans, max_range, 0.5 * resolution), saturation_score=0.95)
-        return drawn
+        local = LocalMap(resolution, sigma, 3.0 * sigma)
+        local.add(self.cloud(place, around, scans, max_range, 0.5 * resolution), saturation_score=0.95)
+        return local
 
     def expand(self, places: F64) -> F64:
         """Poses of all keyscans (n, 3) from poses of the places (m, 3), each keyscan rigid with its place."""

@@ -23,6 +23,7 @@ _SQLITE_MAGIC = b"SQLite format 3\0"
 _GZIP_MAGIC = b"\x1f\x8b"
 _COMPRESSED = re.compile(rb"^\s*compression_mode:\s*[\"']?(file|message)", re.IGNORECASE | re.MULTILINE)
 _METADATA_BYTES = 1 << 20
+"""Bytes of a bag's metadata.yaml that are searched for its compression."""
 _NO_LOG = "is not an MCAP, a ROS bag or a CARMEN log"
 
 

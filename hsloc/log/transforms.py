@@ -78,9 +78,8 @@ class Transform3:
         return Transform3((-tx, -ty, -tz), turned.rotation)
 
 
-MOVED_METRES = 1e-3
-MOVED_RADIANS = 2e-3
-"""From here on a mounting counts as moving: the noise of a joint's encoder stays below."""
+MOVED_METRES, MOVED_RADIANS = 1e-3, 2e-3
+"""Change (m, rad) above which a mounting counts as moving. Internal: above the noise of a joint's encoder."""
 
 
 class FrameTree:

@@ -2,7 +2,7 @@
 
 One kernel serves both: HIDE is Harmony Search with a pass of differential evolution over the memory after every
 `improvisations_per_pass` improvisations; Harmony Search makes no such pass. Letters and equation numbers are
-those of the report [P] and of Mirkhani et al. [M]; see hsloc/matching for what they mean.
+those of the course report [P] and of Mirkhani et al. [M]; see hsloc/matching for what they mean.
 
 Poses are (x, y, theta), x and y in cells of the packed field (hsloc/kernels/fitness.py).
 """
@@ -49,7 +49,7 @@ class SearchParameters(NamedTuple):
     budget: int
     """NI or NFE of one restart."""
     count_improvisations: bool
-    """Whether the budget counts improvisations (the report's program) or fitness evaluations ([M])."""
+    """Whether the budget counts improvisations (the course report's program) or fitness evaluations ([M])."""
     restarts: int
     agreement: int
     """End when this many restarts have found the same best pose."""

@@ -1,4 +1,4 @@
-"""Iterative closest point, point to point: the baseline of the report ([P] II)."""
+"""Iterative closest point, point to point: the baseline of the course report ([P] II)."""
 
 from __future__ import annotations
 

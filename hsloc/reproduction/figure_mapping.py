@@ -21,7 +21,7 @@ SHOWN = (("HIDE", "default"), ("HS", "paper-literal"))
 
 
 def draw_map(figure: Figure, results: MaterialResults) -> None:
-    """Points and paths, of our best on the left and of the report's settings on the right."""
+    """Points and paths, of our best on the left and of the course report's settings on the right."""
     drives = {(d.matcher, d.preset): d for d in results.mapped if d.seed == 0}
     head(
         figure,

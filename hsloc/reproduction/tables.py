@@ -55,7 +55,10 @@ def markdown(reproduction: Reproduction, notes: Sequence[str] = ()) -> str:
 def _of_material(results: MaterialResults) -> list[str]:
     lines = []
     if results.material.name != "report":
-        lines += [f"The published figures beside those on {results.material.title} belong to the report's data.", ""]
+        lines += [
+            f"The published figures beside those on {results.material.title} belong to the course report's data.",
+            "",
+        ]
     if results.scan_match:
         lines += _e1(results.scan_match, results.material.title)
     if results.convergence is not None:
@@ -141,9 +144,9 @@ def _e3(drives: Sequence[Drive], title: str) -> list[str]:
         f"## E3: localisation along the waypoints, on {title}",
         "",
         (
-            f"{seeds} seeds; {first.length_m:.1f} m in {first.duration_s:.1f} s, {first.scans} scans (the report: "
+            f"{seeds} seeds; {first.length_m:.1f} m in {first.duration_s:.1f} s, {first.scans} scans ([P]: "
             f"{published.E3_PATH[0]:.0f} m, {published.E3_PATH[1]} s). RMSE over all odometry stamps: median and, in "
-            "brackets, worst of the seeds. Theta is wrapped; the report prints 0.467 rad (HS) and 0.362 rad (HIDE) "
+            "brackets, worst of the seeds. Theta is wrapped; [P] prints 0.467 rad (HS) and 0.362 rad (HIDE) "
             "because it did not wrap the difference. Most of theta's RMSE is the odometry's between two scans. "
             f"The start is known to {INITIAL[0]:.2f} m and {np.degrees(INITIAL[1]):.1f} deg (P0 read as a covariance)."
         ),
@@ -198,7 +201,7 @@ def _e4(mapped: Sequence[Mapped], title: str) -> list[str]:
             f"{RANGE:g} m, noise {NOISE.speed:g} m/s and {np.degrees(NOISE.steering):g} deg. RMSE over all stamps, "
             "each with the pose that is known once the scan that bears it is taken in: median and, in brackets, worst "
             "of the seeds. Most of theta's RMSE is the odometry's between two scans. Complete: the part of the world's "
-            f"points with a point of the map within {NEAR:g} m (the report: {published.E4_MAP})."
+            f"points with a point of the map within {NEAR:g} m (the course report: {published.E4_MAP})."
         ),
         "",
     ]

@@ -173,7 +173,7 @@ def hall() -> World:
 
 
 def paper() -> World:
-    """The report's set-up on a site of our own: some 400 points on the outlines of what stands there."""
+    """The course report's set-up on a site of our own: some 400 points on the outlines of what stands there."""
     random = Random(25)
     outlines: list[list[Point]] = [
         [(-78, -62), (-20, -81), (44, -92), (98, -70), (139, -41)],

@@ -69,7 +69,7 @@ class OdometryNoise:
 class SteeringNoise:
     """The noise of [P] V on speed (m/s) and steering angle (rad), sampled at every step.
 
-    A step of the report's vehicle is rot1 = g, trans = v dt, rot2 = 0, so it is noise on rot1 and trans.
+    A step of the course report's vehicle is rot1 = g, trans = v dt, rot2 = 0, so it is noise on rot1 and trans.
     """
 
     speed: float = 0.1

@@ -1,4 +1,4 @@
-"""What the robot sees with: a 2D lidar, and the sensor of the report that looks through walls."""
+"""What the robot sees with: a 2D lidar, and the sensor of the course report that looks through walls."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class Lidar:
 
 @dataclass(frozen=True, slots=True)
 class PointSensor:
-    """The report's sensor [P V]: every point of the world within range, seen through walls, free of noise.
+    """The course report's sensor [P V]: every point of the world within range, seen through walls, free of noise.
 
     A scan message has evenly spaced beams, the points have not: each is put into the nearest of `beams`
     directions, all others are +inf. With 14,400 beams that moves a point 50 m away by at most 1.1 cm sideways,

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 _MOST_TORN = 5
 """Maximum number of repeated loop searches, each without the worst wrong loop. Internal: bounds the time."""
 _RESIDUAL_SCANS = 400
-"""Scans whose residuals are measured. Internal: a sample for the metrics, no result depends on it."""
+"""Scans whose residuals are measured. Internal: a sample for the metrics, no pose depends on it."""
 
 
 def finish(

@@ -14,7 +14,8 @@ import typing
 from io import StringIO
 from typing import Any
 
-from hsloc.config import PRESETS, Config, preset, to_dict
+from hsloc.config import Config, preset, to_dict
+from hsloc.options import PRESETS
 from hsloc.parameters import OneOf, Range, describe, hints, number, plain, summary
 
 if typing.TYPE_CHECKING:

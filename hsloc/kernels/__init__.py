@@ -1,1 +1,5 @@
-"""Compiled kernels on arrays; the only package that imports numba."""
+"""Compiled kernels on arrays, the only code that numba compiles; each has a naive twin in the tests."""
+
+from hsloc.kernels.cache import choose_cache
+
+choose_cache()

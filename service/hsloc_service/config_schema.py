@@ -88,7 +88,8 @@ def _wrong(where: str, what: str) -> ServiceError:
 
 
 def _describe() -> dict[str, Any]:
-    from hsloc.config import PRESETS, preset, to_dict
+    from hsloc.config import preset, to_dict
+    from hsloc.options import PRESETS
     from hsloc.parameter_reference import json_schema
 
     schema = json_schema()

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from hsloc.cli.main import main
-from hsloc.config import PRESETS, from_dict, load, preset, to_dict
+from hsloc.config import from_dict, load, preset, to_dict
 from hsloc.errors import ConfigError
+from hsloc.options import PRESETS
 from hsloc.parameter_reference import commented_yaml, json_schema, page
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hsloc.model import Event
 
 PROGRESS_EVERY = 500
+"""Messages between two reports of progress."""
 
 
 @dataclass(frozen=True, slots=True)

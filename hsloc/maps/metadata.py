@@ -18,7 +18,7 @@ MAX_YAML_BYTES = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class MapMetadata:
-    """What map.yaml says. `origin` is the pose of the lower-left corner of the image in the map frame."""
+    """The content of map.yaml. `origin` is the pose of the lower-left corner of the image in the map frame."""
 
     image: Path
     resolution: float
@@ -125,6 +125,6 @@ def metadata_text(image: str, resolution: float, origin: Pose2) -> str:
 
 
 def _decimal(value: float) -> str:
-    """Three decimals where they say it all, else every digit: what is read back is what was written."""
+    """Three decimals where they are exact, else every digit: what is read back is what was written."""
     short = f"{value:.3f}"
     return short if float(short) == value else repr(float(value))

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_METADATA = 1000
+"""Maximum number of metadata records that are read. Internal: guards the memory against a hostile file."""
 _LOOSE_BYTES = 1 << 20
 """Messages outside of chunks are taken together up to this size."""
 

@@ -8,6 +8,7 @@ from hsloc.log.messages import definitions
 from hsloc.log.messages.definitions import short_name
 
 MAX_SCHEMA_BYTES = 64 << 10
+"""Maximum size of a definition that is parsed. Internal: guards the time against a hostile file."""
 MAX_ARRAY = 4096
 """Longest fixed array in a definition that is not ours: the parser unrolls them."""
 

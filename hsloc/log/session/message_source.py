@@ -32,10 +32,11 @@ if TYPE_CHECKING:
 _CHANNELS = 1 << 32
 """More channels than a file can have."""
 _FIRST_BATCH = 16
+"""Messages of the first batch. Internal: small, so that the first event is there at once."""
 _CUT_BATCH = 64
-"""Where the end of a log is left out: what is damaged there is not looked at."""
+"""Messages of a batch where the end of a log is left out. Internal: damage behind the end is not read."""
 _BATCH = 1024
-"""Messages that are decoded together."""
+"""Messages that are decoded together. Internal: time alone, the events are the same."""
 
 INITIAL_POSE = "hsloc.initial_pose"
 """Metadata record with x, y, theta (m, m, rad) and, if it is not the first stamp, stamp_ns."""

@@ -25,11 +25,13 @@ if TYPE_CHECKING:
 KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH = 0, 1, 2
 
 WINDOW_NS = 2_000_000_000
-"""An event waits at most this long (log time) for events of other topics that belong before it."""
+"""Maximum time (of the log) that an event waits for earlier ones of other topics. Internal: bounds the memory; longer
+delays are reported by `hsloc check`."""
 JUMP_NS = 10_000_000_000
 """A stamp further than this from the topic's last one (beyond what the log time advanced) is not trusted, unless
 the next one agrees with it."""
 MAX_PENDING = 20_000
+"""Maximum number of events that wait. Internal: bounds the memory."""
 
 
 class TopicClock:

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import os
-import sys
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
+from tests.support.paths import DATA, RECORDINGS
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 @pytest.fixture(scope="session")
 def recordings() -> Path:
-    return ROOT / "recordings"
+    return RECORDINGS
 
 
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Real logs; a test that needs them skips where they are missing."""
-    folder = Path(os.environ.get("HSLOC_DATA", ROOT.parent / "shared" / "data"))
-    if not folder.is_dir():
-        pytest.skip(f"no real logs: {folder} is missing; set HSLOC_DATA")
-    return folder
+    if not DATA.is_dir():
+        pytest.skip(f"no real logs: {DATA} is missing; set HSLOC_DATA")
+    return DATA

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from hsloc.cli.main import main
+from tests.support.paths import RECORDINGS
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 OFFICE = str(RECORDINGS / "office.mcap")
 
 

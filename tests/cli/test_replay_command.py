@@ -9,8 +9,8 @@ import pytest
 
 from hsloc.cli.main import main
 from hsloc.config import Config, load, preset
+from tests.support.paths import RECORDINGS
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 SLIP = str(RECORDINGS / "slip.mcap")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import warnings
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -66,12 +65,3 @@ def as_evo(evo, tmp_path):
 def rng():
     """A generator with a fixed seed."""
     return np.random.default_rng(7)
-
-
-@pytest.fixture(scope="session")
-def data_folder():
-    """The real logs, or a skip."""
-    folder = Path(os.environ.get("HSLOC_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
-    if not folder.is_dir():
-        pytest.skip(f"no real logs in {folder}; set HSLOC_DATA to the folder that holds intel/")
-    return folder

@@ -7,7 +7,6 @@ import json
 
 import numpy as np
 import pytest
-from evaluation_paths import disturb, make_path
 
 from hsloc.cli import eval as command
 from hsloc.errors import EvaluationError
@@ -15,6 +14,7 @@ from hsloc.evaluation.metrics import evaluate
 from hsloc.evaluation.rpe import Delta
 from hsloc.evaluation.tum import format_stamp, write_tum
 from hsloc.model.pose2 import relative_poses
+from tests.support.evaluation_paths import disturb, make_path
 
 
 def run(*arguments):

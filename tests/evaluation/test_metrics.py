@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation_paths import disturb, make_path
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,6 +19,7 @@ from hsloc.evaluation.statistics import Statistics
 from hsloc.evaluation.tum import write_tum
 from hsloc.model import Pose2, Trajectory
 from hsloc.model.pose2 import compose_poses
+from tests.support.evaluation_paths import disturb, make_path
 
 NAMES = ("rmse", "mean", "median", "std", "min", "max", "sse")
 

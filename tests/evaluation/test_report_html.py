@@ -10,7 +10,6 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from evaluation_paths import diagnostics_of, drive, estimate_of, odometry_of, office
 from PIL import Image
 
 from hsloc.errors import OutputError
@@ -20,6 +19,7 @@ from hsloc.evaluation.report_html import Provenance, time_charts, write_report_h
 from hsloc.evaluation.report_svg import Chart, chart_svg, runs, ticks
 from hsloc.evaluation.report_svg_map import MOST_MARKS, map_svg
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
+from tests.support.evaluation_paths import diagnostics_of, drive, estimate_of, odometry_of, office
 
 NASTY = "<script>alert('x')</script> & \"quoted\" {{data}} {{nothing}} ]]> <b>"
 VOID = {"meta", "input", "br", "link"}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import matplotlib
 import numpy as np
 import pytest
-from evaluation_paths import diagnostics_of, drive, estimate_of, odometry_of, office
 from PIL import Image
 
 from hsloc.errors import OutputError
@@ -18,6 +17,7 @@ from hsloc.evaluation.report_table import format_angle, format_duration, format_
 from hsloc.evaluation.report_time import time_panels
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
 from hsloc.model.pose2 import compose_poses
+from tests.support.evaluation_paths import diagnostics_of, drive, estimate_of, odometry_of, office
 
 NOTHING = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
 

@@ -4,13 +4,13 @@ import gzip
 
 import numpy as np
 import pytest
-from evaluation_paths import make_path
 from hypothesis import given
 from hypothesis import strategies as st
 
 from hsloc.errors import EvaluationError, OutputError
 from hsloc.evaluation.tum import format_stamp, format_tum, parse_stamp, read_tum, write_tum
 from hsloc.model import Trajectory
+from tests.support.evaluation_paths import make_path
 
 HALF = 2**-0.5
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from log_builders import DATA, MOUNTING, SECOND, START, chunk_data_at, chunks_of, flipped, make_scan, write_run
 
 from hsloc.cli.main import main
 from hsloc.log import encode
@@ -18,6 +17,8 @@ from hsloc.log.reader import open_log
 from hsloc.log.summary import ReadOptions
 from hsloc.log.writer import LogWriter
 from hsloc.model import Pose2
+from tests.support.log_builders import MOUNTING, SECOND, START, chunk_data_at, chunks_of, flipped, make_scan, write_run
+from tests.support.paths import DATA
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_builders import SECOND, START, write_run
 from mcap.writer import Writer
 
 from hsloc.log import columns, decode, definitions, encode, ros_source, route
@@ -16,6 +15,7 @@ from hsloc.log.reader import open_log
 from hsloc.log.summary import ReadOptions
 from hsloc.log.writer import LogWriter
 from hsloc.model import Odometry, Pose2, Scan, Truth
+from tests.support.log_builders import SECOND, START, write_run
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -7,10 +7,8 @@ import json
 import sys
 import time
 from functools import cache, partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import log_formats as formats
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -28,13 +26,15 @@ from hsloc.log.transforms import Mounting, Transform3
 from hsloc.log.writer import LogWriter
 from hsloc.model import Odometry, Pose2, Scan
 from hsloc.replay.run import Result, RunSpec, run
+from tests.support import log_formats as formats
+from tests.support.paths import RECORDINGS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from hsloc.model import Event
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 
 FORMATS: dict[str, tuple[str, Callable[[Path, Path], Path]]] = {
     "ros1 in MCAP": ("ros1.mcap", formats.ros1_mcap),

@@ -11,13 +11,23 @@ from typing import TYPE_CHECKING
 import lz4.frame
 import pytest
 import zstandard
-from log_builders import DATA, SECOND, START, chunk_data_at, chunks_of, flipped, scan_payloads, write_raw, write_run
 from mcap.writer import CompressionType, IndexType
 
 from hsloc.errors import LogFormatError
 from hsloc.log.mcap_container import McapContainer
 from hsloc.log.mcap_records import MAGIC
 from hsloc.log.summary import Losses
+from tests.support.log_builders import (
+    SECOND,
+    START,
+    chunk_data_at,
+    chunks_of,
+    flipped,
+    scan_payloads,
+    write_raw,
+    write_run,
+)
+from tests.support.paths import DATA
 
 if TYPE_CHECKING:
     from pathlib import Path

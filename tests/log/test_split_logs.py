@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import log_formats
 import pytest
-from log_builders import SECOND, START, describe, make_scan, write_run
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -19,11 +16,13 @@ from hsloc.log.reader import open_log
 from hsloc.log.summary import ReadOptions
 from hsloc.log.writer import LogWriter
 from hsloc.model import Pose2
+from tests.support import log_formats
+from tests.support.log_builders import SECOND, START, describe, make_scan, write_run
+from tests.support.paths import RECORDINGS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-RECORDINGS = Path(__file__).parents[2] / "recordings"
+    from pathlib import Path
 
 
 def copy(

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_builders import DATA, SECOND
 
 from hsloc.errors import HslocError, LogFormatError, TopicError
 from hsloc.log.carmen import beam_angles
@@ -19,6 +18,8 @@ from hsloc.log.reader import open_log
 from hsloc.log.summary import Losses, ReadOptions
 from hsloc.log.text import stamp_ns
 from hsloc.model import Odometry, Pose2, Scan, Truth
+from tests.support.log_builders import SECOND
+from tests.support.paths import DATA
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

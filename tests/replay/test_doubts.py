@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +13,9 @@ from hsloc.log.writer import LogWriter
 from hsloc.model import Odometry, Pose2, Scan, Truth
 from hsloc.replay.doubts import doubts
 from hsloc.replay.run import RunSpec, run
+from tests.support.paths import RECORDINGS
 
-OFFICE = Path(__file__).resolve().parents[2] / "recordings" / "office.mcap"
+OFFICE = RECORDINGS / "office.mcap"
 
 
 def rewritten(path, change, end=20.0):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from math import pi
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +16,9 @@ from hsloc.log.writer import LogWriter
 from hsloc.model import Pose2, Trajectory
 from hsloc.replay.references import read_reference
 from hsloc.replay.run import RunSpec
+from tests.support.paths import RECORDINGS
 
-HALL = Path(__file__).parents[2] / "recordings" / "hall.mcap"
+HALL = RECORDINGS / "hall.mcap"
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 

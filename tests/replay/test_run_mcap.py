@@ -20,8 +20,9 @@ from hsloc.cli.main import main
 from hsloc.evaluation.tum import read_tum
 from hsloc.log.reader import open_log
 from hsloc.maps import save_map
+from tests.support.paths import RECORDINGS
 
-HALL = Path(__file__).parents[2] / "recordings" / "hall.mcap"
+HALL = RECORDINGS / "hall.mcap"
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,9 @@ from hsloc.model import Odometry, Pose2
 from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.replay.run import RunSpec, run
 from hsloc.replay.start import find_start
+from tests.support.paths import RECORDINGS
 
-OFFICE = Path(__file__).resolve().parents[2] / "recordings" / "office.mcap"
+OFFICE = RECORDINGS / "office.mcap"
 ROOM = OccupancyGrid(np.zeros((100, 200), dtype=np.int8), 0.1, Pose2(0.0, 0.0, np.pi / 2.0))
 """x from -10 to 0, y from 0 to 20."""
 S = 10**9

@@ -12,7 +12,6 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -23,8 +22,8 @@ from hsloc.log.summary import ReadOptions
 from hsloc.replay.sweep import DONE, FAILED, SKIPPED, plan, run_key, sweep
 from hsloc.replay.sweep_pool import sweep_in_processes
 from hsloc.replay.sweep_table import COLUMNS, as_csv, as_json, as_text
+from tests.support.paths import RECORDINGS
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 OFFICE, HALL = RECORDINGS / "office.mcap", RECORDINGS / "hall.mcap"
 SHORT = ReadOptions(end_s=3.0)
 DEFAULT = {"default": Config()}

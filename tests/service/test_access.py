@@ -8,7 +8,6 @@ import uuid
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from conftest import settings, submit, upload, wait
 from fastapi.testclient import TestClient
 
 from hsloc.cli.main import main as program
@@ -18,12 +17,13 @@ from service.main import with_tokens
 from service.principal import Tokens
 from service.settings import SettingsError
 from service.storage import Storage
+from tests.support.servers import settings, submit, upload, wait
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from conftest import Live
+    from tests.support.servers import Live
 
 PUBLIC = {("get", "/healthz"), ("get", "/readyz")}
 READ = {

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from conftest import Live
+    from tests.support.servers import Live
 
 
 @pytest.fixture

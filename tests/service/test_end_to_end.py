@@ -8,22 +8,22 @@ import struct
 import subprocess
 import sys
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import upload, wait
 
 from hsloc.errors import MapError
 from service.settings import Settings
 from service.worker import linked_map
+from tests.support.paths import RECORDINGS
+from tests.support.servers import upload, wait
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from fastapi.testclient import TestClient
 
-RECORDINGS = Path(__file__).parents[2] / "recordings"
 REAL = Settings().worker_command
 
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import fsspec
 import pytest
-from conftest import settings, submit, wait
 from fastapi.testclient import TestClient
 from fsspec.implementations.memory import MemoryFileSystem
 
@@ -21,6 +20,7 @@ from service import patience
 from service.http import results_routes
 from service.http.app import create_app
 from service.waiting import Desk
+from tests.support.servers import settings, submit, wait
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -6,10 +6,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from conftest import settings, submit, wait
-
 from service.housekeeping import Housekeeping
 from service.settings import SettingsError, from_environment, parse_size
+from tests.support.servers import settings, submit, wait
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -12,12 +12,12 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, multiple, rule
 from sqlalchemy import update
-from test_leases import Parts
 
 from service.errors import ServiceError
 from service.principal import ANYBODY
 from service.results import Asset
 from service.tables import JobRow
+from tests.service.test_leases import Parts
 
 if TYPE_CHECKING:
     from service.leases import Claim

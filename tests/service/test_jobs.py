@@ -8,7 +8,8 @@ import uuid
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import submit, upload, wait
+
+from tests.support.servers import submit, upload, wait
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -6,7 +6,6 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import settings
 
 from service.database import Database
 from service.files import Files
@@ -15,6 +14,7 @@ from service.leases import Leases
 from service.principal import ANYBODY, Principal
 from service.results import Asset
 from service.storage import Storage
+from tests.support.servers import settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -13,14 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from conftest import upload
 
 from service.settings import Settings
+from tests.support.paths import RECORDINGS
+from tests.support.servers import upload
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from conftest import Live
+    from tests.support.servers import Live
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="THE PAGE IS NOT TESTED: playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -28,7 +29,6 @@ pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="THE PAGE IS NOT TESTED: no chromium (apt-get install chromium)"
 )
 
-RECORDINGS = Path(__file__).parents[2] / "recordings"
 REAL = ",".join(Settings().worker_command)
 NASTY = "<img src=x onerror=alert(1)>.mcap"
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]

@@ -11,17 +11,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from conftest import free_port, submit, wait
 
 from service import supervisor
 from service.processes import marked
 from service.storage import Storage
+from tests.support.servers import free_port, submit, wait
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from conftest import Live
     from fastapi.testclient import TestClient
+
+    from tests.support.servers import Live
 
 LIMITS: dict[str, Any] = {
     "job_memory_bytes": 1 << 29,

@@ -8,10 +8,8 @@ import subprocess
 import sys
 import time
 import uuid
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from conftest import submit, upload, wait
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -20,13 +18,16 @@ from service.principal import Tokens
 from service.results import Asset
 from service.settings import Settings
 from service.tables import AssetRow
+from tests.support.paths import RECORDINGS
+from tests.support.servers import submit, upload, wait
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from fastapi.testclient import TestClient
 
-OFFICE = Path(__file__).parents[2] / "recordings" / "office.mcap"
+OFFICE = RECORDINGS / "office.mcap"
 REAL = Settings().worker_command
 
 

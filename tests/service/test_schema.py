@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import settings, wait
 from fastapi.testclient import TestClient
 from sqlalchemy import event
 
@@ -18,6 +17,7 @@ from service.http.app import create_app
 from service.principal import ANYBODY
 from service.settings import SettingsError
 from service.tables import SCHEMA_VERSION
+from tests.support.servers import settings, wait
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import fsspec
 import pytest
-from conftest import settings, submit, upload, wait
 from fastapi import HTTPException
 from fastapi.testclient import TestClient
 from hypothesis import given
@@ -30,12 +29,13 @@ from service.results import BLOCK, Asset, FolderStore, ResultStore, Stores, coll
 from service.settings import SettingsError
 from service.storage import Storage
 from service.tables import AssetRow, JobRow
+from tests.support.servers import settings, submit, upload, wait
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from conftest import Live
+    from tests.support.servers import Live
 
 KINDS = ("folder", "memory", "file")
 NAME = f"{uuid.UUID(int=1)}.1"

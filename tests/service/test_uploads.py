@@ -13,17 +13,18 @@ from typing import TYPE_CHECKING, Any
 
 import httpx2 as httpx
 import pytest
-from conftest import upload
 
 from service.dispatcher import sweep
 from service.files import Files
+from tests.support.servers import upload
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from conftest import Live
     from fastapi.testclient import TestClient
+
+    from tests.support.servers import Live
 
 TUS = {"Tus-Resumable": "1.0.0"}
 PATCH = {**TUS, "Content-Type": "application/offset+octet-stream"}

@@ -16,11 +16,11 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from conftest import settings, submit, wait
 
 from service import webhooks
 from service.database import Database
 from service.tables import DeliveryRow
+from tests.support.servers import settings, submit, wait
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -8,7 +8,6 @@ import os
 import re
 import shlex
 from hashlib import sha256
-from pathlib import Path
 
 import pytest
 import zstandard
@@ -18,8 +17,9 @@ from hsloc.cli import record as command
 from hsloc.log.reader import open_log
 from hsloc.model import Odometry, Scan, Truth
 from hsloc.simulation.built_in import built_in
+from tests.support.paths import RECORDINGS
 
-FOLDER = Path(__file__).parents[2] / "recordings"
+FOLDER = RECORDINGS
 README = (FOLDER / "README.md").read_text()
 SUMS = dict(re.findall(r"^([0-9a-f]{64})  (\w+)\.mcap$", README, re.MULTILINE))
 SUMS = {name: digest for digest, name in SUMS.items()}

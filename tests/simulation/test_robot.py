@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from itertools import pairwise
 from math import hypot, pi, radians
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +13,7 @@ from hsloc.model.pose2 import wrap_angles
 from hsloc.simulation.built_in import built_in
 from hsloc.simulation.robot import DifferentialDrive, SteeredVehicle
 from hsloc.simulation.world_files import load_world
+from tests.support.paths import DATA
 
 STEP_S = 0.02
 
@@ -88,7 +87,7 @@ def test_paper_world_is_driven_like_the_reports():
 @pytest.mark.data
 def test_the_reports_way_takes_the_published_time():
     """[P]: 119.8 s and 359 m; scans come every 0.2 s, of which 599 fit."""
-    folder = Path(os.environ.get("HSLOC_DATA", Path(__file__).parents[3] / "shared" / "data")) / "paper"
+    folder = DATA / "paper"
     if not (folder / "waypoints.csv").exists():
         pytest.skip(f"{folder} is not there; set HSLOC_DATA")
     world = load_world(folder / "localisation_map.csv", folder / "waypoints.csv")

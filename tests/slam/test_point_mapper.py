@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import drive
 
 from hsloc.errors import ConfigError
 from hsloc.matching.hide import Hide
@@ -10,6 +9,7 @@ from hsloc.model import PairedScan, Pose2, Scan, Status
 from hsloc.simulation.odometer import SteeringNoise
 from hsloc.simulation.presets import preset
 from hsloc.slam.point_mapper import PointMapper, PointMapperParameters
+from tests.support.drives import drive
 
 
 def scan_of(points, stamp=0):

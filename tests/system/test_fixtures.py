@@ -10,7 +10,6 @@ import os
 import subprocess
 import sys
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +18,7 @@ from hsloc.evaluation import evaluate, read_tum
 from hsloc.model import Status, wrap_angles
 from hsloc.replay.results import write_results
 from hsloc.replay.run import Result, RunSpec, run
-
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
+from tests.support.paths import RECORDINGS
 
 
 @cache

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -13,8 +11,8 @@ from hsloc.log.summary import ReadOptions
 from hsloc.model.pose2 import compose_poses, wrap_angles
 from hsloc.replay.results import write_results
 from hsloc.replay.run import RunSpec, run
+from tests.support.paths import RECORDINGS
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 OFFICE = RECORDINGS / "office.mcap"
 
 

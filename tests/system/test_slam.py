@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -17,8 +17,10 @@ from hsloc.maps import load_map
 from hsloc.model import Scan
 from hsloc.replay.results import write_results
 from hsloc.replay.run import RunSpec, run
+from tests.support.paths import RECORDINGS
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 def ape(found):

@@ -1,0 +1,1 @@
+"""Builders and doubles that tests share; fixtures are in the folders' `conftest.py`."""

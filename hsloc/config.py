@@ -14,7 +14,7 @@ from hsloc.localisation.localiser import LocaliserParameters
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.hide import Hide
 from hsloc.matching.icp import Icp
-from hsloc.slam.mapper import GraphMapperParameters
+from hsloc.slam.parameters import GraphMapperParameters
 from hsloc.slam.point_mapper import PointMapperParameters
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """Stages the repository's Markdown for mkdocs, and adds what is generated from the code.
 
-The pages link to each other as files do, also out of docs/. So the tree of what is linked is copied as it is, and the site
-is built from the copy.
+The pages link to each other as files do, also out of docs/. So the tree of what is linked is copied as it is, and the
+site is built from the copy.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 STAGE = ROOT / "build" / "site-source"
 _LINK = re.compile(r"\]\(([^)#\s]+)")
-_SKIP = {"http:", "https:", "mailto:"}
+_MARKER = re.compile(r"<!-- api: (.+?) -->", re.DOTALL)
+_FOREIGN = ("http:", "https:", "mailto:")
 
 
 def on_config(config: Any) -> Any:
@@ -28,7 +29,9 @@ def on_config(config: Any) -> Any:
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Replace the marker `<!-- api: NAME ... -->` by the documentation of these names."""
-    return re.sub(r"<!-- api: (.+?) -->", lambda found: "\n\n".join(f"::: {name}" for name in found[1].split()), markdown)
+    return re.sub(
+        r"<!-- api: (.+?) -->", lambda found: "\n\n".join(f"::: {name}" for name in found[1].split()), markdown
+    )
 
 
 def _pages(nav: Any) -> list[str]:
@@ -47,5 +50,5 @@ def _stage(source: Path) -> None:
         return
     for link in _LINK.findall(source.read_text(encoding="utf-8")):
         linked = (source.parent / link).resolve()
-        if not link.startswith(tuple(_SKIP)) and linked.suffix != ".md" and linked.is_relative_to(ROOT):
+        if not link.startswith(_FOREIGN) and linked.suffix != ".md" and linked.is_relative_to(ROOT):
             _stage(linked)

@@ -15,7 +15,7 @@ from hsloc.localisation.localiser import Localiser
 from hsloc.matching import LikelihoodField
 from hsloc.model.estimate import Status
 from hsloc.replay.engine import replay
-from hsloc.replay.recording import Recording
+from hsloc.replay.run_history import Recording
 from hsloc.reproduction.variants import NAMES
 from hsloc.simulation.presets import preset as scenario_preset
 from hsloc.simulation.simulator import events

@@ -14,7 +14,7 @@ from hsloc.evaluation import evaluate
 from hsloc.model.estimate import Status
 from hsloc.model.trajectory import Trajectory
 from hsloc.replay.engine import replay
-from hsloc.replay.recording import Recording
+from hsloc.replay.run_history import Recording
 from hsloc.reproduction.localisation import MATCHERS, Path
 from hsloc.reproduction.variants import NAMES
 from hsloc.simulation.odometer import SteeringNoise

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.surfels import choose_hits, fit_surfels
+from hsloc.kernels.point_to_line import choose_hits, fit_surfels
 from hsloc.model.events import Scan
 from hsloc.model.pose2 import Pose2
 
@@ -25,7 +25,7 @@ _SURFEL_RADIUS = 0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyScan:
-    """A scan prepared: its hits with surfels, and its beams for looking up (hsloc/kernels/surfels.py)."""
+    """A scan prepared: its hits with surfels, and its beams for looking up (hsloc/kernels/point_to_line.py)."""
 
     points: F32
     normals: F32

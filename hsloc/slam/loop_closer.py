@@ -3,8 +3,9 @@
 Places are visited in their order. Those seen before that could be near, by a drift that is assumed too large rather
 than too small, are searched by HIDE over the whole window in which they could lie. A match is believed if it is fit,
 if neither place looks through the walls of the other, and if no other pose in the window comes near to it (branch and
-bound, hsloc/kernels/bounds.py: in a corridor whose every bay looks the same there is one). It becomes an edge of the
-pose graph with a covariance and a robust weight, and the graph is solved before the next place is looked at.
+bound, hsloc/kernels/branch_and_bound.py: in a corridor whose every bay looks the same there is one). It becomes an
+edge of the pose graph with a covariance and a robust weight, and the graph is solved before the next place is looked
+at.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.bounds import best_on_lattice, pool
-from hsloc.kernels.surfels import pair_terms
+from hsloc.kernels.branch_and_bound import best_on_lattice, pool
+from hsloc.kernels.point_to_line import pair_terms
 from hsloc.matching.harmony_search import spread_order
 from hsloc.matching.hide import Hide
 from hsloc.matching.window import Window
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.slam.keyscans import KeyScans
-    from hsloc.slam.places import Places
+    from hsloc.slam.submaps import Places
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]

@@ -11,7 +11,7 @@ import numpy as np
 from hsloc.errors import LogFormatError, OutputError
 from hsloc.kernels.normal_equations import add_edges
 from hsloc.model.pose2 import wrap_angles
-from hsloc.slam.sparse import BlockSystem
+from hsloc.slam.sparse_solver import BlockSystem
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

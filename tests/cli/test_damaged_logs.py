@@ -13,13 +13,13 @@ import shutil
 import sqlite3
 from typing import TYPE_CHECKING, Any
 
+import log_formats as formats
 import pytest
+from log_builders import chunk_data_at, chunks_of, flipped
 from mcap.writer import CompressionType, IndexType
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
-from tests.support import log_formats as formats
-from tests.support.log_builders import chunk_data_at, chunks_of, flipped
-from tests.support.paths import RECORDINGS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

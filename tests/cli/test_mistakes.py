@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
-from tests.support.paths import RECORDINGS
 
 OFFICE = str(RECORDINGS / "office.mcap")
 
@@ -104,7 +104,7 @@ def test_not_a_log(here, capsys):
 def write_log(path, scans=("/scan",), odometry=True, grid=False):
     import numpy as np
 
-    from hsloc.log.writer import LogWriter
+    from hsloc.log import LogWriter
     from hsloc.model import Pose2, Scan
 
     with LogWriter(path) as writer:

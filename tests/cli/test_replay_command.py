@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
 from hsloc.config import Config, load, preset
-from tests.support.paths import RECORDINGS
 
 SLIP = str(RECORDINGS / "slip.mcap")
 

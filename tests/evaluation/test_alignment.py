@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from evaluation_paths import disturb, make_path
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -9,7 +10,6 @@ from hsloc.errors import EvaluationError
 from hsloc.evaluation.alignment import align, parse_alignment, umeyama
 from hsloc.model import Pose2
 from hsloc.model.pose2 import compose_poses
-from tests.support.evaluation_paths import disturb, make_path
 
 
 def test_a_quarter_turn_by_hand():

@@ -2,13 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from evaluation_paths import START_NS, disturb, make_path
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hsloc.errors import EvaluationError
 from hsloc.evaluation.association import associate, interpolate_poses
 from hsloc.model import Trajectory
-from tests.support.evaluation_paths import START_NS, disturb, make_path
 
 MS = 1_000_000
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evaluation_paths import disturb, make_path
 
 from hsloc.cli.main import main
-from hsloc.evaluation.tum import write_tum
-from tests.support.evaluation_paths import disturb, make_path
+from hsloc.trajectory_io.tum import write_tum
 
 
 @pytest.fixture

@@ -4,13 +4,13 @@ import gzip
 
 import numpy as np
 import pytest
+from evaluation_paths import make_path
 
 from hsloc.errors import EvaluationError
 from hsloc.evaluation.relations import Relations, evaluate_relations, read_relations, relation_errors
-from hsloc.evaluation.tum import parse_stamp, read_tum
 from hsloc.model import Pose2, Trajectory
 from hsloc.model.pose2 import compose_poses, relative_poses
-from tests.support.evaluation_paths import make_path
+from hsloc.trajectory_io.tum import parse_stamp, read_tum
 
 S = 1_000_000_000
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import naive
 import numpy as np
 import pytest
 
 from hsloc.kernels.fitness import fitness_many, normal_equations, pack, point_scores, score_sum
-from hsloc.kernels.polish import polish, solve_damped
-from tests import naive
+from hsloc.kernels.levenberg_marquardt import polish, solve_damped
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ import sys
 from math import inf, sqrt
 from pathlib import Path
 
+import naive_raycasting
 import numpy as np
 import pytest
 
 from hsloc.kernels.raycasting import cast_rays
-from tests.support import naive_raycasting
 
 NOTHING = np.empty((0, 4))
 NOBODY = np.empty((0, 3))

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from math import exp, log
 
+import naive
 import numpy as np
 import pytest
 
 from hsloc.kernels.fitness import pack, score_sum
 from hsloc.kernels.search import STOPPED_AGREEMENT, STOPPED_BUDGET, SearchParameters, improve_memory, search
-from tests import naive
 
 NONE = np.empty(0)
 

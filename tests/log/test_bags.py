@@ -5,16 +5,16 @@ from __future__ import annotations
 import shutil
 from typing import TYPE_CHECKING
 
+import log_formats
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from log_builders import describe, write_run
 from rosbags.rosbag2 import StoragePlugin
 
 from hsloc.errors import HslocError, LogFormatError
 from hsloc.log.reader import open_log
 from hsloc.log.summary import Losses, ReadOptions
-from tests.support import log_formats
-from tests.support.log_builders import describe, write_run
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from log_builders import SECOND, START, chunk_data_at, chunks_of, describe, flipped, make_scan, write_run
 from mcap.reader import make_reader
+from paths import DATA
 
 from hsloc.errors import LogFormatError
 from hsloc.log.convert import convert_log
@@ -15,8 +17,6 @@ from hsloc.log.summary import Losses, ReadOptions
 from hsloc.log.transforms import Transform3
 from hsloc.log.writer import LogWriter
 from hsloc.model import OccupancyGrid, Odometry, Pose2, Scan
-from tests.support.log_builders import SECOND, START, chunk_data_at, chunks_of, describe, flipped, make_scan, write_run
-from tests.support.paths import DATA
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,15 +11,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from log_builders import START, make_scan
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hsloc.errors import LogFormatError
-from hsloc.log import decode, definitions, encode, schema
 from hsloc.log.container import Channel
-from hsloc.log.decoders import Undecodable, decoder_for, is_decodable
+from hsloc.log.messages import decode, definitions, encode
+from hsloc.log.messages import definition_compatibility as schema
+from hsloc.log.messages.decoders import Undecodable, decoder_for, is_decodable
 from hsloc.log.transforms import Transform3
 from hsloc.model import OccupancyGrid, Pose2
-from tests.support.log_builders import START, make_scan
 
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 ROS1 = get_typestore(Stores.ROS1_NOETIC)

@@ -9,25 +9,26 @@ import time
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
+import log_formats as formats
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
 from hsloc.errors import LogFormatError
-from hsloc.log import foxglove
 from hsloc.log.container import Channel
-from hsloc.log.decoders import Undecodable, decoder_for
-from hsloc.log.frames import Mountings
+from hsloc.log.messages import foxglove
+from hsloc.log.messages.decoders import Undecodable, decoder_for
 from hsloc.log.reader import open_log
+from hsloc.log.session.extrinsics import Mountings
 from hsloc.log.summary import Losses, ReadOptions
 from hsloc.log.transforms import Mounting, Transform3
 from hsloc.log.writer import LogWriter
 from hsloc.model import Odometry, Pose2, Scan
-from hsloc.replay.run import Result, RunSpec, run
-from tests.support import log_formats as formats
-from tests.support.paths import RECORDINGS
+from hsloc.replay.run import Result, run
+from hsloc.request import RunRequest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -57,7 +58,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def localised(path: Path) -> Result:
     start = open_log(RECORDINGS / "kidnapped.mcap").initial_pose()
     assert start is not None
-    return run(RunSpec(logs=(path,), initial_pose=start[1]))
+    return run(RunRequest(logs=(path,), initial_pose=start[1]))
 
 
 def values(event: Event) -> tuple[object, ...]:

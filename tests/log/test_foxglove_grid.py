@@ -6,16 +6,16 @@ import json
 from base64 import b64encode
 from typing import TYPE_CHECKING, Any
 
+import log_formats
 import numpy as np
 import pytest
+from log_builders import START, write_raw
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
 from hsloc.log.container import Channel
-from hsloc.log.decoders import Undecodable, decoder_for
+from hsloc.log.messages.decoders import Undecodable, decoder_for
 from hsloc.log.reader import open_log
-from tests.support import log_formats
-from tests.support.log_builders import START, write_raw
-from tests.support.paths import RECORDINGS
 
 if TYPE_CHECKING:
     from pathlib import Path

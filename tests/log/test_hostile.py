@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from log_builders import scan_payloads, write_raw, write_run
+from log_formats import foxglove_mcap, ros1_mcap
 from mcap.writer import CompressionType
 
 from hsloc.errors import HslocError
-from hsloc.log.check import check_log
+from hsloc.log.checks.checker import check_log
 from hsloc.log.reader import open_log
 from hsloc.log.summary import ReadOptions
-from tests.support.log_builders import scan_payloads, write_raw, write_run
-from tests.support.log_formats import foxglove_mcap, ros1_mcap
 
 if TYPE_CHECKING:
     from pathlib import Path

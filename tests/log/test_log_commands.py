@@ -6,11 +6,11 @@ import json
 from typing import TYPE_CHECKING
 
 import pytest
+from log_builders import START, chunk_data_at, chunks_of, flipped, make_scan, write_run
 
 from hsloc.cli.main import main
 from hsloc.log.writer import LogWriter
 from hsloc.model import OccupancyGrid, Pose2
-from tests.support.log_builders import START, chunk_data_at, chunks_of, flipped, make_scan, write_run
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from log_builders import SECOND, START, describe, make_scan
 
-from hsloc.log.ordering import KIND_ODOMETRY, KIND_SCAN, WINDOW_NS, Arrivals, Reorder, TopicClock
+from hsloc.log.session.ordering import KIND_ODOMETRY, KIND_SCAN, WINDOW_NS, Arrivals, Reorder, TopicClock
 from hsloc.log.summary import Losses
 from hsloc.model import Odometry, Pose2
-from tests.support.log_builders import SECOND, START, describe, make_scan
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

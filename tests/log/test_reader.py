@@ -8,14 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-
-from hsloc.errors import LogError, LogFormatError, TopicError
-from hsloc.log.reader import open_log
-from hsloc.log.summary import Losses, ReadOptions
-from hsloc.log.transforms import Transform3
-from hsloc.log.writer import LogWriter
-from hsloc.model import IDENTITY, OccupancyGrid, Odometry, Pose2, Scan, Truth
-from tests.support.log_builders import (
+from log_builders import (
     MOUNTING,
     SECOND,
     START,
@@ -28,7 +21,14 @@ from tests.support.log_builders import (
     write_raw,
     write_run,
 )
-from tests.support.paths import DATA
+from paths import DATA
+
+from hsloc.errors import LogError, LogFormatError, TopicError
+from hsloc.log.reader import open_log
+from hsloc.log.summary import Losses, ReadOptions
+from hsloc.log.transforms import Transform3
+from hsloc.log.writer import LogWriter
+from hsloc.model import IDENTITY, OccupancyGrid, Odometry, Pose2, Scan, Truth
 
 if TYPE_CHECKING:
     from pathlib import Path

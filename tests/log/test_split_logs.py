@@ -6,9 +6,12 @@ import json
 import re
 from typing import TYPE_CHECKING
 
+import log_formats
 import pytest
+from log_builders import SECOND, START, describe, make_scan, write_run
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
 from hsloc.errors import LogError
@@ -16,9 +19,6 @@ from hsloc.log.reader import open_log
 from hsloc.log.summary import ReadOptions
 from hsloc.log.writer import LogWriter
 from hsloc.model import Pose2
-from tests.support import log_formats
-from tests.support.log_builders import SECOND, START, describe, make_scan, write_run
-from tests.support.paths import RECORDINGS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from log_builders import make_scan
 
 from hsloc.log.transforms import FrameTree, Transform3, laser_mounting
 from hsloc.model import Pose2
-from tests.support.log_builders import make_scan
 
 numbers = st.floats(-10, 10)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import radians
 
+import naive
 import numpy as np
 import pytest
 
@@ -12,7 +13,6 @@ from hsloc.errors import ConfigError, MapError
 from hsloc.matching import HarmonySearch, Hide, Icp, LikelihoodField, StopReason, Window
 from hsloc.matching.icp import rigid_motion
 from hsloc.model import OccupancyGrid, Pose2, wrap_angle
-from tests import naive
 
 ALL = [Hide(), HarmonySearch(), Icp()]
 SEARCHES = [Hide(), HarmonySearch(), Hide.paper(), HarmonySearch.paper(), Hide.paper_literal()]

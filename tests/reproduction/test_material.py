@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from paths import DATA
 
 from hsloc.errors import ConfigError
 from hsloc.reproduction import own_material, report_material
 from hsloc.reproduction.scan_match import run_scan_match
-from tests.support.paths import DATA
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from fastapi.testclient import TestClient
+from servers import Live, settings
 
-from service.http.app import create_app
-from tests.support.servers import Live, settings
+from hsloc_service.http.app import create_app
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from tests.support.servers import Live
+    from servers import Live
 
 
 @pytest.fixture

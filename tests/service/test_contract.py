@@ -17,11 +17,11 @@ import requests
 import schemathesis
 from hypothesis import HealthCheck, Phase
 from schemathesis.specs.openapi.checks import negative_data_rejection
+from servers import Live, settings, submit, upload, wait
 
-from service.http import tus
-from service.http.app import create_app
-from service.http.schemas import UUID_PATTERN
-from tests.support.servers import Live, settings, submit, upload, wait
+from hsloc_service.http import tus
+from hsloc_service.http.app import create_app
+from hsloc_service.http.schemas import UUID_PATTERN
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,12 +11,12 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
+from paths import RECORDINGS
+from servers import upload, wait
 
 from hsloc.errors import MapError
-from service.settings import Settings
-from service.worker import linked_map
-from tests.support.paths import RECORDINGS
-from tests.support.servers import upload, wait
+from hsloc_service.execution.worker import linked_map
+from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable

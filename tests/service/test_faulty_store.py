@@ -15,12 +15,12 @@ import fsspec
 import pytest
 from fastapi.testclient import TestClient
 from fsspec.implementations.memory import MemoryFileSystem
+from servers import settings, submit, wait
 
-from service import patience
-from service.http import results_routes
-from service.http.app import create_app
-from service.waiting import Desk
-from tests.support.servers import settings, submit, wait
+from hsloc_service.call_timeout import Desk
+from hsloc_service.execution import retry as patience
+from hsloc_service.http import results_routes
+from hsloc_service.http.app import create_app
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -117,7 +117,7 @@ def wait_for_store(client: TestClient, job: str) -> None:
 
 
 def failures() -> float:
-    from service.http.metrics import REGISTRY
+    from hsloc_service.http.metrics import REGISTRY
 
     return REGISTRY.get_sample_value("hsloc_store_errors_total") or 0.0
 

@@ -12,15 +12,15 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, multiple, rule
 from sqlalchemy import update
+from test_leases import Parts
 
-from service.errors import ServiceError
-from service.principal import ANYBODY
-from service.results import Asset
-from service.tables import JobRow
-from tests.service.test_leases import Parts
+from hsloc_service.auth import ANYBODY
+from hsloc_service.db.tables import JobRow
+from hsloc_service.errors import ServiceError
+from hsloc_service.results.store import Asset
 
 if TYPE_CHECKING:
-    from service.leases import Claim
+    from hsloc_service.jobs.leases import Claim
 
 GRAPH = {
     None: {"queued"},

@@ -8,8 +8,7 @@ import uuid
 from typing import TYPE_CHECKING
 
 import pytest
-
-from tests.support.servers import submit, upload, wait
+from servers import submit, upload, wait
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from paths import RECORDINGS
+from servers import upload
 
-from service.settings import Settings
-from tests.support.paths import RECORDINGS
-from tests.support.servers import upload
+from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from tests.support.servers import Live
+    from servers import Live
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="THE PAGE IS NOT TESTED: playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import httpx2 as httpx
 import pytest
-
-from tests.support.servers import Live, submit
+from servers import Live, submit
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -14,11 +14,11 @@ from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, rule
+from servers import settings as service_settings
+from test_uploads import TUS, append, begin
 
-from service.housekeeping import Housekeeping
-from service.http.app import create_app
-from tests.service.test_uploads import TUS, append, begin
-from tests.support.servers import settings as service_settings
+from hsloc_service.housekeeping import Housekeeping
+from hsloc_service.http.app import create_app
 
 TTL = 1000.0
 

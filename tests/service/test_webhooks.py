@@ -16,11 +16,11 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from servers import settings, submit, wait
 
-from service import webhooks
-from service.database import Database
-from service.tables import DeliveryRow
-from tests.support.servers import settings, submit, wait
+from hsloc_service import webhooks
+from hsloc_service.db.database import Database
+from hsloc_service.db.tables import DeliveryRow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

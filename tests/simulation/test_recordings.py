@@ -12,12 +12,12 @@ from hashlib import sha256
 import pytest
 import zstandard
 from mcap.reader import make_reader
+from paths import RECORDINGS
 
 from hsloc.cli import record as command
-from hsloc.log.reader import open_log
+from hsloc.log import open_log
 from hsloc.model import Odometry, Scan, Truth
 from hsloc.simulation.built_in import built_in
-from tests.support.paths import RECORDINGS
 
 FOLDER = RECORDINGS
 README = (FOLDER / "README.md").read_text()

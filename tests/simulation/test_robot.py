@@ -7,13 +7,13 @@ from math import hypot, pi, radians
 
 import numpy as np
 import pytest
+from paths import DATA
 
 from hsloc.model import Pose2
 from hsloc.model.pose2 import wrap_angles
 from hsloc.simulation.built_in import built_in
 from hsloc.simulation.robot import DifferentialDrive, SteeredVehicle
 from hsloc.simulation.world_files import load_world
-from tests.support.paths import DATA
 
 STEP_S = 0.02
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import pytest
-
-from tests.support.drives import drive
+from drives import drive
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drives import drive
 
 from hsloc.errors import ConfigError
 from hsloc.matching.hide import Hide
@@ -9,7 +10,6 @@ from hsloc.model import PairedScan, Pose2, Scan, Status
 from hsloc.simulation.odometer import SteeringNoise
 from hsloc.simulation.presets import preset
 from hsloc.slam.point_mapper import PointMapper, PointMapperParameters
-from tests.support.drives import drive
 
 
 def scan_of(points, stamp=0):

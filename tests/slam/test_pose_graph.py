@@ -4,7 +4,7 @@ import pytest
 from hsloc.errors import LogFormatError, OutputError
 from hsloc.model.pose2 import compose_poses, relative_poses
 from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
-from hsloc.slam.sparse import BlockSystem
+from hsloc.slam.sparse_solver import BlockSystem
 
 TIGHT = np.diag((1e4, 1e4, 1e5))
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
-from hsloc.log import definitions, encode
+from hsloc.log.messages import definitions, encode
 from hsloc.log.writer import LogWriter
 from hsloc.model import Odometry, Pose2, Scan, Truth
 

@@ -17,7 +17,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from hsloc.log import decode, definitions
+from hsloc.log.messages import decode, definitions
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

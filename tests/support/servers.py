@@ -14,7 +14,7 @@ from typing import Any
 
 import httpx2 as httpx
 
-from service.settings import Settings
+from hsloc_service.settings import Settings
 
 FAKE = (sys.executable, "-P", str(Path(__file__).parent / "fake_worker.py"))
 SMALL: dict[str, Any] = {

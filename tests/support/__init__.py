@@ -1,1 +1,0 @@
-"""Builders and doubles that tests share; fixtures are in the folders' `conftest.py`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from paths import DATA, RECORDINGS
 from hsloc.trajectory_io.tum import write_tum
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 
@@ -32,7 +33,7 @@ def data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def evo(tmp_path_factory):
+def evo(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """evo's Python API. It is GPL and a judge in tests only: hsloc itself never imports it.
 
     On import evo writes its settings under $HOME, and its dependencies warn; neither is to reach us.
@@ -70,10 +71,10 @@ def evo(tmp_path_factory):
 
 
 @pytest.fixture
-def as_evo(evo, tmp_path):
+def as_evo(evo: SimpleNamespace, tmp_path: Path) -> Callable[..., Any]:
     """A trajectory as evo reads it from our file."""
 
-    def convert(trajectory, name="trajectory"):
+    def convert(trajectory: Any, name: str = "trajectory") -> Any:
         write_tum(tmp_path / f"{name}.tum", trajectory)
         return evo.read(str(tmp_path / f"{name}.tum"))
 
@@ -81,6 +82,6 @@ def as_evo(evo, tmp_path):
 
 
 @pytest.fixture
-def rng():
+def rng() -> np.random.Generator:
     """A generator with a fixed seed."""
     return np.random.default_rng(7)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -14,10 +15,14 @@ from hsloc.model import Odometry, Pose2, Scan, Truth
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
 OFFICE = RECORDINGS / "office.mcap"
 
 
-def rewritten(path, change, end=20.0):
+def rewritten(path: Path, change: Callable[..., Any], end: float = 20.0) -> Path:
     """The office, with each event changed by `change`."""
     log = open_log(OFFICE, ReadOptions(end_s=end))
     with LogWriter(path) as writer:
@@ -30,12 +35,12 @@ def rewritten(path, change, end=20.0):
     return path
 
 
-def test_a_sound_run_leaves_no_doubt():
+def test_a_sound_run_leaves_no_doubt() -> None:
     assert doubts(run(RunRequest(logs=(OFFICE,), read=ReadOptions(end_s=20.0), unknown_start=True))) == []
 
 
-def test_a_laser_that_hangs_head_down_and_is_not_said_to_leaves_a_doubt(tmp_path):
-    def mirrored(event):
+def test_a_laser_that_hangs_head_down_and_is_not_said_to_leaves_a_doubt(tmp_path: Path) -> None:
+    def mirrored(event: Any) -> Any:
         return replace(event, ranges=event.ranges[::-1].copy()) if isinstance(event, Scan) else event
 
     found = run(RunRequest(logs=(rewritten(tmp_path / "run.mcap", mirrored),), unknown_start=True))
@@ -44,14 +49,14 @@ def test_a_laser_that_hangs_head_down_and_is_not_said_to_leaves_a_doubt(tmp_path
     assert "--laser-pose" in line
 
 
-def test_a_log_too_short_to_be_sure_is_all_guesses():
+def test_a_log_too_short_to_be_sure_is_all_guesses() -> None:
     found = run(RunRequest(logs=(OFFICE,), read=ReadOptions(end_s=0.5), unknown_start=True))
     assert not found.localised.any()
     assert "every pose is a guess" in doubts(found)[0]
 
 
-def test_odometry_that_is_told_in_millimetres_is_not_mended(tmp_path):
-    def in_millimetres(event):
+def test_odometry_that_is_told_in_millimetres_is_not_mended(tmp_path: Path) -> None:
+    def in_millimetres(event: Any) -> Any:
         if isinstance(event, Odometry):
             pose = event.T_odom_base
             return replace(event, T_odom_base=Pose2(1000.0 * pose.x, 1000.0 * pose.y, pose.theta))
@@ -66,8 +71,8 @@ def test_odometry_that_is_told_in_millimetres_is_not_mended(tmp_path):
 
 @pytest.mark.parametrize("mode", ["localise", "slam"])
 @pytest.mark.parametrize("reset", [Pose2(5.0, 0.0, 0.0), Pose2(0.1, 0.0, 3.0), Pose2(-40.0, 7.0, -2.0)])
-def test_odometry_that_begins_anew_goes_on_where_it_was_and_is_told(tmp_path, mode, reset):
-    def begun_anew(event):
+def test_odometry_that_begins_anew_goes_on_where_it_was_and_is_told(tmp_path: Path, mode: str, reset: Pose2) -> None:
+    def begun_anew(event: Any) -> Any:
         if isinstance(event, Odometry) and event.stamp_ns >= 1_700_000_010_000_000_000:
             return replace(event, T_odom_base=reset @ event.T_odom_base)
         return event
@@ -88,11 +93,11 @@ def test_odometry_that_begins_anew_goes_on_where_it_was_and_is_told(tmp_path, mo
     assert found.localised.all()
 
 
-def test_the_way_is_retraced_as_far_as_the_scans_fit_and_no_farther(tmp_path):
+def test_the_way_is_retraced_as_far_as_the_scans_fit_and_no_farther(tmp_path: Path) -> None:
     """For eight seconds the lidar sees nothing of the map, so that nobody can say where the robot was at first."""
     rng = np.random.default_rng(0)
 
-    def blind(event):
+    def blind(event: Any) -> Any:
         if isinstance(event, Scan) and event.stamp_ns < 1_700_000_008_000_000_000:
             clutter = rng.uniform(0.3, 6.0, len(event.ranges)).astype(np.float32)
             return replace(event, ranges=clutter)

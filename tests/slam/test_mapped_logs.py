@@ -1,6 +1,9 @@
 """The promises about real logs. They read CARMEN text by hand: one ODOM line, then its FLASER line."""
 
+from __future__ import annotations
+
 import gzip
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -10,15 +13,20 @@ from hsloc.model import Odometry, PairedScan, Pose2, Scan, Trajectory
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.parameters import GraphMapperParameters
 
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hsloc.slam.result import MappingResult
+
 pytestmark = pytest.mark.data
 
 
-def stamp(text):
+def stamp(text: str) -> int:
     seconds, fraction = text.split(".")
     return int(seconds) * 10**9 + int(fraction.ljust(9, "0"))
 
 
-def read(path):
+def read(path: Path) -> list[Any]:
     events = []
     with gzip.open(path, "rt") as lines:
         for line in lines:
@@ -34,14 +42,14 @@ def read(path):
     return events
 
 
-def mapped(events, seed):
+def mapped(events: list[Any], seed: int) -> MappingResult:
     mapper = Mapper(GraphMapperParameters(), np.random.default_rng(seed))
     for event in events:
         mapper.update(event)
     return mapper.finish()
 
 
-def test_intel_is_mapped_better_than_published(data):
+def test_intel_is_mapped_better_than_published(data: Path) -> None:
     events = read(data / "intel" / "intel.clf.gz")
     result = mapped(events, seed=0)
     stamps = np.array([event.stamp_ns for event in events if isinstance(event, Odometry)])
@@ -54,7 +62,7 @@ def test_intel_is_mapped_better_than_published(data):
     assert score.statistics.angle_deg.mean < 0.65
 
 
-def test_the_loop_of_aces_closes(data):
+def test_the_loop_of_aces_closes(data: Path) -> None:
     events = read(data / "aces" / "aces.clf.gz")
     result = mapped(events, seed=0)
     reference = np.loadtxt(data / "aces" / "aces.rbpf.txt")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from hsloc.simulation.simulator import events
 from hsloc.simulation.world_files import load_world
 
 
-def drive(scenario, **changes):
+def drive(scenario: Any, **changes: Any) -> Any:
     """Events of a drive as the mapper gets them, and the truth."""
     setting = replace(preset(scenario), **changes)
     told = list(pair(events(setting, load_world(setting.world, None))))
@@ -21,7 +22,7 @@ def drive(scenario, **changes):
     return [event for event in told if not isinstance(event, Truth)], truth
 
 
-def ape_rmse(events, poses, truth):
+def ape_rmse(events: Any, poses: Any, truth: Any) -> Any:
     """RMSE (m) of the poses at the scans, after rotation and translation."""
     stamps = np.array([event.scan.stamp_ns for event in events if isinstance(event, PairedScan)])
     known = (stamps >= truth.stamps_ns[0]) & (stamps <= truth.stamps_ns[-1])

@@ -27,7 +27,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def fails(capsys: pytest.CaptureFixture[str], *argv: str, code: int = 1) -> str:
     """Run a command that must fail; its one line on stderr."""
     try:
-        status = main(argv)
+        status: object = main(argv)
     except SystemExit as stop:
         status = stop.code
     printed = capsys.readouterr()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 import shlex
 import subprocess
@@ -80,9 +81,10 @@ def test_every_command_that_is_named_exists(path: Path) -> None:
     assert flags - known - foreign == set()
 
 
-def parsers() -> dict_values:
-    (subparsers,) = (action for action in build_parser()._actions if action.dest == "command")
-    return subparsers.choices.values()
+def parsers() -> list[argparse.ArgumentParser]:
+    actions = build_parser()._actions
+    (subparsers,) = (action for action in actions if isinstance(action, argparse._SubParsersAction))
+    return list(subparsers.choices.values())
 
 
 @pytest.mark.parametrize("path", [ROOT / "README.md", *GUIDES], ids=lambda path: path.name)

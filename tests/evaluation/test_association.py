@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pytest
@@ -80,7 +80,7 @@ def test_equals_evo(
     evo: SimpleNamespace,
     as_evo: Callable[..., Any],
     rng: np.random.Generator,
-    method: str,
+    method: Literal["nearest", "interpolation"],
     offset_s: float,
     every: int,
     shift_ns: int,

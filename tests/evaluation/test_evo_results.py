@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def files(tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize("alignment", ["none", "origin", "se2"])
 @pytest.mark.parametrize(("delta", "unit"), [(1.0, "m"), (10.0, "frames")])
 def test_the_files_hold_what_evo_would_have_saved(
-    files: None, evo: SimpleNamespace, alignment: str, delta: float, unit: str, tmp_path: Path
+    files: None, evo: SimpleNamespace, alignment: str, delta: float, unit: Literal["frames", "m", "s"], tmp_path: Path
 ) -> None:
     from evo.tools.file_interface import load_res_file
 

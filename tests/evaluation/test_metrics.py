@@ -5,7 +5,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pytest
@@ -77,7 +77,7 @@ def test_rpe_equals_evo(
     relation: str,
     all_pairs: bool,
     value: float,
-    unit: str,
+    unit: Literal["frames", "m", "s"],
 ) -> None:
     reference = make_path(rng, 300)
     estimate = disturb(rng, reference, every=2)

@@ -25,11 +25,11 @@ NOBODY = np.empty((0, 3))
 def cast(
     direction: NDArray[np.float64] | tuple[Any, ...],
     segments: NDArray[np.float64] | list[tuple[float, float, float, float]] = NOTHING,
-    circles: list[tuple[float, float, float]] = NOBODY,
+    circles: NDArray[np.float64] | list[tuple[float, float, float]] = NOBODY,
     origin: Any = (0.0, 0.0),
 ) -> float:
-    direction = np.array([direction]) / np.linalg.norm(direction)
-    return cast_rays(np.array([origin]), direction, np.asarray(segments, float), np.asarray(circles, float))[0]
+    unit = np.array([direction]) / np.linalg.norm(direction)
+    return float(cast_rays(np.array([origin]), unit, np.asarray(segments, float), np.asarray(circles, float))[0])
 
 
 @pytest.mark.parametrize(

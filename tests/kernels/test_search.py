@@ -21,7 +21,7 @@ NONE = np.empty(0)
 
 
 def parameters(**changes: bool | int) -> SearchParameters:
-    values = {
+    values: dict[str, Any] = {
         "memory_size": 8, "consideration_rate": 0.88, "par_min": 0.55, "par_max": 0.98,
         "bandwidth_max": (2.0, 2.0, 0.2), "bandwidth_ratio": 0.01, "improvisations_per_pass": 5, "attraction": 0.7,
         "differential_weight": 0.44, "budget": 60, "count_improvisations": False, "restarts": 1, "agreement": 1,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import pi
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +11,8 @@ import pytest
 from hsloc.model import OccupancyGrid, Pose2, Scan, Trajectory
 
 
-def scan(ranges: list[float], **changes: Pose2 | float | np.float32) -> Scan:
-    values = {"angle_min": -pi / 2, "angle_increment": pi / 2, "range_min": 0.1, "range_max": 10.0}
+def scan(ranges: list[float], **changes: Any) -> Scan:
+    values: dict[str, Any] = {"angle_min": -pi / 2, "angle_increment": pi / 2, "range_min": 0.1, "range_max": 10.0}
     return Scan(0, np.array(ranges, dtype=np.float32), **{**values, **changes})
 
 

@@ -34,12 +34,12 @@ def at(seconds: float, speed: float = 1.0, turn: float = 0.5) -> Pose2:
     return Pose2(speed / turn * np.sin(angle), speed / turn * (1.0 - np.cos(angle)), angle)
 
 
-def scan(stamp_s: float = 1.0, beams: int = 100, sweep_s: float = 0.1, **changes: float) -> Scan:
-    values = {"T_base_laser": Pose2(0.2, 0.1, 0.3), "time_increment": sweep_s / max(beams, 1)} | changes
+def scan(stamp_s: float = 1.0, beams: int = 100, sweep_s: float = 0.1, **changes: Any) -> Scan:
+    values: dict[str, Any] = {"T_base_laser": Pose2(0.2, 0.1, 0.3), "time_increment": sweep_s / max(beams, 1)} | changes
     return Scan(round(stamp_s * SECOND), np.full(beams, 2.0, np.float32), -1.0, 0.02, 0.1, 10.0, **values)
 
 
-def paired_scan(events: list[Odometry]) -> PairedScan:
+def paired_scan(events: list[Any]) -> PairedScan:
     (found,) = (event for event in pair(sorted(events, key=lambda e: e.stamp_ns), deskew=True) if is_scan(event))
     return found
 
@@ -77,7 +77,8 @@ def test_scans_without_a_usable_time_of_their_beams_stay(changes: dict[str, Any]
 
 
 def test_all_events_come_once_and_scans_keep_their_order() -> None:
-    events = sorted([*drive(), *(scan(s / 10, sweep_s=0.15) for s in range(20))], key=lambda e: e.stamp_ns)
+    events: list[Any] = [*drive(), *(scan(s / 10, sweep_s=0.15) for s in range(20))]
+    events.sort(key=lambda e: e.stamp_ns)
     found = list(pair(events, deskew=True))
     assert len(found) == len(events)
     stamps = [event.stamp_ns for event in found if isinstance(event, Odometry)]

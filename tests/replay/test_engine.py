@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hsloc.model import Estimate, Odometry, PairedScan, Pose2, Scan, Status, Truth
+from hsloc.model import Estimate, Event, Odometry, PairedScan, Pose2, Scan, Status, Truth
 from hsloc.replay.engine import pair, replay
 
 RANGES = np.ones(3, dtype=np.float32)
@@ -23,7 +23,7 @@ def scan(stamp: int) -> Scan:
 
 def told(events: list[Any]) -> list[Any]:
     """What comes out, in short: O stamp, S stamp x, T stamp."""
-    out = []
+    out: list[Any] = []
     for event in pair(events):
         if isinstance(event, PairedScan):
             out.append(("S", event.scan.stamp_ns, round(event.T_odom_base.x, 9)))
@@ -62,7 +62,7 @@ def test_a_late_scan_is_placed_among_recent_odometry() -> None:
 
 
 def test_order_of_scans_is_kept_and_none_is_lost() -> None:
-    events = [odometry(0, 0)]
+    events: list[Event] = [odometry(0, 0)]
     for k in range(1, 300):
         events += [scan(10 * k - 3), scan(10 * k - 2), odometry(10 * k, k)]
     out = told(events)
@@ -74,7 +74,7 @@ def test_order_of_scans_is_kept_and_none_is_lost() -> None:
 
 class Spy:
     def __init__(self) -> None:
-        self.seen = []
+        self.seen: list[Odometry | PairedScan] = []
 
     def update(self, event: Odometry | PairedScan) -> Estimate:
         self.seen.append(event)
@@ -83,7 +83,7 @@ class Spy:
 
 def test_the_truth_never_reaches_the_estimator() -> None:
     spy = Spy()
-    events = [odometry(0, 0), Truth(0, Pose2(9.0, 9.0, 0.0)), scan(0)]
+    events: list[Event] = [odometry(0, 0), Truth(0, Pose2(9.0, 9.0, 0.0)), scan(0)]
     out = list(replay(events, spy))
     assert [type(event) for event in spy.seen] == [Odometry, PairedScan]
     assert [(type(event), estimate is None) for event, estimate in out] == [

@@ -46,9 +46,7 @@ def moving(tmp_path: Path) -> Path:
     return path
 
 
-def replay(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], *options: Path | str, code: int = 0
-) -> dict[str, Any] | str:
+def replay(tmp_path: Path, capsys: pytest.CaptureFixture[str], *options: Path | str, code: int = 0) -> Any:
     out = str(tmp_path / "out")
     assert main(["replay", str(HALL), "--end", "6", *map(str, options), "--out", out, "--overwrite", "--json"]) == code
     captured = capsys.readouterr()
@@ -100,7 +98,9 @@ def test_replay_compares_with_any_reference(
     rows = "".join(f"{stamp / 1e9:.9f},{x!r},{y!r},{theta!r}\n" for stamp, (x, y, theta) in
                    zip(truth.stamps_ns.tolist(), truth.poses.tolist(), strict=True))  # fmt: skip
     (tmp_path / "truth.csv").write_text(f'"t","x","y","theta"\n{rows}')
-    named = {"tum": tmp_path / "truth.tum", "csv": tmp_path / "truth.csv", "log": HALL, "topic": "/ground_truth"}[kind]
+    named: Any = {"tum": tmp_path / "truth.tum", "csv": tmp_path / "truth.csv", "log": HALL, "topic": "/ground_truth"}[
+        kind
+    ]
     expected = replay(tmp_path, capsys)
     found = replay(tmp_path, capsys, "--reference", named)
     assert found["matched"] == expected["matched"]

@@ -49,7 +49,9 @@ class Page(HTMLParser):
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.open, self.elements, self.text = [], [], []
+        self.open: list[str] = []
+        self.elements: list[tuple[str, dict[str, Any]]] = []
+        self.text: list[tuple[str, str]] = []
         self.feed(text)
         self.close()
         assert self.open == []
@@ -59,13 +61,13 @@ class Page(HTMLParser):
         if tag not in VOID:
             self.open.append(tag)
 
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str]]) -> None:
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.elements.append((tag, dict(attrs)))
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
 
-    def handle_data(self, data: Path) -> None:
+    def handle_data(self, data: str) -> None:
         self.text.append((self.open[-1] if self.open else "", data))
 
     def all(self, tag: str) -> list[Any]:

@@ -23,8 +23,8 @@ def circle(n: int = 40, radius: float = 5.0) -> NDArray[np.float64]:
     return np.column_stack((radius * np.cos(angle), radius * np.sin(angle), angle + np.pi / 2))
 
 
-def edges_of(poses: NDArray[np.float64], pairs: list[tuple[int, int]], scale: float = np.inf) -> Edges:
-    pairs = np.array(pairs)
+def edges_of(poses: NDArray[np.float64], links: list[tuple[int, int]], scale: float = np.inf) -> Edges:
+    pairs = np.array(links, dtype=np.int64)
     measured = relative_poses(poses[pairs[:, 0]], poses[pairs[:, 1]])
     return Edges(pairs, measured, np.broadcast_to(TIGHT, (len(pairs), 3, 3)).copy(), np.full(len(pairs), scale))
 

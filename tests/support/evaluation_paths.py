@@ -46,11 +46,13 @@ def office(
     inside[:] = 0
     low, high = round(rows * 0.4), round(rows * 0.6)
 
-    def wall(r0: Any, r1: Any, c0: Any, c1: Any) -> None:
+    def wall(r0: int, r1: int, c0: int, c1: int) -> None:
         inside[max(r0, 0) : r1 + 1, max(c0, 0) : c1 + 1] = 100
 
-    wall(0, 1, 0, columns), wall(rows - 2, rows, 0, columns), wall(0, rows, 0, 1), wall(0, rows, columns - 2, columns)
-    wall(low, low + 1, 0, columns), wall(high, high + 1, 0, columns)
+    for r0, r1 in ((0, 1), (rows - 2, rows), (low, low + 1), (high, high + 1)):
+        wall(r0, r1, 0, columns)
+    wall(0, rows, 0, 1)
+    wall(0, rows, columns - 2, columns)
     rooms = max(round(width_m / 5.0), 1)
     door = round(1.0 / resolution)
     for room in range(rooms):

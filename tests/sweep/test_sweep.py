@@ -198,7 +198,7 @@ def test_mistakes_are_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, expected: str
 ) -> None:
     try:
-        status = main(["sweep", str(OFFICE), "--out", str(tmp_path / "out"), *words])
+        status: object = main(["sweep", str(OFFICE), "--out", str(tmp_path / "out"), *words])
     except SystemExit as stop:
         status = stop.code
     assert status == code

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -40,13 +40,16 @@ def second(first: tuple[Result, Path]) -> Result:
 
 def errors_in_frame_of(first: Result, found: Result) -> NDArray[np.float64]:
     """Distances (m) from the truth, the estimate moved as is best for the first part alone."""
+    assert first.reference is not None
+    assert found.reference is not None
     moved = compare(first.trajectory, first.reference, alignment="se2").T_reference_estimate
     known = (found.trajectory.stamps_ns >= found.reference.stamps_ns[0]) & (
         found.trajectory.stamps_ns <= found.reference.stamps_ns[-1]
     )
     ours = compose_poses(moved.to_array(), found.trajectory.poses[known])
     truth = found.reference.interpolated(found.trajectory.stamps_ns[known])
-    return np.hypot(*(ours - truth)[:, :2].T)
+    distances: NDArray[np.float64] = np.hypot(*(ours - truth)[:, :2].T)
+    return distances
 
 
 def test_the_second_part_is_right_in_the_frame_of_the_first(
@@ -106,6 +109,7 @@ def test_all_forms_of_a_map_can_be_localised_in(first: tuple[Result, Path]) -> N
 
 def test_mistakes_are_told(first: tuple[Result, Path], tmp_path: Path) -> None:
     _, folder = first
+    wrong: dict[str, Any]
     for wrong, said in (
         ({"resume": tmp_path}, "no map.npz there"),
         ({"resume": OFFICE}, "not a saved map"),

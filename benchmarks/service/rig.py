@@ -13,7 +13,7 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
-FAKE_WORKER = Path(__file__).parents[2] / "tests" / "support" / "fake_worker.py"
+FAKE_WORKER = Path(__file__).parents[2] / "tests" / "service" / "fake_worker.py"
 
 
 class Server:

@@ -18,7 +18,7 @@ from hsloc.log import open_log
 from hsloc.matching import LikelihoodField
 from hsloc.replay.engine import replay
 from hsloc.replay.run import find_map, run
-from hsloc.replay.run_history import Recording
+from hsloc.replay.run_history import RunHistory
 from hsloc.request import RunRequest
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def _parts(spec: RunRequest) -> dict[str, float]:
     matcher = _Timed(config.make_matcher())
     rng = np.random.default_rng(0)
     localiser = Localiser(grid, field, matcher, config.localiser, rng, None if stated is None else stated[1])
-    recording = Recording()
+    history = RunHistory()
     reading = 0.0
 
     def timed(events: Iterator[Event]) -> Iterator[Event]:
@@ -131,6 +131,6 @@ def _parts(spec: RunRequest) -> dict[str, float]:
 
     begin = perf_counter()
     for event, estimate in replay(timed(iter(log.events())), localiser):
-        recording.add(event, estimate)
+        history.add(event, estimate)
     total = perf_counter() - begin
     return {"read": reading, "search": matcher.seconds, "other": total - reading - matcher.seconds}

@@ -13,7 +13,7 @@ from hsloc.log import LogWriter, open_log
 from hsloc.model.events import Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.model.trajectory import Trajectory
-from hsloc.preprocessing.odometry_resets import Joined
+from hsloc.preprocessing.odometry_resets import ContinuousOdometry
 from hsloc.replay.engine import pair
 from hsloc.replay.garbage import seldom_collected
 from hsloc.version import __version__
@@ -64,7 +64,7 @@ def write_recording(result: Result, path: Path, progress: Callable[[float], None
         writer.metadata("hsloc", {"version": __version__, "seed": str(result.spec.seed)})
         writer.attachment("config.yaml", config_text(result).encode(), "application/yaml")
         writer.occupancy_grid(result.grid, start)
-        for event in pair(Joined(log.events()), deskew=result.spec.read.deskew, first=first):
+        for event in pair(ContinuousOdometry(log.events()), deskew=result.spec.read.deskew, first=first):
             if isinstance(event, PairedScan):
                 scan = event.scan
                 if scan.frame_id not in mountings:

@@ -24,7 +24,7 @@ _MOST = 20
 """So many jumps are mended; after more of them the odometry is taken for broken."""
 
 
-class Joined:
+class ContinuousOdometry:
     """Events whose odometry goes on where it jumped. To be gone through once; then `doubt` tells what was found."""
 
     def __init__(self, events: Iterable[Event], topic: str | None = None) -> None:

@@ -17,13 +17,13 @@ from hsloc.matching.window import Window
 from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
-from hsloc.preprocessing.odometry_resets import Joined
+from hsloc.preprocessing.odometry_resets import ContinuousOdometry
 from hsloc.replay.engine import replay
 from hsloc.replay.garbage import seldom_collected
 from hsloc.replay.initial_pose import find_start, first_odometry
 from hsloc.replay.map_sources import load_grid, load_state, maps_beside, unread_maps
 from hsloc.replay.references import read_reference
-from hsloc.replay.run_history import Recording
+from hsloc.replay.run_history import RunHistory
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.parameters import Resume
 from hsloc.slam.point_mapper import PointMapper
@@ -104,24 +104,24 @@ def run(spec: RunRequest, progress: Callable[[Progress], None] | None = None) ->
     if progress is not None:
         progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
     if localise:
-        start, doubts = find_start(spec, log, _must(grid))
+        start, doubts = find_start(spec, log, require_map(grid))
         warnings = (*warnings, *doubts)
         likelihood = LikelihoodField.from_grid(
-            _must(grid), spec.config.likelihood_field.sigma, spec.config.likelihood_field.margin
+            require_map(grid), spec.config.likelihood_field.sigma, spec.config.likelihood_field.margin
         )
-        estimator: Estimator = _localiser(spec, _must(grid), likelihood, start)
+        estimator: Estimator = _localiser(spec, require_map(grid), likelihood, start)
     else:
         likelihood, estimator = None, _mapper(spec, state)
     first = None if spec.no_odometry else first_odometry(log.events())
     prepared = time.perf_counter()
-    recording, events = Recording(), Joined(_events(spec, log), log.summary.odom_topic)
+    history, events = RunHistory(), ContinuousOdometry(_events(spec, log), log.summary.odom_topic)
     with seldom_collected():
         for event, estimate in replay(
-            _reported(log, events, recording, progress), estimator, deskew=spec.read.deskew, first=first
+            _reported(log, events, history, progress), estimator, deskew=spec.read.deskew, first=first
         ):
-            recording.add(event, estimate)
+            history.add(event, estimate)
     replayed = time.perf_counter()
-    if recording.scans == 0:
+    if history.scans == 0:
         where = "between --start and --end" if _cut(spec) else f"on {log.summary.scan_topic} that could be read"
         lost = "".join(f": {line}" for line in ["; ".join(log.losses.lines())] if line)
         raise LogError(f"{spec.logs[0]}: no scan {where}{lost}")
@@ -131,22 +131,22 @@ def run(spec: RunRequest, progress: Callable[[Progress], None] | None = None) ->
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
     mapping, true_grid = None, None if localise else grid
     if isinstance(estimator, Mapper):
-        mapping = estimator.finish(_share(progress, log.summary.duration_s, recording.scans))
+        mapping = estimator.finish(_share(progress, log.summary.duration_s, history.scans))
         grid = mapping.grid
         seconds["finish"] = time.perf_counter() - replayed
     elif isinstance(estimator, PointMapper):
         grid = estimator.grid()
-    trajectory, localised = recording.trajectory() if mapping is None else _mapped(recording, mapping)
+    trajectory, localised = history.trajectory() if mapping is None else _mapped(history, mapping)
     return Result(
         spec=spec,
         summary=log.summary,
         input_sha256=log.sha256(),
         trajectory=trajectory,
         localised=localised,
-        odometry=recording.odometry(),
-        reference=recording.reference() if reference is None else reference,
-        grid=_must(grid),
-        diagnostics=recording.diagnostics(),
+        odometry=history.odometry(),
+        reference=history.reference() if reference is None else reference,
+        grid=require_map(grid),
+        diagnostics=history.diagnostics(),
         losses=log.losses,
         warnings=(*log.summary.warnings, *warnings, *events.doubt()),
         seconds=seconds,
@@ -157,12 +157,12 @@ def run(spec: RunRequest, progress: Callable[[Progress], None] | None = None) ->
     )
 
 
-def _mapped(recording: Recording, mapping: MappingResult) -> tuple[Trajectory, NDArray[np.bool_]]:
+def _mapped(history: RunHistory, mapping: MappingResult) -> tuple[Trajectory, NDArray[np.bool_]]:
     """The trajectory as it is known at the end: at the odometry messages, or at the scans if there are none."""
-    stamps = recording.odometry().stamps_ns
+    stamps = history.odometry().stamps_ns
     poses = mapping.odometry_poses
     if len(stamps) == 0:
-        stamps, poses = recording.diagnostics().stamps_ns, mapping.scan_poses
+        stamps, poses = history.diagnostics().stamps_ns, mapping.scan_poses
     return Trajectory(stamps, poses), np.ones(len(stamps), dtype=np.bool_)
 
 
@@ -198,7 +198,8 @@ def find_map(spec: RunRequest, log: Log) -> tuple[OccupancyGrid | None, tuple[st
     return None, (hint + ("" if not beside[1:] else f" (also there: {', '.join(p.name for p in beside[1:])})"),)
 
 
-def _must(grid: OccupancyGrid | None) -> OccupancyGrid:
+def require_map(grid: OccupancyGrid | None) -> OccupancyGrid:
+    """The map. Raises MapError where there is none."""
     if grid is None:
         raise MapError("no map to localise in")
     return grid
@@ -250,7 +251,7 @@ def _cut(spec: RunRequest) -> bool:
 
 
 def _reported(
-    log: Log, events: Iterable[Event], recording: Recording, progress: Callable[[Progress], None] | None
+    log: Log, events: Iterable[Event], history: RunHistory, progress: Callable[[Progress], None] | None
 ) -> Iterator[Event]:
     """The events, telling now and then how far they are."""
     if progress is None:
@@ -261,4 +262,4 @@ def _reported(
     for event in events:
         yield event
         if isinstance(event, Scan):
-            progress(Progress("replay", max((event.stamp_ns - origin) / 1e9, 0.0), total, recording.scans))
+            progress(Progress("replay", max((event.stamp_ns - origin) / 1e9, 0.0), total, history.scans))

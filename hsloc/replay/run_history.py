@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hsloc.model.pose2 import Pose2
 
 
-class Recording:
+class RunHistory:
     """Columns that grow with the log: the result itself, and all of the memory that does."""
 
     def __init__(self) -> None:

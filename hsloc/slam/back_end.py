@@ -11,10 +11,10 @@ from hsloc.errors import MapError
 from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import Pose2, wrap_angles
 from hsloc.slam.calibration import OdometryCalibration
-from hsloc.slam.joint_registration import Refined, refine, stirred
+from hsloc.slam.joint_registration import Registration, moved_scans, refine
 from hsloc.slam.loop_closer import Loop, LoopCloser
 from hsloc.slam.map_extension import connect, unconnected
-from hsloc.slam.map_session import gather
+from hsloc.slam.map_session import from_front_end
 from hsloc.slam.map_state import MapState, fingerprint
 from hsloc.slam.occupancy_mapper import draw_grid
 from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
@@ -28,15 +28,15 @@ if TYPE_CHECKING:
 
     from hsloc.slam.front_end import LocalMatch
     from hsloc.slam.keyscans import KeyScan, KeyScans
-    from hsloc.slam.map_session import Gathered
+    from hsloc.slam.map_session import MapSession
     from hsloc.slam.parameters import GraphMapperParameters, Resume
-    from hsloc.slam.submaps import Places
-    from hsloc.slam.trajectory_correction import Track
+    from hsloc.slam.submaps import Submaps
+    from hsloc.slam.trajectory_correction import EventLog
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
-_TORN = 6.0
+MAX_EDGE_CHI = 6.0
 """A loop whose chi is larger than this once the graph is solved was wrong."""
 _MOST_TORN = 5
 """So often at most the loops are looked for anew, each time without the worst wrong one."""
@@ -48,7 +48,7 @@ def finish(
     scans: list[KeyScan],
     stamps_ns: I64,
     local: list[LocalMatch],
-    track: Track,
+    track: EventLog,
     parameters: GraphMapperParameters,
     rng: Generator,
     progress: Callable[[float], None] | None = None,
@@ -63,15 +63,15 @@ def finish(
         if resume is not None:
             raise MapError(unconnected(resume.state))
         return _empty(track)
-    gathered = gather(scans, stamps_ns, local, track, parameters)
+    gathered = from_front_end(scans, stamps_ns, local, track, parameters)
     if resume is not None:
         gathered = connect(resume.state, gathered, parameters, rng, resume.T_map_first)
     poses, loops, loop_edges = _close_loops(gathered, parameters, rng, lambda part: tell(0.5 * part))
     if resume is not None and not any(loop.accepted and _connects(loop, gathered) for loop in loops):
         raise MapError(unconnected(resume.state))
-    edges = Edges.joined([gathered.steps, loop_edges])
+    edges = Edges.concatenate([gathered.steps, loop_edges])
     refined, passes = _refine(poses, gathered.scans, edges, parameters, lambda part: tell(0.5 + 0.4 * part))
-    grid = draw_grid(refined.poses, gathered.scans, parameters.drawing)
+    grid = draw_grid(refined.poses, gathered.scans, parameters.occupancy)
     tell(1.0)
     of_log = refined.poses[gathered.first :]
     calibration = track.calibrated(of_log) if parameters.use_odometry else OdometryCalibration()
@@ -91,12 +91,12 @@ def finish(
     )
 
 
-def _connects(loop: Loop, gathered: Gathered) -> bool:
+def _connects(loop: Loop, gathered: MapSession) -> bool:
     return loop.first < gathered.first_place <= loop.second
 
 
 def _state(
-    gathered: Gathered, poses: F64, loops: Edges, grid: OccupancyGrid, parameters: GraphMapperParameters
+    gathered: MapSession, poses: F64, loops: Edges, grid: OccupancyGrid, parameters: GraphMapperParameters
 ) -> MapState:
     return MapState(
         scans=gathered.scans,
@@ -112,7 +112,7 @@ def _state(
 
 
 def _close_loops(
-    gathered: Gathered, parameters: GraphMapperParameters, rng: Generator, progress: Callable[[float], None]
+    gathered: MapSession, parameters: GraphMapperParameters, rng: Generator, progress: Callable[[float], None]
 ) -> tuple[F64, list[Loop], Edges]:
     """Poses of the keyscans with all loops closed, the loops, and those accepted as edges between keyscans."""
     p, places, chain = parameters.loops, gathered.places, gathered.chain
@@ -134,18 +134,18 @@ def _close_loops(
     return solved, [*loops, *torn], edges
 
 
-def _solved(closer: LoopCloser, places: Places, chain: Edges, robust: float) -> tuple[F64, Edges, Loop | None]:
+def _solved(closer: LoopCloser, places: Submaps, chain: Edges, robust: float) -> tuple[F64, Edges, Loop | None]:
     """The graph of keyscans solved with the loops, and the loop that tears worst, if any does, as refused."""
     edges = _between_keyscans(closer.loops, places, robust)
-    solved = solve_edges(places.expand(closer.poses), Edges.joined([chain, edges]))
+    solved = solve_edges(places.expand(closer.poses), Edges.concatenate([chain, edges]))
     _, _, chi = edge_errors(solved, edges)
-    if not (chi > _TORN).any():
+    if not (chi > MAX_EDGE_CHI).any():
         return solved, edges, None
     loop = closer.accepted[int(np.argmax(chi))]
     return solved, edges, replace(loop, accepted=False, reason=f"torn: {chi.max():.0f} sigma off, the graph solved")
 
 
-def _between_keyscans(loops: list[Loop], places: Places, robust: float) -> Edges:
+def _between_keyscans(loops: list[Loop], places: Submaps, robust: float) -> Edges:
     accepted = [loop for loop in loops if loop.accepted]
     if not accepted:
         return Edges.none()
@@ -160,9 +160,9 @@ def _between_keyscans(loops: list[Loop], places: Places, robust: float) -> Edges
 
 def _refine(
     poses: F64, scans: KeyScans, edges: Edges, parameters: GraphMapperParameters, progress: Callable[[float], None]
-) -> tuple[Refined, int]:
+) -> tuple[Registration, int]:
     """Passes over the whole log, each with partners chosen anew, until nothing moves."""
-    most, p = parameters.passes, parameters.refinement
+    most, p = parameters.passes, parameters.joint_registration
     # Later passes begin near their end: no wide gates, and fewer rounds.
     later = replace(p, gates=p.gates[-1:], rounds=max(p.rounds // 2, 1))
     refined = refine(poses, scans, edges, p, lambda part: progress(part / most))
@@ -174,12 +174,12 @@ def _refine(
         passes += 1
         change = refined.poses - begin
         change[:, 2] = wrap_angles(change[:, 2])
-        if stirred(change) < p.still:
+        if moved_scans(change) < p.convergence_tolerance:
             break
     return refined, passes
 
 
-def _revision(odometry_poses: F64, track: Track) -> tuple[tuple[int, Pose2], ...]:
+def _revision(odometry_poses: F64, track: EventLog) -> tuple[tuple[int, Pose2], ...]:
     return tuple(
         (k, Pose2.from_array(pose) @ Pose2.from_array(odometry).inverse())
         for k, (pose, odometry) in enumerate(zip(odometry_poses, track.odometry(), strict=True))
@@ -187,7 +187,7 @@ def _revision(odometry_poses: F64, track: Track) -> tuple[tuple[int, Pose2], ...
 
 
 def _quality(
-    refined: Refined, passes: int, loops: list[Loop], edges: Edges, grid: OccupancyGrid, scans: KeyScans
+    refined: Registration, passes: int, loops: list[Loop], edges: Edges, grid: OccupancyGrid, scans: KeyScans
 ) -> MappingQuality:
     nan = float("nan")
     distance, angle, _ = edge_errors(refined.poses, edges)
@@ -224,7 +224,7 @@ def _residuals(poses: F64, scans: KeyScans, grid: OccupancyGrid) -> F64:
     return distances
 
 
-def _empty(track: Track) -> MappingResult:
+def _empty(track: EventLog) -> MappingResult:
     """No scan had a return: odometry is all there is."""
     nan = float("nan")
     odometry_poses, scan_poses = track.corrected(np.zeros((0, 3)))

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LocalMatchingParameters:
+class FrontEndParameters:
     """When a scan becomes a keyscan, what it is matched against and in which window."""
 
     keyscan_min_d: float = 0.1
@@ -47,7 +47,7 @@ class LocalMatchingParameters:
     """Of the local field (m)."""
     sigma: float = 0.1
     """Decay of the score with the distance from a wall (m)."""
-    reach: float = 0.4
+    max_distance: float = 0.4
     """Beyond it the score is zero (m)."""
     submap_length: float = 4.0
     """A local map begins after so many metres of the way, and another one later it takes over (m)."""
@@ -65,7 +65,7 @@ class LocalMatchingParameters:
     """And of such an angle (rad)."""
     min_fitness: float = 0.35
     """A match below is refused."""
-    usual_fraction: float = 0.7
+    min_fitness_ratio: float = 0.7
     """And so is one below this part of the usual fitness."""
     match_trust: float = 0.05
     """A match's covariance is taken times this: against the scans just before, errors of the map hardly count."""
@@ -83,10 +83,18 @@ class LocalMatchingParameters:
     def __post_init__(self) -> None:
         for name in ("keyscan_min_d", "keyscan_min_a"):
             if not getattr(self, name) >= 0.0:
-                raise ConfigError(f"local_matching: {name} is {getattr(self, name)}; it must be 0 or more")
-        for name in ("local_range", "resolution", "sigma", "reach", "submap_length", "window_min", "window_min_angle"):
+                raise ConfigError(f"front_end: {name} is {getattr(self, name)}; it must be 0 or more")
+        for name in (
+            "local_range",
+            "resolution",
+            "sigma",
+            "max_distance",
+            "submap_length",
+            "window_min",
+            "window_min_angle",
+        ):
             if not getattr(self, name) > 0.0:
-                raise ConfigError(f"local_matching: {name} is {getattr(self, name)}; it must be positive")
+                raise ConfigError(f"front_end: {name} is {getattr(self, name)}; it must be positive")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,10 +125,10 @@ _CONVINCING = 0.9
 """A match in the wide window must reach this part of the usual fitness."""
 
 
-class LocalMatcher:
+class FrontEnd:
     """State: the last keyscan's pose and odometry, and two local maps that overlap."""
 
-    def __init__(self, parameters: LocalMatchingParameters, rng: Generator, use_odometry: bool = True) -> None:
+    def __init__(self, parameters: FrontEndParameters, rng: Generator, use_odometry: bool = True) -> None:
         self._parameters = parameters
         self._rng = rng
         self._use_odometry = use_odometry
@@ -211,7 +219,7 @@ class LocalMatcher:
         p = self._parameters
         if match.fitness < p.min_fitness:
             return f"fitness {match.fitness:.2f} below {p.min_fitness:.2f}"
-        if self._usual is not None and match.fitness < p.usual_fraction * self._usual:
+        if self._usual is not None and match.fitness < p.min_fitness_ratio * self._usual:
             return f"fitness {match.fitness:.2f} far below the usual {self._usual:.2f}"
         return ""
 
@@ -246,7 +254,7 @@ class LocalMatcher:
         if self._refused >= p.restart_after:
             self._maps, self._refused = [], 0
         if not self._maps or self._way - self._maps[-1][1] > p.submap_length:
-            self._maps = [*self._maps[-1:], (LocalMap(p.resolution, p.sigma, p.reach), self._way)]
+            self._maps = [*self._maps[-1:], (LocalMap(p.resolution, p.sigma, p.max_distance), self._way)]
         self._T_map_key, self._T_odom_key = found.pose, paired.T_odom_base
         if self._last is None:
             self._last = (paired.scan.stamp_ns, found.pose)

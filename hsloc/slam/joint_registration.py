@@ -15,7 +15,7 @@ import numpy as np
 from hsloc.errors import ConfigError
 from hsloc.kernels.normal_equations import add_edges, assemble_pairs
 from hsloc.model.pose2 import wrap_angles
-from hsloc.slam.pose_graph import moved_by, solve_anchored
+from hsloc.slam.pose_graph import apply_increment, solve_anchored
 from hsloc.slam.sparse_solver import BlockSystem
 
 if TYPE_CHECKING:
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RefinementParameters:
+class JointRegistrationParameters:
     """Which scans are compared, and how they are pulled onto each other."""
 
     radius: float = 3.0
     """Scans taken so near to each other are compared (m)."""
-    partners: int = 8
+    max_partners: int = 8
     """Each scan chooses so many of them, of different places and headings."""
-    crowd: int = 16
+    max_scans_per_view: int = 16
     """Of more scans of one place and heading, so many stand for all: a room crossed all day is known by then."""
     temporal: int = 3
     """And is compared with so many scans before it."""
@@ -48,27 +48,27 @@ class RefinementParameters:
     """Scale of the Geman-McClure weight, as a part of the gate."""
     sigma: float = 0.02
     """Standard deviation of a point from a wall (m)."""
-    correlated: float = 20.0
+    correlated_points: float = 20.0
     """So many points count as one: neighbouring beams, and pairs of neighbouring scans, share their errors."""
     points_per_scan: int = 90
     """About so many hits of a scan are used."""
     rounds: int = 6
     """At most, in a pass."""
-    still: float = 0.002
+    convergence_tolerance: float = 0.002
     """Nothing moves when 99 of 100 poses move less than this (m; rad: a fifth)."""
 
     def __post_init__(self) -> None:
-        for name in ("radius", "sigma", "correlated", "scale_of_gate"):
+        for name in ("radius", "sigma", "correlated_points", "scale_of_gate"):
             if not getattr(self, name) > 0.0:
-                raise ConfigError(f"refinement: {name} is {getattr(self, name)}; it must be positive")
+                raise ConfigError(f"joint_registration: {name} is {getattr(self, name)}; it must be positive")
         if not self.gates or min(self.gates) <= 0.0:
-            raise ConfigError(f"refinement: gates is {self.gates}; it must hold at least one positive length")
-        if min(self.points_per_scan, self.rounds, self.crowd) < 1:
-            raise ConfigError("refinement: points_per_scan, rounds and crowd must be at least 1")
+            raise ConfigError(f"joint_registration: gates is {self.gates}; it must hold at least one positive length")
+        if min(self.points_per_scan, self.rounds, self.max_scans_per_view) < 1:
+            raise ConfigError("joint_registration: points_per_scan, rounds and max_scans_per_view must be at least 1")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Refined:
+class Registration:
     """What a pass found; `counts` (m, 5) of the pairs (m, 2) as in `kernels.surfels.pair_terms`."""
 
     poses: F64
@@ -95,17 +95,17 @@ def refine(
     poses: F64,
     scans: KeyScans,
     edges: Edges,
-    parameters: RefinementParameters,
+    parameters: JointRegistrationParameters,
     progress: Callable[[float], None] | None = None,
-) -> Refined:
+) -> Registration:
     """Move `poses` (n, 3) until all pairs of scans and all edges agree best; the first pose stays."""
     p = parameters
-    pairs = neighbour_pairs(poses, p.radius, p.partners, p.temporal, p.crowd)
+    pairs = neighbour_pairs(poses, p.radius, p.max_partners, p.temporal, p.max_scans_per_view)
     system = BlockSystem(
         len(poses), np.concatenate((pairs[:, 0], edges.pairs[:, 0])), np.concatenate((pairs[:, 1], edges.pairs[:, 1]))
     )
     chosen, chosen_start = scans.chosen(p.points_per_scan)
-    weights = np.full(len(pairs), 1.0 / (p.sigma**2 * p.correlated))
+    weights = np.full(len(pairs), 1.0 / (p.sigma**2 * p.correlated_points))
     counts = np.zeros((len(pairs), 5))
     pair_blocks, edge_blocks = np.empty((len(pairs), 3, 3)), np.empty((len(edges), 3, 3))
     moved, rounds = 0.0, 0
@@ -119,16 +119,16 @@ def refine(
             diagonal, pair_blocks, right, counts,
         )  # fmt: skip
         step = solve_anchored(system, diagonal, np.concatenate((pair_blocks, edge_blocks)), right)
-        poses = moved_by(poses, step)
-        moved = stirred(step)
+        poses = apply_increment(poses, step)
+        moved = moved_scans(step)
         if progress is not None:
             progress(rounds / p.rounds)
-        if rounds >= len(p.gates) and moved < p.still:
+        if rounds >= len(p.gates) and moved < p.convergence_tolerance:
             break
-    return Refined(poses, pairs, counts, rounds, moved)
+    return Registration(poses, pairs, counts, rounds, moved)
 
 
-def stirred(step: F64) -> float:
+def moved_scans(step: F64) -> float:
     """What 99 of 100 poses moved less than, of a step (n, 3): m, or rad as fifths of a metre.
 
     Not the longest move: a scan with a handful of pairs may swing for ever between two walls.

@@ -70,7 +70,7 @@ class KeyScans:
     geometry: F64
 
     @staticmethod
-    def joined(scans: list[KeyScan]) -> KeyScans:
+    def from_scans(scans: list[KeyScan]) -> KeyScans:
         """Of at least one scan."""
         return KeyScans(
             np.concatenate([scan.points for scan in scans]),
@@ -90,10 +90,10 @@ class KeyScans:
         for k in range(len(start) - 1):
             hits, beams = slice(start[k], start[k + 1]), slice(table_start[k], table_start[k + 1])
             scans.append(KeyScan.fitted(points[hits], hit_of_beam[beams], ranges[beams], geometry[k]))
-        return KeyScans.joined(scans)
+        return KeyScans.from_scans(scans)
 
     @staticmethod
-    def together(first: KeyScans, second: KeyScans) -> KeyScans:
+    def concatenate(first: KeyScans, second: KeyScans) -> KeyScans:
         """Those of two logs."""
         return KeyScans(
             np.concatenate((first.points, second.points)),

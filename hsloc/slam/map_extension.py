@@ -14,7 +14,7 @@ from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.model.events import PairedScan
 from hsloc.model.pose2 import Pose2
 from hsloc.slam.loop_closer import LoopCloser
-from hsloc.slam.map_session import restored, together
+from hsloc.slam.map_session import concatenate, from_map_state
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
 
     from hsloc.slam.loop_closer import Loop
-    from hsloc.slam.map_session import Gathered
+    from hsloc.slam.map_session import MapSession
     from hsloc.slam.map_state import MapState
     from hsloc.slam.parameters import GraphMapperParameters
 
@@ -38,20 +38,20 @@ _AGREE = 2
 
 def connect(
     state: MapState,
-    log: Gathered,
+    log: MapSession,
     parameters: GraphMapperParameters,
     rng: Generator,
     T_map_first: Pose2 | None = None,
-) -> Gathered:
+) -> MapSession:
     """The saved map and the log in its frame, connected by loops; `T_map_first` is the log's start, if it is known.
 
     A place that is found is believed if loops between it and the old places around it pass all that is asked of a
     loop. Raises MapError if there is none.
     """
-    old = restored(state, parameters)
+    old = from_map_state(state, parameters)
     found = _relocalised(state, log, parameters, rng) if T_map_first is None else iter([(T_map_first, 0)])
     for T_map_front, scan in found:
-        both = together(old, log.moved(T_map_front))
+        both = concatenate(old, log.moved(T_map_front))
         loops = _verified(both, both.first + scan, parameters, rng)
         if loops:
             return replace(both, known=(*both.known, *loops))
@@ -67,11 +67,11 @@ def unconnected(state: MapState) -> str:
 
 
 def _relocalised(
-    state: MapState, log: Gathered, parameters: GraphMapperParameters, rng: Generator
+    state: MapState, log: MapSession, parameters: GraphMapperParameters, rng: Generator
 ) -> Iterator[tuple[Pose2, int]]:
     """T_map_front by the relocaliser, and the keyscan of the log at which it was sure."""
     field = LikelihoodField.from_grid(state.grid)
-    noise = parameters.local_matching.odometry_noise
+    noise = parameters.front_end.odometry_noise
     relocaliser = Relocaliser(state.grid, field, Hide(), RelocaliserParameters(), noise, rng)
     starts = log.places.start[:-1]
     for begin in starts[np.unique(np.linspace(0, len(starts) - 1, _ATTEMPTS).astype(np.int64))]:
@@ -84,7 +84,7 @@ def _relocalised(
                 break
 
 
-def _verified(both: Gathered, scan: int, parameters: GraphMapperParameters, rng: Generator) -> list[Loop]:
+def _verified(both: MapSession, scan: int, parameters: GraphMapperParameters, rng: Generator) -> list[Loop]:
     """Accepted loops between the places around a keyscan and those of the old map; none if too few are."""
     first_place = both.first_place
     closer = LoopCloser(both.places, both.scans, parameters.loops, rng, first=first_place)

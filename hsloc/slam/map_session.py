@@ -12,7 +12,7 @@ from hsloc.model.pose2 import Pose2, compose_poses, relative_poses
 from hsloc.slam.keyscans import KeyScans
 from hsloc.slam.loop_closer import Loop
 from hsloc.slam.pose_graph import Edges
-from hsloc.slam.submaps import UNKNOWN_STEP, Places
+from hsloc.slam.submaps import UNKNOWN_STEP, Submaps
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hsloc.slam.keyscans import KeyScan
     from hsloc.slam.map_state import MapState
     from hsloc.slam.parameters import GraphMapperParameters
-    from hsloc.slam.trajectory_correction import Track
+    from hsloc.slam.trajectory_correction import EventLog
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
@@ -31,7 +31,7 @@ _ODOMETRY_FLOOR = np.diag((0.01**2, 0.01**2, 0.005**2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Gathered:
+class MapSession:
     """Keyscans at `poses` (n, 3), not yet corrected, and what was measured between them.
 
     `motions` (n, 3) and `covariances` (n, 3, 3) lead to each keyscan from the one before, by the front end; `refused`
@@ -46,7 +46,7 @@ class Gathered:
     covariances: F64
     refused: NDArray[np.bool_]
     steps: Edges
-    places: Places
+    places: Submaps
     known: tuple[Loop, ...] = ()
     first: int = 0
     first_place: int = 0
@@ -56,39 +56,39 @@ class Gathered:
         """The front end's steps as edges."""
         return Edges.chain(self.motions[1:], self.covariances[1:], self.refused[1:])
 
-    def moved(self, T_map_front: Pose2) -> Gathered:
+    def moved(self, T_map_front: Pose2) -> MapSession:
         """The same in the map's frame."""
         poses = compose_poses(T_map_front.to_array(), self.poses)
         return replace(self, poses=poses, places=replace(self.places, poses=poses))
 
 
-def gather(
-    scans: list[KeyScan], stamps_ns: I64, local: list[LocalMatch], track: Track, parameters: GraphMapperParameters
-) -> Gathered:
+def from_front_end(
+    scans: list[KeyScan], stamps_ns: I64, local: list[LocalMatch], track: EventLog, parameters: GraphMapperParameters
+) -> MapSession:
     """Of a log with at least one keyscan."""
     poses = np.array([found.pose.to_array() for found in local])
     motions = np.array([found.motion.to_array() for found in local])
     covariances = np.array([found.covariance for found in local])
     refused = np.array([found.status is Status.REJECTED for found in local], dtype=bool)
-    length, turn = parameters.loops.place_length, parameters.local_matching.turn_length
-    return Gathered(
-        scans=KeyScans.joined(scans),
+    length, turn = parameters.loops.submap_length, parameters.front_end.turn_length
+    return MapSession(
+        scans=KeyScans.from_scans(scans),
         stamps_ns=stamps_ns,
         poses=poses,
         motions=motions,
         covariances=covariances,
         refused=refused,
         steps=_odometry_edges(motions, covariances, refused, track, parameters),
-        places=Places.along(poses, motions, covariances, length, turn, refused),
+        places=Submaps.along(poses, motions, covariances, length, turn, refused),
     )
 
 
-def restored(state: MapState, parameters: GraphMapperParameters) -> Gathered:
+def from_map_state(state: MapState, parameters: GraphMapperParameters) -> MapSession:
     """Of a saved map. What was refined is what is measured: the graph holds the old map in its shape."""
     motions = np.concatenate((np.zeros((1, 3)), relative_poses(state.poses[:-1], state.poses[1:])))
-    length, turn = parameters.loops.place_length, parameters.local_matching.turn_length
-    places = Places.along(state.poses, motions, state.covariances, length, turn, state.refused)
-    return Gathered(
+    length, turn = parameters.loops.submap_length, parameters.front_end.turn_length
+    places = Submaps.along(state.poses, motions, state.covariances, length, turn, state.refused)
+    return MapSession(
         scans=state.scans,
         stamps_ns=state.stamps_ns,
         poses=state.poses,
@@ -101,7 +101,7 @@ def restored(state: MapState, parameters: GraphMapperParameters) -> Gathered:
     )
 
 
-def together(old: Gathered, new: Gathered) -> Gathered:
+def concatenate(old: MapSession, new: MapSession) -> MapSession:
     """The old map and a further log, which is in the map's frame."""
     n = len(old.poses)
     seam = relative_poses(old.poses[None, -1], new.poses[None, 0])
@@ -112,22 +112,22 @@ def together(old: Gathered, new: Gathered) -> Gathered:
         np.array([np.inf]),
     )
     later = replace(new.steps, pairs=new.steps.pairs + n)
-    return Gathered(
-        scans=KeyScans.together(old.scans, new.scans),
+    return MapSession(
+        scans=KeyScans.concatenate(old.scans, new.scans),
         stamps_ns=np.concatenate((old.stamps_ns, new.stamps_ns)),
         poses=np.concatenate((old.poses, new.poses)),
         motions=np.concatenate((old.motions, seam, new.motions[1:])),
         covariances=np.concatenate((old.covariances, UNKNOWN_STEP[None], new.covariances[1:])),
         refused=np.concatenate((old.refused, [False], new.refused[1:])),
-        steps=Edges.joined([old.steps, unknown, later]),
-        places=Places.together(old.places, new.places),
+        steps=Edges.concatenate([old.steps, unknown, later]),
+        places=Submaps.concatenate(old.places, new.places),
         known=old.known,
         first=n,
         first_place=len(old.places),
     )
 
 
-def _loops(state: MapState, places: Places) -> tuple[Loop, ...]:
+def _loops(state: MapState, places: Submaps) -> tuple[Loop, ...]:
     """The saved loops, carried from their keyscans to the references of the places in which those lie."""
     owner = np.repeat(np.arange(len(places)), np.diff(places.start))
     loops = []
@@ -147,13 +147,13 @@ def _loops(state: MapState, places: Places) -> tuple[Loop, ...]:
 
 
 def _odometry_edges(
-    motions: F64, covariances: F64, refused: NDArray[np.bool_], track: Track, parameters: GraphMapperParameters
+    motions: F64, covariances: F64, refused: NDArray[np.bool_], track: EventLog, parameters: GraphMapperParameters
 ) -> Edges:
     """Steps from keyscan to keyscan by odometry alone, the scans being compared anew; without it, the matches'."""
     if not parameters.use_odometry:
         return Edges.chain(motions[1:], covariances[1:] + _ODOMETRY_FLOOR, refused[1:])
     odometry = track.key_odometry()
     steps = relative_poses(odometry[:-1], odometry[1:])
-    noise = parameters.local_matching.odometry_noise
+    noise = parameters.front_end.odometry_noise
     floored = [noise.covariance(Pose2.from_array(step)) + _ODOMETRY_FLOOR for step in steps]
     return Edges.chain(steps, np.array(floored).reshape(-1, 3, 3), refused[1:])

@@ -67,7 +67,7 @@ def fingerprint(parameters: object) -> str:
 
 def write_state(state: MapState, path: Path) -> None:
     """Write the state; the same state gives the same bytes. Raises OutputError."""
-    edges = Edges.joined([state.steps, state.loops])
+    edges = Edges.concatenate([state.steps, state.loops])
     origin = state.grid.origin
     arrays: dict[str, Any] = {
         "version": np.int64(VERSION),

@@ -17,9 +17,9 @@ from hsloc.model.estimate import Estimate, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.slam.back_end import finish
-from hsloc.slam.front_end import FLOOR, LocalMatcher
+from hsloc.slam.front_end import FLOOR, FrontEnd
 from hsloc.slam.keyscans import KeyScan
-from hsloc.slam.trajectory_correction import Track
+from hsloc.slam.trajectory_correction import EventLog
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,8 +42,8 @@ class Mapper:
         self._parameters = parameters
         self._rng = rng
         self._resume = resume
-        self._matcher = LocalMatcher(parameters.local_matching, rng, parameters.use_odometry)
-        self._track = Track(parameters.local_matching.turn_length)
+        self._matcher = FrontEnd(parameters.front_end, rng, parameters.use_odometry)
+        self._track = EventLog(parameters.front_end.turn_length)
         self._scans: list[KeyScan] = []
         self._stamps: list[int] = []
         self._local: list[LocalMatch] = []

@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DrawingParameters:
+class OccupancyMapperParameters:
     """How beams become cells."""
 
     resolution: float = 0.05
     """Side of a cell (m)."""
-    hit: float = 0.7
+    hit_probability: float = 0.7
     """Probability that a cell in which a beam ended is occupied."""
-    miss: float = 0.45
+    miss_probability: float = 0.45
     """Probability that a cell through which a beam passed is occupied: grazing beams pass through many walls."""
-    most: float = 0.97
+    max_probability: float = 0.97
     """No cell is surer than this, of either."""
     max_range: float = 30.0
     """Beams are traced so far (m); a hit beyond counts as none."""
@@ -42,15 +42,18 @@ class DrawingParameters:
     def __post_init__(self) -> None:
         for name in ("resolution", "max_range"):
             if not getattr(self, name) > 0.0:
-                raise ConfigError(f"drawing: {name} is {getattr(self, name)}; it must be positive")
-        if not 0.0 < self.miss < 0.5 < self.hit < 1.0:
-            raise ConfigError(f"drawing: miss is {self.miss}, hit {self.hit}; it must be 0 < miss < 0.5 < hit < 1")
+                raise ConfigError(f"occupancy: {name} is {getattr(self, name)}; it must be positive")
+        if not 0.0 < self.miss_probability < 0.5 < self.hit_probability < 1.0:
+            raise ConfigError(
+                f"occupancy: miss_probability is {self.miss_probability}, hit_probability {self.hit_probability}; "
+                "it must be 0 < miss_probability < 0.5 < hit_probability < 1"
+            )
 
 
 _MOST_CELLS = 400_000_000
 
 
-def draw_grid(poses: F64, scans: KeyScans, parameters: DrawingParameters) -> OccupancyGrid:
+def draw_grid(poses: F64, scans: KeyScans, parameters: OccupancyMapperParameters) -> OccupancyGrid:
     """The occupancy grid of keyscans at `poses` (n, 3), n at least 1; what no beam met stays unknown.
 
     Each cell's log odds are `hits * logit(hit) + misses * logit(miss)`, clamped: people who walked through
@@ -68,14 +71,14 @@ def draw_grid(poses: F64, scans: KeyScans, parameters: DrawingParameters) -> Occ
     for k in range(len(scans)):
         origins, ends, is_hit = _beams(poses[k], scans, k, p)
         trace(hits, misses, origins / p.resolution - corner, ends / p.resolution - corner, is_hit)
-    limit = _logit(p.most)
-    odds = np.clip(hits * _logit(p.hit) + misses * _logit(p.miss), -limit, limit)
+    limit = _logit(p.max_probability)
+    odds = np.clip(hits * _logit(p.hit_probability) + misses * _logit(p.miss_probability), -limit, limit)
     cells = np.round(100.0 / (1.0 + np.exp(-odds))).astype(np.int8)
     cells[(hits == 0) & (misses == 0)] = UNKNOWN
     return OccupancyGrid(cells, p.resolution, Pose2(float(corner[0]) * p.resolution, float(corner[1]) * p.resolution))
 
 
-def _extent(poses: F64, scans: KeyScans, p: DrawingParameters) -> tuple[F64, F64]:
+def _extent(poses: F64, scans: KeyScans, p: OccupancyMapperParameters) -> tuple[F64, F64]:
     low, high = poses[:, :2].min(axis=0), poses[:, :2].max(axis=0)
     for k in range(len(scans)):
         hits = scans.hits(k).astype(np.float64)
@@ -86,7 +89,7 @@ def _extent(poses: F64, scans: KeyScans, p: DrawingParameters) -> tuple[F64, F64
     return low, high
 
 
-def _beams(pose: F64, scans: KeyScans, k: int, p: DrawingParameters) -> tuple[F64, F64, NDArray[np.uint8]]:
+def _beams(pose: F64, scans: KeyScans, k: int, p: OccupancyMapperParameters) -> tuple[F64, F64, NDArray[np.uint8]]:
     """Origins, ends (n, 2) in the map (m) and whether each beam ends in a hit."""
     x, y, theta, angle_min, increment = scans.geometry[k]
     laser = Pose2.from_array(pose) @ Pose2(float(x), float(y), float(theta))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from hsloc.slam.front_end import LocalMatchingParameters
-from hsloc.slam.joint_registration import RefinementParameters
+from hsloc.slam.front_end import FrontEndParameters
+from hsloc.slam.joint_registration import JointRegistrationParameters
 from hsloc.slam.loop_closer import LoopParameters
-from hsloc.slam.occupancy_mapper import DrawingParameters
+from hsloc.slam.occupancy_mapper import OccupancyMapperParameters
 
 if TYPE_CHECKING:
     from hsloc.model.pose2 import Pose2
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 class GraphMapperParameters:
     """All of the graph mapper's, one default for all logs."""
 
-    local_matching: LocalMatchingParameters = field(default_factory=LocalMatchingParameters)
+    front_end: FrontEndParameters = field(default_factory=FrontEndParameters)
     loops: LoopParameters = field(default_factory=LoopParameters)
-    refinement: RefinementParameters = field(default_factory=RefinementParameters)
-    drawing: DrawingParameters = field(default_factory=DrawingParameters)
+    joint_registration: JointRegistrationParameters = field(default_factory=JointRegistrationParameters)
+    occupancy: OccupancyMapperParameters = field(default_factory=OccupancyMapperParameters)
     use_odometry: bool = True
     """Otherwise a constant velocity predicts, and the log's odometry is not looked at."""
     passes: int = 3

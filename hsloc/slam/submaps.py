@@ -30,7 +30,7 @@ _FAR = 1e4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Places:
+class Submaps:
     """Place k holds keyscans start[k] to start[k + 1]; its frame is that of its middle one, `reference[k]`.
 
     `poses` (n, 3) are the front end's, of the keyscans; within a few places they are taken to be rigid. `steps`
@@ -60,7 +60,7 @@ class Places:
         length: float,
         turn_length: float,
         refused: NDArray[np.bool_] | None = None,
-    ) -> Places:
+    ) -> Submaps:
         """Cut the way of keyscans into places of `length` metres; `motions` and `covariances` lead to each keyscan."""
         refused = np.zeros(len(poses), dtype=bool) if refused is None else refused
         way = np.cumsum(np.hypot(motions[:, 0], motions[:, 1]) + turn_length * np.abs(motions[:, 2]))
@@ -79,14 +79,14 @@ class Places:
         count = np.cumsum(refused)
         doubted = np.diff(count[reference]) > 0
         piece = np.zeros(len(reference), dtype=np.int64)
-        return Places(start, reference, poses, steps, chained, doubted, (way + REFUSED_WAY * count)[reference], piece)
+        return Submaps(start, reference, poses, steps, chained, doubted, (way + REFUSED_WAY * count)[reference], piece)
 
     @staticmethod
-    def together(first: Places, second: Places) -> Places:
+    def concatenate(first: Submaps, second: Submaps) -> Submaps:
         """Those of two logs in one map; the step from the first's last to the second's first says nothing."""
         scans = len(first.poses)
         seam = relative_poses(first.poses[None, first.reference[-1]], second.poses[None, second.reference[0]])
-        return Places(
+        return Submaps(
             np.concatenate((first.start[:-1], scans + second.start)),
             np.concatenate((first.reference, scans + second.reference)),
             np.concatenate((first.poses, second.poses)),
@@ -103,7 +103,7 @@ class Places:
         low = max(place - around, 0)
         return range(int(self.start[low + same[0]]), int(self.start[low + same[-1] + 1]))
 
-    def cloud(self, place: int, around: int, scans: KeyScans, reach: float, cell: float) -> F64:
+    def cloud(self, place: int, around: int, scans: KeyScans, max_range: float, cell: float) -> F64:
         """Hits of a place and its neighbours in its frame, one for each cell of side `cell` (m), shape (n, 2)."""
         members = self.members(place, around)
         relative = relative_poses(
@@ -113,7 +113,7 @@ class Places:
         parts = []
         for row, scan in enumerate(members):
             hits = scans.hits(scan).astype(np.float64)
-            parts.append(Pose2.from_array(relative[row]) @ hits[np.hypot(hits[:, 0], hits[:, 1]) < reach])
+            parts.append(Pose2.from_array(relative[row]) @ hits[np.hypot(hits[:, 0], hits[:, 1]) < max_range])
         points = np.concatenate(parts)
         if len(points) == 0:
             return points
@@ -123,11 +123,11 @@ class Places:
         return thinned
 
     def field(
-        self, place: int, around: int, scans: KeyScans, reach: float, resolution: float, sigma: float
+        self, place: int, around: int, scans: KeyScans, max_range: float, resolution: float, sigma: float
     ) -> LocalMap:
         """The field of a place and its neighbours, in its frame."""
         drawn = LocalMap(resolution, sigma, 3.0 * sigma)
-        drawn.draw(self.cloud(place, around, scans, reach, 0.5 * resolution), known=0.95)
+        drawn.draw(self.cloud(place, around, scans, max_range, 0.5 * resolution), saturation_score=0.95)
         return drawn
 
     def expand(self, places: F64) -> F64:

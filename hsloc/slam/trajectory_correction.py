@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
 
 
-class Track:
+class EventLog:
     """Odometry of all messages and scans in the order of the log; some scans are keyscans."""
 
     def __init__(self, turn_length: float) -> None:

@@ -45,7 +45,7 @@ def wait(work: Callable[[], T], timeout_s: float) -> T:
         raise StoreError(f"no answer within {timeout_s:g} s") from error
 
 
-class Desk:
+class BoundedExecutor:
     """Takes the calls of the routes: so many at a time, each for so long, the wait for its turn included."""
 
     def __init__(self, timeout_s: float, most: int = 64) -> None:

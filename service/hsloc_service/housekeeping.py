@@ -11,7 +11,7 @@ from sqlalchemy import delete, select
 
 from hsloc_service.db.tables import ENDED, FileRow, IdempotencyRow, JobRow
 from hsloc_service.errors import StoreError
-from hsloc_service.jobs.repository import erase, extended
+from hsloc_service.jobs.repository import base_job, delete_job
 from hsloc_service.logs import log
 from hsloc_service.results.deletion_queue import Removals
 from hsloc_service.uploads.repository import needed
@@ -95,8 +95,8 @@ class Housekeeping:
         with self._database.write() as session:
             jobs = session.scalars(select(JobRow).where(JobRow.state.in_(ENDED), JobRow.ended < before)).all()
             for job in jobs:
-                if not extended(session, job.id):
-                    erase(session, job)
+                if not base_job(session, job.id):
+                    delete_job(session, job)
             query = select(FileRow).where(FileRow.state == "complete", FileRow.created < before)
             files = [row for row in session.scalars(query) if not needed(session, row.id)]
             for row in files:

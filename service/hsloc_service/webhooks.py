@@ -60,7 +60,7 @@ def sign(secret: str, stamp: int, body: bytes) -> str:
     return f"t={stamp},v1={mac.hexdigest()}"
 
 
-class Deliverer:
+class WebhookSender:
     """A thread that empties the outbox."""
 
     def __init__(self, database: Database, settings: Settings) -> None:

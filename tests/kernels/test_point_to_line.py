@@ -47,7 +47,7 @@ def terms(
 @pytest.fixture(scope="module")
 def two() -> tuple[KeyScans, NDArray[np.float64]]:
     first, second = Pose2(2.0, 1.5, 0.3), Pose2(2.4, 1.8, 0.5)
-    scans = KeyScans.joined([KeyScan.of(room_scan(first)), KeyScan.of(room_scan(second))])
+    scans = KeyScans.from_scans([KeyScan.of(room_scan(first)), KeyScan.of(room_scan(second))])
     return scans, first.between(second).to_array()
 
 
@@ -98,7 +98,9 @@ def test_the_gradient_is_that_of_half_the_sum_of_squares(two: tuple[KeyScans, ND
 
 
 def test_a_scan_moved_into_the_room_conflicts() -> None:
-    scans = KeyScans.joined([KeyScan.of(room_scan(Pose2(1.0, 2.0, 0.0))), KeyScan.of(room_scan(Pose2(1.0, 2.0, 0.0)))])
+    scans = KeyScans.from_scans(
+        [KeyScan.of(room_scan(Pose2(1.0, 2.0, 0.0))), KeyScan.of(room_scan(Pose2(1.0, 2.0, 0.0)))]
+    )
     _, _, counts = terms(scans, 1, 0, (-2.0, 0.0, 0.0))
     assert counts[1] > 20
     assert terms(scans, 1, 0, (0.0, 0.0, 0.0))[2][1] == 0
@@ -109,7 +111,7 @@ def test_the_two_sides_of_a_wall_are_not_paired() -> None:
     angles = np.radians(np.arange(-40, 41))
     ranges = (1.0 / np.cos(angles)).astype(np.float32)
     scan = Scan(0, ranges, float(angles[0]), float(np.radians(1.0)), 0.05, 30.0)
-    scans = KeyScans.joined([KeyScan.of(scan), KeyScan.of(scan)])
+    scans = KeyScans.from_scans([KeyScan.of(scan), KeyScan.of(scan)])
     assert terms(scans, 1, 0, (0.05, 0.0, 0.0))[2][0] > 60
     assert terms(scans, 1, 0, (2.05, 0.0, np.pi))[2][0] == 0
 

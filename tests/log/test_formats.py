@@ -22,7 +22,7 @@ from hsloc.log.container import Channel
 from hsloc.log.messages import foxglove
 from hsloc.log.messages.decoders import Undecodable, decoder_for
 from hsloc.log.reader import open_log
-from hsloc.log.session.extrinsics import Mountings
+from hsloc.log.session.extrinsics import Extrinsics
 from hsloc.log.summary import Losses, ReadOptions
 from hsloc.log.transforms import Mounting, Transform3
 from hsloc.log.writer import LogWriter
@@ -126,7 +126,7 @@ def test_the_pose_of_a_foxglove_scan_is_part_of_its_mounting() -> None:
     message.pose.orientation.x = 1.0  # head down
     scan = decoder_for(channel("foxglove.LaserScan"))(message.SerializeToString())
     assert scan.T_frame_laser == Transform3((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-    mountings = Mountings([], "base", None)
+    mountings = Extrinsics([], "base", None)
     mountings._spatial["laser"] = Transform3.from_pose2(Pose2(0.5, 0.25, np.pi / 2))
     mountings._known["laser"] = (Mounting(Pose2(0.5, 0.25, np.pi / 2)), "/tf_static")
     mounting = mountings.of("laser", scan.T_frame_laser)

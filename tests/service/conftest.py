@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from fastapi.testclient import TestClient
-from servers import Live, settings
+from live_service import Live, settings
 
 from hsloc_service.http.app import create_app
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from fastapi.testclient import TestClient
-from servers import settings, submit, upload, wait
+from live_service import settings, submit, upload, wait
 
 from hsloc.cli.main import main as program
 from hsloc_service.auth import Tokens
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from servers import Live
+    from live_service import Live
 
 PUBLIC = {("get", "/healthz"), ("get", "/readyz")}
 READ = {

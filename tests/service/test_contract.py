@@ -16,8 +16,8 @@ import pytest
 import requests
 import schemathesis
 from hypothesis import HealthCheck, Phase
+from live_service import Live, settings, submit, upload, wait
 from schemathesis.specs.openapi.checks import negative_data_rejection
-from servers import Live, settings, submit, upload, wait
 
 from hsloc_service.http import tus
 from hsloc_service.http.app import create_app

@@ -11,8 +11,8 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
+from live_service import upload, wait
 from paths import RECORDINGS
-from servers import upload, wait
 
 from hsloc.errors import MapError
 from hsloc_service.execution.worker import linked_map

@@ -15,9 +15,9 @@ import fsspec
 import pytest
 from fastapi.testclient import TestClient
 from fsspec.implementations.memory import MemoryFileSystem
-from servers import settings, submit, wait
+from live_service import settings, submit, wait
 
-from hsloc_service.call_timeout import Desk
+from hsloc_service.call_timeout import BoundedExecutor
 from hsloc_service.execution import retry as patience
 from hsloc_service.http import results_routes
 from hsloc_service.http.app import create_app
@@ -195,7 +195,7 @@ def test_many_readers_wait_for_their_turn() -> None:
         return k
 
     async def all_at_once() -> list[int]:
-        desk = Desk(timeout_s=5.0, most=3)
+        desk = BoundedExecutor(timeout_s=5.0, most=3)
         return list(await asyncio.gather(*(desk.ask(functools.partial(read, k)) for k in range(30))))
 
     assert asyncio.run(all_at_once()) == list(range(30))

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from servers import settings, submit, wait
+from live_service import settings, submit, wait
 
 from hsloc_service.housekeeping import Housekeeping
 from hsloc_service.settings import SettingsError, from_environment, parse_size

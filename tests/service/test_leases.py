@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from servers import settings
+from live_service import settings
 
 from hsloc_service.auth import ANYBODY, Principal
 from hsloc_service.db.database import Database

@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from live_service import upload
 from paths import RECORDINGS
-from servers import upload
 
 from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from servers import Live
+    from live_service import Live
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="THE PAGE IS NOT TESTED: playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")

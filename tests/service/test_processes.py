@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from servers import free_port, submit, wait
+from live_service import free_port, submit, wait
 
 from hsloc_service.execution import supervisor
 from hsloc_service.execution.processes import marked
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from fastapi.testclient import TestClient
-    from servers import Live
+    from live_service import Live
 
 LIMITS: dict[str, Any] = {
     "job_memory_bytes": 1 << 29,

@@ -10,10 +10,10 @@ import time
 import uuid
 from typing import TYPE_CHECKING, Any
 
+from live_service import submit, upload, wait
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from paths import RECORDINGS
-from servers import submit, upload, wait
 
 from hsloc_service.auth import Tokens
 from hsloc_service.db.tables import AssetRow

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from fastapi.testclient import TestClient
-from servers import settings, wait
+from live_service import settings, wait
 from sqlalchemy import event
 
 from hsloc_service.auth import ANYBODY

@@ -16,7 +16,7 @@ from fastapi import HTTPException
 from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
-from servers import settings, submit, upload, wait
+from live_service import settings, submit, upload, wait
 from sqlalchemy import select
 
 from hsloc_service.auth import ANYBODY
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from servers import Live
+    from live_service import Live
 
 KINDS = ("folder", "memory", "file")
 NAME = f"{uuid.UUID(int=1)}.1"

@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, rule
-from servers import settings as service_settings
+from live_service import settings as service_settings
 from test_uploads import TUS, append, begin
 
 from hsloc_service.housekeeping import Housekeeping

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import httpx2 as httpx
 import pytest
-from servers import upload
+from live_service import upload
 
 from hsloc_service.execution.dispatcher import sweep
 from hsloc_service.uploads.repository import Files
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from fastapi.testclient import TestClient
-    from servers import Live
+    from live_service import Live
 
 TUS = {"Tus-Resumable": "1.0.0"}
 PATCH = {**TUS, "Content-Type": "application/offset+octet-stream"}

@@ -7,7 +7,7 @@ import pytest
 
 from hsloc.errors import ConfigError
 from hsloc.model.pose2 import wrap_angles
-from hsloc.slam.joint_registration import RefinementParameters, neighbour_pairs
+from hsloc.slam.joint_registration import JointRegistrationParameters, neighbour_pairs
 
 RADIUS, MOST, TEMPORAL = 3.0, 8, 3
 
@@ -73,5 +73,5 @@ def test_of_a_crowd_some_stand_for_all_and_everybody_has_partners() -> None:
 
 
 def test_a_crowd_of_nobody_is_refused() -> None:
-    with pytest.raises(ConfigError, match="crowd must be at least 1"):
-        RefinementParameters(crowd=0)
+    with pytest.raises(ConfigError, match="max_scans_per_view must be at least 1"):
+        JointRegistrationParameters(max_scans_per_view=0)

@@ -4,11 +4,11 @@ import numpy as np
 
 from hsloc.model import Pose2
 from hsloc.model.pose2 import compose_poses
-from hsloc.slam.trajectory_correction import Track
+from hsloc.slam.trajectory_correction import EventLog
 
 
 def test_a_shift_of_all_keyscans_shifts_everything() -> None:
-    track = Track(0.3)
+    track = EventLog(0.3)
     for k in range(10):
         track.add(Pose2(0.1 * k, 0.0, 0.0), is_scan=False)
         if k % 3 == 0:
@@ -20,7 +20,7 @@ def test_a_shift_of_all_keyscans_shifts_everything() -> None:
 
 
 def test_what_two_keyscans_disagree_in_is_shared_along_the_way() -> None:
-    track = Track(0.3)
+    track = EventLog(0.3)
     track.add(Pose2(), is_scan=True, is_key=True)
     for x in (0.25, 0.5, 0.5, 1.0):
         track.add(Pose2(x), is_scan=False)
@@ -30,7 +30,7 @@ def test_what_two_keyscans_disagree_in_is_shared_along_the_way() -> None:
 
 
 def test_before_the_first_and_after_the_last_keyscan_odometry_goes_on() -> None:
-    track = Track(0.3)
+    track = EventLog(0.3)
     track.add(Pose2(-1.0), is_scan=False)
     track.add(Pose2(0.0), is_scan=True, is_key=True)
     track.add(Pose2(2.0), is_scan=False)
@@ -40,7 +40,7 @@ def test_before_the_first_and_after_the_last_keyscan_odometry_goes_on() -> None:
 
 
 def test_without_keyscans_there_is_only_odometry() -> None:
-    track = Track(0.3)
+    track = EventLog(0.3)
     track.add(Pose2(1.0), is_scan=False)
     track.add(Pose2(2.0), is_scan=True)
     odometry, scans = track.corrected(np.zeros((0, 3)))

@@ -1,4 +1,4 @@
-"""Short simulated drives, without a log in between."""
+"""Simulated drives for the tests of mapping."""
 
 from __future__ import annotations
 

@@ -50,12 +50,12 @@ def check_log(log: Log, progress: Callable[[int], None] | None = None) -> CheckR
         count += 1
         if isinstance(message, list):
             for link in message:
-                transforms.see(topic, link, log_time)
+                transforms.add(topic, link, log_time)
         else:
             key = (topic, type(message))
             if key not in topics:
                 topics[key] = _SCAN_OR_ODOMETRY[type(message)](topic, findings)
-            topics[key].see(message, log_time)
+            topics[key].add(message, log_time)
         if progress is not None and count % 4096 == 0:
             progress(log_time)
     losses = log.losses.copy()

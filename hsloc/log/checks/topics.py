@@ -41,7 +41,7 @@ class TopicCheck:
         self._findings = findings
         self._count = 0
 
-    def see(self, message: Any, log_time_ns: int) -> None:
+    def add(self, message: Any, log_time_ns: int) -> None:
         """One message."""
         place = Place(self.topic, self._count, message.stamp_ns, log_time_ns)
         self._count += 1
@@ -120,10 +120,10 @@ class ScanCheck(TopicCheck):
         self._previous_end_ns: int | None = None
         self._beams: int | None = None
 
-    def see(self, message: Any, log_time_ns: int) -> None:
+    def add(self, message: Any, log_time_ns: int) -> None:
         """One message."""
         place = Place(self.topic, self._count, message.stamp_ns, log_time_ns)
-        super().see(message, log_time_ns)
+        super().add(message, log_time_ns)
         self._check_geometry(message, place)
         self._check_ranges(message, place)
         if self.frame is not None and message.frame_id != self.frame:
@@ -197,10 +197,10 @@ class OdometryCheck(TopicCheck):
         self.frame = self.child = ""
         self._position: tuple[int, float, float] | None = None
 
-    def see(self, message: Any, log_time_ns: int) -> None:
+    def add(self, message: Any, log_time_ns: int) -> None:
         """One message."""
         place = Place(self.topic, self._count, message.stamp_ns, log_time_ns)
-        super().see(message, log_time_ns)
+        super().add(message, log_time_ns)
         self.frame, self.child = message.frame_id, message.child_frame_id
         norm = sum(value * value for value in message.quaternion) ** 0.5
         if not abs(norm - 1.0) < 1e-2:

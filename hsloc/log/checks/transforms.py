@@ -24,7 +24,7 @@ class TransformCheck:
         self._stamps: dict[tuple[str, str], int] = {}
         self._number = 0
 
-    def see(self, topic: str, link: LinkMessage, log_time_ns: int) -> None:
+    def add(self, topic: str, link: LinkMessage, log_time_ns: int) -> None:
         """One transform of a message."""
         place = Place(topic, self._number, link.stamp_ns, log_time_ns)
         self._number += 1

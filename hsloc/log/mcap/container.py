@@ -17,7 +17,7 @@ import numpy as np
 from hsloc.errors import LogError, LogFormatError
 from hsloc.log.container import Channel, RawMessage
 from hsloc.log.mcap import records
-from hsloc.log.mcap.index_scan import Segment, Walk
+from hsloc.log.mcap.index_scan import IndexScan, Segment
 from hsloc.log.mcap.records import ChunkHead, Damage, Opcode, UnknownCompression
 from hsloc.log.messages.definitions import long_name
 from hsloc.log.summary import Losses
@@ -48,7 +48,7 @@ class McapContainer:
         try:
             self._size = path.stat().st_size
             with path.open("rb") as stream:
-                self._directory = Walk(path, stream, self._size).run()
+                self._directory = IndexScan(path, stream, self._size).run()
             self._read_what_the_index_does_not_tell()
         except OSError as error:
             raise LogFormatError(f"{path}: cannot be read ({error.strerror or error})") from error

@@ -44,7 +44,7 @@ class Segment(NamedTuple):
 
 
 @dataclass(slots=True)
-class Directory:
+class ChunkIndex:
     """What a file holds. `losses` are those found on the walk, by what the records' heads say."""
 
     path: Path
@@ -90,11 +90,11 @@ class Directory:
         statistics.add(int(ordered[0]), int(ordered[-1]), len(ordered), gap)
 
 
-class Walk:
+class IndexScan:
     """The walk; `run` returns the directory. Raises LogFormatError for what is no MCAP at all, and OSError."""
 
     def __init__(self, path: Path, stream: BinaryIO, size: int) -> None:
-        self.directory = Directory(path)
+        self.directory = ChunkIndex(path)
         self.stream = stream
         self.size = size
         self.losses = self.directory.losses
@@ -104,7 +104,7 @@ class Walk:
         self.index_is_whole = True
         self.chunks_of_summary: list[int] | None = None
 
-    def run(self) -> Directory:
+    def run(self) -> ChunkIndex:
         """From the magic to the footer, or as far as it goes."""
         path = self.directory.path
         if self.size == 0:

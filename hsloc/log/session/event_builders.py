@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from hsloc.log.messages.cdr_batch_decode import PoseColumns
     from hsloc.log.messages.decode import LinkMessage, OdometryMessage, PoseMessage, ScanMessage
-    from hsloc.log.session.extrinsics import Mountings
+    from hsloc.log.session.extrinsics import Extrinsics
     from hsloc.log.session.ordering import TopicClock
     from hsloc.log.summary import Losses
     from hsloc.model import Event
@@ -54,7 +54,7 @@ class ScanFeed:
 
     typename = definitions.LASER_SCAN
 
-    def __init__(self, clock: TopicClock, mountings: Mountings, losses: Losses, deskew: bool = False) -> None:
+    def __init__(self, clock: TopicClock, mountings: Extrinsics, losses: Losses, deskew: bool = False) -> None:
         """With `deskew`, a scan that does not say how long a beam takes gets an even part of its duration."""
         self.topic = clock.topic
         self.clocks = (clock,)

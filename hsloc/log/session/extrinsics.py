@@ -55,7 +55,7 @@ def read_links(
                 continue
 
 
-class Mountings:
+class Extrinsics:
     """The mounting of each laser frame; `warnings` grows with what had to be assumed."""
 
     def __init__(self, containers: Sequence[Container], base_frame: str | None, override: Pose2 | None) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from hsloc.log.messages import definitions, foxglove
 from hsloc.log.messages.decoders import Undecodable, canonical_type, decoder_for, is_decodable
 from hsloc.log.session.event_builders import MAP_FRAME
-from hsloc.log.session.extrinsics import BASE_FRAMES, Mountings, read_links
+from hsloc.log.session.extrinsics import BASE_FRAMES, Extrinsics, read_links
 from hsloc.log.session.split_recordings import check_parts
 from hsloc.log.session.topic_selection import TF, TRUTH_TYPES, carries, choose_topics, is_truth_name, of_type
 from hsloc.log.summary import LaserSummary, LogSummary, Losses, ReadOptions, TopicSummary
@@ -30,7 +30,7 @@ _SAME_CLOCK_NS = 3600 * 1_000_000_000
 _CLOCKS_APART_NS = 5_000_000_000
 
 
-class First(NamedTuple):
+class FirstMessage(NamedTuple):
     """The first message of a topic that has a stamp, and when the topic started by the log's clock."""
 
     message: Any
@@ -50,7 +50,7 @@ class First(NamedTuple):
         return self.start_log_ns if self.starts_unstamped and self.shares_log_clock else self.stamp_ns
 
 
-class Survey:
+class LogSession:
     """Topics, their first messages, the laser's mounting, and a summary of it all.
 
     `active` are the channels that have messages; `T_child_base` leads from the frame that the odometry speaks of to
@@ -84,7 +84,7 @@ class Survey:
         self.odom = self._first(self.choice.odom, self.odom_type)
         self.truth_type = self._pose_type(self.choice.truth)
         self.truth = self._first(self.choice.truth, self.truth_type)
-        self.mountings = Mountings(containers, self._base_frame(), options.laser_pose)
+        self.mountings = Extrinsics(containers, self._base_frame(), options.laser_pose)
         self.T_child_base = self._child_to_base()
         # A truth that speaks of the same frame as the odometry moves with it.
         truth_child = getattr(self.truth.message, "child_frame_id", None) if self.truth is not None else None
@@ -119,15 +119,15 @@ class Survey:
                 except Undecodable:
                     continue
 
-    def _first(self, topic: str | None, typename: str | None) -> First | None:
+    def _first(self, topic: str | None, typename: str | None) -> FirstMessage | None:
         """The first message of a topic; the first one with a stamp, if that is soon."""
         if topic is None or topic == TF:
             return None
-        first: First | None = None
+        first: FirstMessage | None = None
         for count, (log_time, message) in enumerate(self.messages(topic, typename)):
             stamp = message.stamp_ns
             start, unstamped = (first[3], first[4]) if first is not None else (log_time, stamp == 0 < log_time)
-            first = First(message, stamp, log_time, start, unstamped)
+            first = FirstMessage(message, stamp, log_time, start, unstamped)
             if stamp != 0 or count >= _STAMPS_AT_OPENING:
                 break
         return first
@@ -202,7 +202,7 @@ class Survey:
             warnings=tuple(dict.fromkeys(self._warnings + self.mountings.warnings)),
         )
 
-    def _laser(self, topic: str, first: First) -> LaserSummary:
+    def _laser(self, topic: str, first: FirstMessage) -> LaserSummary:
         frame = first.message.frame_id
         extrinsics = self.mountings.found(frame)[1]
         mounting = self.mountings.of(frame, first.message.T_frame_laser)

@@ -12,7 +12,7 @@ from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import Undecodable, canonical_type, is_decodable
 from hsloc.log.session.event_builders import OdometryFeed, PoseFeed, ScanFeed, TransformFeed
 from hsloc.log.session.extrinsics import BASE_FRAMES
-from hsloc.log.session.log_session import First, Survey
+from hsloc.log.session.log_session import FirstMessage, LogSession
 from hsloc.log.session.ordering import KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH, Reorder, TopicClock, one_by_one
 from hsloc.log.session.topic_reader import Route
 from hsloc.log.session.topic_selection import TF, of_type
@@ -48,7 +48,7 @@ class RosSource:
 
     def __init__(self, containers: Sequence[Container], options: ReadOptions) -> None:
         self._containers = containers
-        self._survey = Survey(containers, options)
+        self._survey = LogSession(containers, options)
         self.summary = self._survey.summary
         self.losses_at_opening = _added(container.losses_at_opening for container in containers)
 
@@ -201,7 +201,7 @@ def _pose_feed(
     return PoseFeed(clock, losses, typename, is_truth, T_child_base)
 
 
-def _clock(topic: str, kind: int, first: First | None, losses: Losses) -> TopicClock:
+def _clock(topic: str, kind: int, first: FirstMessage | None, losses: Losses) -> TopicClock:
     return TopicClock(topic, kind, losses, first is None or first.shares_log_clock)
 
 

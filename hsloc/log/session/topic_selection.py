@@ -26,7 +26,7 @@ _LISTED = 12
 
 
 @dataclass(slots=True)
-class Choice:
+class TopicSelection:
     """Topics to read; `TF` stands for transforms in place of a topic. `problems` are what stood in the way."""
 
     scans: tuple[str, ...] = ()
@@ -53,13 +53,15 @@ def of_type(channels: Sequence[Channel], typename: str) -> list[str]:
     return sorted({c.topic for c in channels if canonical_type(c.typename) == typename and is_decodable(c)})
 
 
-def choose_topics(where: str, channels: Sequence[Channel], options: ReadOptions, tf_has_odometry: bool) -> Choice:
+def choose_topics(
+    where: str, channels: Sequence[Channel], options: ReadOptions, tf_has_odometry: bool
+) -> TopicSelection:
     """Take the topics that the options name, else the only ones of their type.
 
     `channels` are those that have messages. Raises TopicError, naming the candidates and the flag to choose with,
     where a required topic is missing or ambiguous, and always where a named one does not exist.
     """
-    choice = Choice()
+    choice = TopicSelection()
     choice.truth = _truth(where, channels, options)
     choice.scans = _scans(where, channels, options, choice.problems)
     if options.odom_topic in TF_NAMES:

@@ -28,13 +28,13 @@ class Interrupted(Exception):
         self.why = why
 
 
-class Patience:
+class Retry:
     """`look` is asked many times a second: it prolongs the job's lease, and says `go`, or why the job must end."""
 
     def __init__(self, look: Callable[[], str], job_id: str, failed: Callable[[], None]) -> None:
         self._look, self._job_id, self._failed = look, job_id, failed
 
-    def insist(self, what: str, work: Callable[[], T], timeout_s: float) -> T:
+    def retry(self, what: str, work: Callable[[], T], timeout_s: float) -> T:
         """The result of `work`, which is begun anew after StoreError or `timeout_s`, for as long as it takes.
 
         What is computed is not thrown away because a store is gone for an hour. Raises Interrupted where `look` says
@@ -49,7 +49,7 @@ class Patience:
                 log("store.error", job=self._job_id, what=what, error=str(error), again_in_s=wait)
             until = time.monotonic() + wait
             while time.monotonic() < until:
-                self._go()
+                self._run_once()
                 time.sleep(TICK_S)
             wait = min(2.0 * wait, LONGEST_WAIT_S)
 
@@ -61,11 +61,11 @@ class Patience:
             except TimeoutError:
                 if future.done():
                     raise
-            self._go()
+            self._run_once()
             if time.monotonic() > until:
                 raise StoreError(f"no answer within {timeout_s:g} s")
 
-    def _go(self) -> None:
+    def _run_once(self) -> None:
         why = self._look()
         if why != "go":
             raise Interrupted(why)

@@ -17,7 +17,7 @@ from hsloc_service.errors import StoreError
 from hsloc_service.execution.job_folder import fetch, prepare
 from hsloc_service.execution.processes import end_job, start_job
 from hsloc_service.execution.progress_pipe import plain_line
-from hsloc_service.execution.retry import BYTES_PER_S, Interrupted, Patience
+from hsloc_service.execution.retry import BYTES_PER_S, Interrupted, Retry
 from hsloc_service.logs import log
 from hsloc_service.results.store import collect
 from hsloc_service.storage import folder_bytes
@@ -37,7 +37,7 @@ T = TypeVar("T")
 _LINE_BYTES = 1 << 18
 """The longest line of the pipe; more is a job gone mad."""
 TICK_S = 0.1
-LOOK_S = 0.5
+POLL_S = 0.5
 """Time between two looks at the size of the folder, and between two notes of progress."""
 
 
@@ -82,7 +82,7 @@ class Attempt:
         """The final state that was written, or `queued` or `lost`."""
         try:
             outcome = self._attempt()
-            return self._settle(outcome)
+            return self._finish(outcome)
         finally:
             self._storage.remove_work(self._folder)
 
@@ -143,13 +143,13 @@ class Attempt:
                 if now - begin > settings.job_wall_s:
                     return Outcome("failed", "wall_limit", f"the job took longer than {settings.job_wall_s:.0f} s")
                 if now >= size_at:
-                    size_at = now + LOOK_S
+                    size_at = now + POLL_S
                     if folder_bytes(self._folder) > settings.job_output_bytes:
                         return Outcome("failed", "output_limit", "the job wrote more than it is allowed")
                     if self._storage.free_bytes() < self._storage.min_free_bytes // 2:
                         return Outcome("failed", "disk_full", "the server's disk became full while the job ran")
                 if now >= beat_at or self._cancel.is_set():
-                    beat_at = now + min(LOOK_S, settings.heartbeat_s)
+                    beat_at = now + min(POLL_S, settings.heartbeat_s)
                     held = self._beat(now, begin)
                     if held == "lost":
                         return Outcome("lost")
@@ -226,7 +226,7 @@ class Attempt:
                 return f": {text.splitlines()[-1][:300]}"
         return ""
 
-    def _settle(self, outcome: Outcome) -> str:
+    def _finish(self, outcome: Outcome) -> str:
         """Write the outcome, and log it; the state that was written."""
         state = self._write(outcome)
         log("job.end", job=self._claim.job_id, attempt=self._claim.attempt, state=state, reason=outcome.reason)
@@ -266,15 +266,15 @@ class Attempt:
         return "lost"
 
     def _insist(self, what: str, work: Callable[[], T], timeout_s: float) -> T:
-        patience = Patience(self._look, self._claim.job_id, self._store_failed)
-        return patience.insist(what, work, timeout_s)
+        patience = Retry(self._look, self._claim.job_id, self._store_failed)
+        return patience.retry(what, work, timeout_s)
 
     def _look(self) -> str:
         """Keep the lease while the store is waited for."""
         if self._stop.is_set():
             return "stop"
         now = time.monotonic()
-        if now < self._looked + LOOK_S and not self._cancel.is_set():
+        if now < self._looked + POLL_S and not self._cancel.is_set():
             return "go"
         self._looked = now
         return self._beat(now, self._begin)

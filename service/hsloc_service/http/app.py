@@ -22,7 +22,7 @@ from starlette.routing import Match
 from hsloc.version import __version__
 from hsloc_service import config_schema as options
 from hsloc_service.auth import Tokens
-from hsloc_service.call_timeout import Desk
+from hsloc_service.call_timeout import BoundedExecutor
 from hsloc_service.db.database import Database
 from hsloc_service.errors import ServiceError, StoreError
 from hsloc_service.execution.dispatcher import LocalDispatcher
@@ -49,7 +49,7 @@ from hsloc_service.settings import SettingsError
 from hsloc_service.storage import Storage
 from hsloc_service.uploads.repository import Files
 from hsloc_service.uploads.upload_stream import Receiver
-from hsloc_service.webhooks import Deliverer
+from hsloc_service.webhooks import WebhookSender
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -93,9 +93,9 @@ def create_app(settings: Settings) -> FastAPI:
         dispatcher=dispatcher,
         stores=stores,
         removals=Removals(database, stores, settings.store_timeout_s),
-        desk=Desk(settings.store_timeout_s),
+        desk=BoundedExecutor(settings.store_timeout_s),
     )
-    helpers = (Deliverer(database, settings), Housekeeping(database, storage, settings, stores))
+    helpers = (WebhookSender(database, settings), Housekeeping(database, storage, settings, stores))
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 from fastapi import Depends, Request
 
 from hsloc_service.auth import Principal
-from hsloc_service.call_timeout import Desk
+from hsloc_service.call_timeout import BoundedExecutor
 from hsloc_service.execution.dispatcher import Dispatcher
 from hsloc_service.http.schemas import Problem
 from hsloc_service.jobs.repository import Jobs
@@ -40,7 +40,7 @@ class Context:
     dispatcher: Dispatcher
     stores: ResultStores
     removals: Removals
-    desk: Desk
+    desk: BoundedExecutor
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server begins to shut down: event streams end."""
     streams: Counter[str] = field(default_factory=Counter)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 POLL_S = 0.4
-BREATH_S = 10.0
+HEARTBEAT_S = 10.0
 """A comment is sent so often, so that both sides notice a dead connection."""
 
 
@@ -82,7 +82,7 @@ async def _stream(ctx: Context, who: Principal, job_id: str, cursor: int, follow
             spoke = now
         elif not follow or job.state in ENDED or ctx.stopping.is_set():
             return
-        elif now - spoke > BREATH_S:
+        elif now - spoke > HEARTBEAT_S:
             spoke = now
             yield ": still here\n\n"
         if not rows:

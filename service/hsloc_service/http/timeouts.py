@@ -12,7 +12,7 @@ from typing import Any, cast
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 
-class PatientProtocol(H11Protocol):
+class TimeoutProtocol(H11Protocol):
     """Patient, but not for ever: with headers, with bodies, with answers that nobody takes."""
 
     header_timeout_s = 5.0
@@ -101,4 +101,4 @@ def protocol_class(
         "write_timeout_s": write_timeout_s,
         "max_connections": max_connections,
     }
-    return cast("type[asyncio.Protocol]", type("LimitedProtocol", (PatientProtocol,), values))
+    return cast("type[asyncio.Protocol]", type("LimitedProtocol", (TimeoutProtocol,), values))

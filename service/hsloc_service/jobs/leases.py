@@ -15,7 +15,7 @@ from sqlalchemy import func, select
 
 from hsloc_service.db.tables import AssetRow, FileRow, JobRow
 from hsloc_service.jobs.events import record
-from hsloc_service.jobs.repository import end
+from hsloc_service.jobs.repository import finish_job
 from hsloc_service.stored_request import MAP_STATE, files_of
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class Claim(NamedTuple):
     source: Source | None = None
 
 
-class Beat(NamedTuple):
+class HeartbeatReply(NamedTuple):
     """What a worker learns when it says that it lives."""
 
     mine: bool
@@ -78,19 +78,19 @@ class Leases:
             names, source = _names(session, job.request), _source(session, job)
             return Claim(job.id, job.tenant, owner, job.attempt, job.log_name, job.request, names, source)
 
-    def beat(self, claim: Claim, progress: dict[str, Any] | None) -> Beat:
+    def beat(self, claim: Claim, progress: dict[str, Any] | None) -> HeartbeatReply:
         """Prolong the lease, and note the progress."""
         with self.database.write() as session:
             job = _held(session, claim)
             if job is None:
-                return Beat(mine=False, cancel=False)
+                return HeartbeatReply(mine=False, cancel=False)
             now = time.time()
             job.lease_until, job.heartbeat = now + self.lease_s, now
             if progress is not None:
                 job.phase, job.done, job.total = progress["phase"], progress["done"], progress["total"]
                 job.scans, job.speed, job.progressed = progress["scans"], progress["speed"], now
                 record(session, job, "progress", progress)
-            return Beat(mine=True, cancel=job.cancel)
+            return HeartbeatReply(mine=True, cancel=job.cancel)
 
     def succeed(
         self, claim: Claim, folder: str, assets: list[Asset], summary: dict[str, Any], store: str | None = None
@@ -115,7 +115,7 @@ class Leases:
                         media_type=asset.media_type,
                     )
                 )
-            end(session, job, "succeeded", None, None)
+            finish_job(session, job, "succeeded", None, None)
             return True
 
     def fail(self, claim: Claim, state: str, reason: str, message: str) -> bool:
@@ -124,7 +124,9 @@ class Leases:
             job = _held(session, claim)
             if job is None:
                 return False
-            end(session, job, "cancelled" if job.cancel else state, "cancelled" if job.cancel else reason, message)
+            finish_job(
+                session, job, "cancelled" if job.cancel else state, "cancelled" if job.cancel else reason, message
+            )
             return True
 
     def release(self, claim: Claim, reason: str, counts: bool = True) -> None:
@@ -151,9 +153,9 @@ class Leases:
 
     def _again(self, session: Session, job: JobRow, reason: str, counts: bool) -> None:
         if job.cancel:
-            end(session, job, "cancelled", "cancelled", "cancelled")
+            finish_job(session, job, "cancelled", "cancelled", "cancelled")
         elif counts and job.attempt >= self.max_attempts:
-            end(session, job, "crashed", "attempts", f"given up after {job.attempt} attempts: {reason}")
+            finish_job(session, job, "crashed", "attempts", f"given up after {job.attempt} attempts: {reason}")
         else:
             job.state = "queued"
             job.owner = job.lease_until = None

@@ -117,7 +117,7 @@ class Jobs:
         with self.database.write() as session:
             job = _job(session, who, job_id)
             if job.state == "queued":
-                end(session, job, "cancelled", "cancelled", "cancelled before it started")
+                finish_job(session, job, "cancelled", "cancelled", "cancelled before it started")
             elif job.state == "running":
                 job.cancel, job.state = True, "cancelling"
                 record(session, job, "state", {"state": "cancelling"})
@@ -132,9 +132,9 @@ class Jobs:
             job = _job(session, who, job_id)
             if job.state in ACTIVE:
                 raise conflict("active", f"the job is {job.state}; cancel it first")
-            if extended(session, job_id):
+            if base_job(session, job_id):
                 raise conflict("in_use", "an active job extends the map of this one; cancel that first")
-            erase(session, job)
+            delete_job(session, job)
 
     def _need_room(self, session: Session, who: Principal) -> None:
         self.storage.need_space()
@@ -174,7 +174,7 @@ class Jobs:
         return job
 
 
-def end(session: Session, job: JobRow, state: str, reason: str | None, message: str | None) -> None:
+def finish_job(session: Session, job: JobRow, state: str, reason: str | None, message: str | None) -> None:
     """Put a job into a final state, and its webhook into the outbox, in one transaction."""
     job.state, job.reason, job.message = state, reason, message
     job.ended = time.time()
@@ -207,7 +207,7 @@ def end(session: Session, job: JobRow, state: str, reason: str | None, message: 
         )
 
 
-def erase(session: Session, job: JobRow) -> None:
+def delete_job(session: Session, job: JobRow) -> None:
     """Remove the rows of a job, and note down that its results are to go."""
     if job.folder is not None:
         session.add(removal_of(job))
@@ -217,7 +217,7 @@ def erase(session: Session, job: JobRow) -> None:
     session.delete(job)
 
 
-def extended(session: Session, job_id: str) -> bool:
+def base_job(session: Session, job_id: str) -> bool:
     """Whether a job that has not ended extends the map of this one."""
     query = select(JobRow.id).where(JobRow.resume_of == job_id, JobRow.state.in_(ACTIVE)).limit(1)
     return session.scalar(query) is not None

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import or_, select
 
-from hsloc_service.logs import log
-from hsloc_service.errors import StoreError
-from hsloc_service.db.tables import JobRow, RemovalRow
 from hsloc_service.call_timeout import wait
+from hsloc_service.db.tables import JobRow, RemovalRow
+from hsloc_service.errors import StoreError
+from hsloc_service.logs import log
 
 if TYPE_CHECKING:
     from hsloc_service.db.database import Database

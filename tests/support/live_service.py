@@ -1,4 +1,4 @@
-"""A service on a temporary folder, with a fake worker: its settings, a process of it, and requests to it."""
+"""A running server, and requests that tests send to it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import httpx2 as httpx
 
 from hsloc_service.settings import Settings
 
-FAKE = (sys.executable, "-P", str(Path(__file__).parent / "fake_worker.py"))
+FAKE = (sys.executable, "-P", str(Path(__file__).parents[1] / "service" / "fake_worker.py"))
 SMALL: dict[str, Any] = {
     "min_free_bytes": 1 << 20,
     "grace_s": 0.3,

@@ -17,13 +17,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def pytest_itemcollected(item: pytest.Item) -> None:
-    """Give each operation of the API an id of its own: schemathesis has one for all, and pytest-xdist ran only one."""
-    label = getattr(item, "operation_label", None)
-    if label is not None and "[" not in item.nodeid:
-        item._nodeid = f"{item.nodeid}[{label}]"
-
-
 @pytest.fixture
 def make_client(tmp_path: Path) -> Iterator[Callable[..., TestClient]]:
     """Clients of services in this process; with `raise_server_exceptions=False`, as over the wire."""

@@ -26,7 +26,7 @@ def rewritten(path: Path, change: Callable[..., Any], end: float = 20.0) -> Path
     """The office, with each event changed by `change`."""
     log = open_log(OFFICE, ReadOptions(end_s=end))
     with LogWriter(path) as writer:
-        writer.occupancy_grid(log.map(), log.summary.origin_ns)
+        writer.occupancy_grid(log.map(), log.summary.origin_ns)  # type: ignore[arg-type]
         for event in map(change, log.events()):
             if isinstance(event, Scan):
                 writer.scan(event)

@@ -32,7 +32,7 @@ map_server:
 
 def test_what_means_the_same_is_taken_and_the_rest_is_named(tmp_path: Path) -> None:
     (tmp_path / "nav2.yaml").write_text(AMCL)
-    warnings = []
+    warnings: list[str] = []
     config = load(tmp_path / "nav2.yaml", warnings=warnings)
     noise = config.localiser.odometry_noise
     assert (noise.alpha1, noise.alpha2, noise.alpha4) == (0.3, Config().localiser.odometry_noise.alpha2, 1.0)
@@ -49,7 +49,7 @@ def test_nodes_in_namespaces_and_wildcards(tmp_path: Path) -> None:
     (tmp_path / "p.yaml").write_text(
         "robot1:\n  amcl:\n    ros__parameters: {update_min_d: 0.7}\n/**:\n  ros__parameters: {alpha3: 0.5}\n"
     )
-    warnings = []
+    warnings: list[str] = []
     config = load(tmp_path / "p.yaml", warnings=warnings)
     assert config.localiser.update_min_d == 0.7
     assert config.localiser.odometry_noise.alpha3 == 0.5

@@ -193,13 +193,13 @@ def test_a_path_shorter_than_a_piece_has_no_rpe() -> None:
 @pytest.mark.parametrize(("value", "unit"), [(0, "m"), (-1, "s"), (1.5, "frames"), (np.nan, "m"), (1, "miles")])
 def test_bad_deltas(value: float, unit: str) -> None:
     with pytest.raises(EvaluationError):
-        Delta(value, unit)
+        Delta(value, unit)  # type: ignore[arg-type]
 
 
 def test_statistics_by_hand() -> None:
     statistics = Statistics.of(np.array([3.0, 4.0, 0.0, 1.0]))
     assert statistics == Statistics(
-        rmse=pytest.approx(6.5**0.5), mean=2.0, median=2.0, std=pytest.approx(2.5**0.5), min=0.0, max=4.0, sse=26.0,
+        rmse=pytest.approx(6.5**0.5), mean=2.0, median=2.0, std=pytest.approx(2.5**0.5), min=0.0, max=4.0, sse=26.0,  # type: ignore[arg-type]
         count=4,
     )  # fmt: skip
 

@@ -47,16 +47,16 @@ def test_the_mcap_library_finds_index_checksums_attachment_and_metadata(results:
 
 def test_rosbags_decodes_every_message(results: Path) -> None:
     trajectory = read_tum(results / "trajectory.tum")
-    found = Counter()
+    found = Counter()  # type: ignore[var-annotated]
     poses = []
     with AnyReader([results / "run.mcap"]) as reader:
         for connection, _, raw in reader.messages():
             message = reader.deserialize(raw, connection.msgtype)
             found[connection.topic] += 1
             if connection.topic == "/pose":
-                poses.append((message.pose.position.x, message.pose.position.y))
+                poses.append((message.pose.position.x, message.pose.position.y))  # type: ignore[attr-defined]
             if connection.topic == "/map":
-                cells = np.asarray(message.data).reshape(message.info.height, message.info.width)
+                cells = np.asarray(message.data).reshape(message.info.height, message.info.width)  # type: ignore[attr-defined]
                 np.testing.assert_array_equal(cells, open_log(HALL).map().cells)
     scans = json.loads((results / "metrics.json").read_text())["scans"]["total"]
     of_each = {"/scan": scans, "/pose": len(trajectory), "/tf": len(trajectory)}
@@ -94,7 +94,7 @@ def test_the_page_tells_what_was_read_how_it_converged_and_where_the_origin_is(r
 
 
 def test_the_page_tells_warnings_and_the_checksums_of_a_map_that_was_given(results: Path, tmp_path: Path) -> None:
-    save_map(open_log(HALL).map(), tmp_path)
+    save_map(open_log(HALL).map(), tmp_path)  # type: ignore[arg-type]
     text = (tmp_path / "map.yaml").read_text().replace("free_thresh: 0.196", "free_thresh: 0.25")
     (tmp_path / "map.yaml").write_text(text)
     out = tmp_path / "out"

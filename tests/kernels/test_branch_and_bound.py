@@ -39,7 +39,7 @@ def naive_best(
                 fitness = scores[moved[inside, 1], moved[inside, 0]].sum() / len(points)
                 if fitness > best:
                     best, pose = fitness, (u, v, theta)
-    return best, pose
+    return best, pose  # type: ignore[return-value]
 
 
 @pytest.fixture

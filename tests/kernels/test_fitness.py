@@ -73,9 +73,9 @@ def test_the_gradient_is_that_of_finite_differences(
     scores, packed, points = scene
     pose = np.array([20.3, 14.6, 0.4])
     information, gradient = np.empty((3, 3)), np.empty(3)
-    total = normal_equations(packed, points, *pose, information, gradient)
+    total = normal_equations(packed, points, *pose, information, gradient)  # type: ignore[call-arg]
     # Single precision, and the two kernels add in another order.
-    assert total == pytest.approx(score_sum(packed, points, *pose, -2.0), abs=1e-4)
+    assert total == pytest.approx(score_sum(packed, points, *pose, -2.0), abs=1e-4)  # type: ignore[call-arg]
     jacobian = np.empty((37, 3))
     inside = np.empty(37)
     for i, point in enumerate(points):
@@ -112,13 +112,13 @@ def test_polish_climbs_and_stays_in_the_box(
     rng = np.random.default_rng(1)
     for _ in range(20):
         start = np.array([rng.uniform(5, 35), rng.uniform(5, 25), rng.uniform(-3, 3)])
-        before = score_sum(packed, points, *start, -2.0)
+        before = score_sum(packed, points, *start, -2.0)  # type: ignore[call-arg]
         pose = start.copy()
         half = np.array((0.5, 0.5, 0.05))
         low, high = start - half, start + half
         total, evaluations = polish(packed, points, pose, low, high, 15, np.zeros((3, 3)))
         assert total >= before - 1e-4
-        assert total == pytest.approx(score_sum(packed, points, *pose, -2.0), abs=1e-4)
+        assert total == pytest.approx(score_sum(packed, points, *pose, -2.0), abs=1e-4)  # type: ignore[call-arg]
         assert (pose >= low).all()
         assert (pose <= high).all()
         assert 1 <= evaluations <= 16

@@ -37,7 +37,7 @@ def terms(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     information, gradient, counts = np.empty((3, 3)), np.empty(3), np.empty(5)
     chosen, chosen_start = scans.chosen(10_000)
-    pair_terms(
+    pair_terms(  # type: ignore[call-arg]
         i, j, *pose, scans.points, scans.normals, scans.centroids, scans.start, scans.hit_of_beam, scans.ranges,
         scans.table_start, scans.geometry, chosen, chosen_start, gate, scale, information, gradient, counts,
     )  # fmt: skip

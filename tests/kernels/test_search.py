@@ -168,7 +168,7 @@ def test_search_is_repeatable_and_tells_why_it_stopped(
     assert stopped == STOPPED_AGREEMENT
     assert 2 <= restarts <= 10
     assert evaluations > restarts * 60
-    assert fitness == pytest.approx(score_sum(packed, points, *first[0], -2.0) / 20, abs=1e-6)
+    assert fitness == pytest.approx(score_sum(packed, points, *first[0], -2.0) / 20, abs=1e-6)  # type: ignore[call-arg]
     assert (np.abs(first[0] - centre) <= half).all()
     assert run(1)[1][3] == STOPPED_BUDGET
     assert not np.array_equal(run(1)[0], run(2)[0])

@@ -37,7 +37,7 @@ def copy(
         writer.start(profile="ros2", library="test")
         channels: dict[int, int] = {}
         for schema, channel, message in messages:
-            if not keep(channel.topic, (message.log_time - start) / SECOND):
+            if not keep(channel.topic, (message.log_time - start) / SECOND):  # type: ignore[arg-type]
                 continue
             if channel.id not in channels:
                 assert schema is not None

@@ -104,7 +104,7 @@ def test_no_points_no_match(scene: tuple[LikelihoodField, NDArray[np.float64]]) 
     field, _ = scene
     window = Window(Pose2(1.0, 1.0, 0.0), 0.3, 0.3, 0.1)
     for matcher in ALL:
-        match = matcher.match(np.empty((0, 2)), field, window, np.random.default_rng(0))
+        match = matcher.match(np.empty((0, 2)), field, window, np.random.default_rng(0))  # type: ignore[attr-defined]
         assert match.stopped is StopReason.NO_POINTS
         assert match.pose == window.centre
         assert match.evaluations == 0
@@ -136,8 +136,8 @@ def test_evaluations_are_counted_truly(scene: tuple[LikelihoodField, NDArray[np.
     # 250 improvisations, 17 passes of 30 rows after every 14 of them, 30 rows to begin with.
     assert Hide.paper_literal().match(points, field, window, rng).evaluations == 30 + 250 + 17 * 30 + 1
     history = Hide().match(points, field, window, rng, keep_history=True).history
-    assert len(history) == 240
-    assert (np.diff(history) >= 0.0).all()
+    assert len(history) == 240  # type: ignore[arg-type]
+    assert (np.diff(history) >= 0.0).all()  # type: ignore[operator, type-var]
 
 
 @pytest.mark.parametrize(

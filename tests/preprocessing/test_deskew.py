@@ -40,8 +40,8 @@ def scan(stamp_s: float = 1.0, beams: int = 100, sweep_s: float = 0.1, **changes
 
 
 def paired_scan(events: list[Any]) -> PairedScan:
-    (found,) = (event for event in pair(sorted(events, key=lambda e: e.stamp_ns), deskew=True) if is_scan(event))
-    return found
+    (found,) = (event for event in pair(sorted(events, key=lambda e: e.stamp_ns), deskew=True) if is_scan(event))  # type: ignore[arg-type]
+    return found  # type: ignore[return-value]
 
 
 def is_scan(event: Odometry | PairedScan) -> bool:
@@ -83,7 +83,7 @@ def test_all_events_come_once_and_scans_keep_their_order() -> None:
     assert len(found) == len(events)
     stamps = [event.stamp_ns for event in found if isinstance(event, Odometry)]
     assert stamps == sorted(stamps)
-    scans = [event.scan.stamp_ns for event in found if is_scan(event)]
+    scans = [event.scan.stamp_ns for event in found if is_scan(event)]  # type: ignore[arg-type]
     assert scans == sorted(scans)
     assert len(scans) == 20
 
@@ -114,7 +114,7 @@ def test_the_duration_of_a_scan_stands_in_for_the_time_of_its_beams(tmp_path: Pa
 
 def test_a_turning_lidar_is_localised_three_times_better(tmp_path: Path) -> None:
     scenario = preset("office")
-    scenario = replace(scenario, seed=8, duration_s=25.0, sensor=replace(scenario.sensor, motion_distortion=True))
+    scenario = replace(scenario, seed=8, duration_s=25.0, sensor=replace(scenario.sensor, motion_distortion=True))  # type: ignore[arg-type]
     record(scenario, tmp_path / "skew.mcap")
     errors = {}
     for deskew in (False, True):

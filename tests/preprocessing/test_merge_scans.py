@@ -44,7 +44,7 @@ def test_the_last_of_each_pair_carries_the_other(offset: int) -> None:
     # Before b is known a leads alone; b's first scan then waits for a's second where that is near, as all do.
     found = told(*scans)
     assert found[0] == ("a", 0, ())
-    carried = [entry for entry in found[1:] if entry[2] != "held"]
+    carried = [entry for entry in found[1:] if entry[2] != "held"]  # type: ignore[unreachable]
     assert len(carried) == 2
     for _, ms, companions in carried:
         (other,) = companions

@@ -26,7 +26,7 @@ S = 10**9
 
 def told(
     stated: tuple[float, Pose2] | None,
-    odometry: list[tuple[int, float]] = (),
+    odometry: list[tuple[int, float]] = (),  # type: ignore[assignment]
     start_s: float | None = None,
     grid: OccupancyGrid = ROOM,
     **spec: Pose2 | bool,

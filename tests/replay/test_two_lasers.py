@@ -36,7 +36,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     parts = {}
     for name, mounting, offset in (("front", FRONT, 0.0), ("rear", REAR, 0.05)):
         scenario = preset("corridor_loop")
-        sensor = replace(scenario.sensor, mounting=mounting, frame_id=name, field_of_view=pi, beams=180)
+        sensor = replace(scenario.sensor, mounting=mounting, frame_id=name, field_of_view=pi, beams=180)  # type: ignore[arg-type]
         scenario = replace(scenario, seed=9, duration_s=20.0, sensor=sensor, scan_offset_s=offset)
         record(scenario, folder / f"{name}.mcap")
         parts[name] = open_log(folder / f"{name}.mcap")
@@ -52,7 +52,7 @@ def write(path: Path, log: Log, events: list[Odometry | Scan | Truth], T_base_re
     with LogWriter(path) as writer:
         writer.metadata("hsloc.initial_pose", {"x": repr(start.x), "y": repr(start.y), "theta": repr(start.theta)})
         writer.transforms(0, links, static=True)
-        writer.occupancy_grid(log.map(), 0)
+        writer.occupancy_grid(log.map(), 0)  # type: ignore[arg-type]
         for event in events:
             if isinstance(event, Scan):
                 writer.scan(event, topic=f"/{event.frame_id}")
@@ -82,7 +82,7 @@ def error(log: Path, topics: str, mode: str) -> tuple[float, Result]:
     """RMSE of APE (m) and the result."""
     result = run(RunRequest(logs=(log,), read=ReadOptions(scan_topic=topics), mode=mode))
     alignment = "none" if mode == "localise" else "se2"
-    return evaluate(result.trajectory, result.reference, alignment=alignment).ape.trans_part.rmse, result
+    return evaluate(result.trajectory, result.reference, alignment=alignment).ape.trans_part.rmse, result  # type: ignore[arg-type]
 
 
 def test_both_lasers_are_matched_as_one_cloud_and_are_better_than_either(log: Path) -> None:
@@ -102,7 +102,7 @@ def test_a_map_of_both_lasers_holds_the_beams_of_both(log: Path) -> None:
     assert mounted == {(0.3, 0.0, 0.0), (-0.3, 0.05, round(pi, 6))}
     stamps = result.mapping.keyscan_stamps_ns
     assert (np.diff(stamps) > 0).all()
-    assert evaluate(result.trajectory, result.reference, alignment="se2").ape.trans_part.max < 0.03
+    assert evaluate(result.trajectory, result.reference, alignment="se2").ape.trans_part.max < 0.03  # type: ignore[arg-type]
 
 
 def test_the_command_takes_the_flag_twice_or_commas(

@@ -47,7 +47,7 @@ def run() -> dict[str, Any]:
 def pixels(path: Path) -> tuple[NDArray[np.uint8], dict[str, tuple[float, float]]]:
     with Image.open(path) as image:
         assert image.format == "PNG"
-        return np.asarray(image.convert("RGB")), dict(image.info)
+        return np.asarray(image.convert("RGB")), dict(image.info)  # type: ignore[arg-type]
 
 
 def test_the_same_run_gives_the_same_bytes(run: dict[str, Any], tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_an_aligned_reference_is_drawn_over_the_trajectory(run: dict[str, Any]) 
         run["reference"].stamps_ns, compose_poses(Pose2(30.0, 5.0, 1.0).to_array(), run["reference"].poses)
     )
     data = prepare(run["trajectory"], None, away, None, {"alignment": "se2"})
-    assert np.abs(data.reference - data.path).max() < 0.1
+    assert np.abs(data.reference - data.path).max() < 0.1  # type: ignore[operator]
     assert data.errors.translation_m.values.max() < 0.1
     assert prepare(run["trajectory"], None, away, None, {}).errors.translation_m.values.max() > 10.0
 
@@ -171,10 +171,10 @@ def test_lost_spans_and_counts(run: dict[str, Any]) -> None:
     scans = prepare(run["trajectory"], None, None, run["diagnostics"], {}).scans
     ((begin, until),) = scans.lost
     assert (begin, until) == pytest.approx((10.0, 15.0), abs=0.3)
-    counts = status_counts(scans)
+    counts = status_counts(scans)  # type: ignore[arg-type]
     assert sum(counts.values()) == len(run["diagnostics"])
     assert counts["searching"] == scans.where("searching").sum() > 0
-    assert ("rejected", "fitness 0.41 below 0.55", counts["rejected"]) in reason_counts(scans)
+    assert ("rejected", "fitness 0.41 below 0.55", counts["rejected"]) in reason_counts(scans)  # type: ignore[arg-type]
 
 
 def test_reasons_that_differ_in_figures_are_one(run: dict[str, Any]) -> None:
@@ -182,7 +182,7 @@ def test_reasons_that_differ_in_figures_are_one(run: dict[str, Any]) -> None:
     reasons = [f"fitness {0.3 + i / 1e4:.4f} below 0.55" if r else "" for i, r in enumerate(diagnostics.reason)]
     object.__setattr__(diagnostics, "reason", tuple(reasons))
     scans = prepare(run["trajectory"], None, None, diagnostics, {}).scans
-    counted = {status: (reason, count) for status, reason, count in reason_counts(scans)}
+    counted = {status: (reason, count) for status, reason, count in reason_counts(scans)}  # type: ignore[arg-type]
     first = next(reason for reason, status in zip(reasons, diagnostics.status, strict=True) if status == "rejected")
     assert counted["rejected"] == (f"fitness … below … (first: {first})", diagnostics.status.count("rejected"))
 

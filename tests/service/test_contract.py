@@ -144,7 +144,7 @@ def answers_are_as_described(operation: Any) -> Any:
 
 # A name for each operation: `schema.parametrize()` gives all the same id, and pytest-xdist runs one test for each id.
 for found in schema.get_all_operations():
-    described_operation = found.ok()
+    described_operation = found.ok()  # type: ignore[union-attr]
     name = re.sub(r"\W+", "_", f"{described_operation.method}{described_operation.path}".lower()).strip("_")
     globals()[f"test_answers_are_as_described_{name}"] = answers_are_as_described(described_operation)
 

@@ -50,7 +50,7 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
     def make(url: str, **options: Any) -> Any:
         contexts.append(browser.new_context(accept_downloads=True, **options))
         page = contexts[-1].new_page()
-        page.on("dialog", lambda dialog: (complaints.append(f"dialog: {dialog.message}"), dialog.dismiss()))
+        page.on("dialog", lambda dialog: (complaints.append(f"dialog: {dialog.message}"), dialog.dismiss()))  # type: ignore[func-returns-value]
         page.on("pageerror", lambda error: complaints.append(f"error: {error}"))
         page.on(
             "console",

@@ -53,7 +53,7 @@ def cut(path: Path, at_s: float, end_s: float, folder: Path) -> list[Path]:
                         channel.topic, channel.message_encoding, ident, channel.metadata
                     )
                 writer.add_message(known[channel.id], message.log_time, message.data, message.publish_time)
-            writer.finish()
+            writer.finish()  # type: ignore[no-untyped-call]
     return paths
 
 

@@ -83,7 +83,7 @@ def test_they_hold_what_the_readme_says(name: str) -> None:
     events = list(log.events())
     assert (events[-1].stamp_ns - events[0].stamp_ns) / 1e9 == pytest.approx(float(seconds), abs=0.06)
     assert log.map().cells.max() == 100
-    _, start = log.initial_pose()
+    _, start = log.initial_pose()  # type: ignore[misc]
     truth = next(event for event in events if isinstance(event, Truth))
     assert start.distance(truth.T_map_base) < 1e-6
     counts = [sum(isinstance(event, kind) for event in events) for kind in (Truth, Odometry, Scan)]

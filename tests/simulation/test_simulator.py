@@ -45,14 +45,14 @@ def test_odometry_without_noise_is_the_truth_seen_from_the_start() -> None:
 
 
 def test_hits_lie_on_the_walls_seen_from_the_truth() -> None:
-    ticks, scans = split(replace(SHORT, sensor=replace(SHORT.sensor, range_noise=0.0)))
+    ticks, scans = split(replace(SHORT, sensor=replace(SHORT.sensor, range_noise=0.0)))  # type: ignore[arg-type]
     truth = {tick.stamp_ns: tick.T_map_base for tick in ticks}
     for scan in scans:
         assert OFFICE.distance_to_walls(truth[scan.stamp_ns] @ scan.points_base()).max() < 1.5e-3
 
 
 def test_distorted_scans_straighten_when_each_beam_is_put_where_it_was_measured() -> None:
-    sensor = replace(SHORT.sensor, range_noise=0.0, motion_distortion=True, range_max=30.0)
+    sensor = replace(SHORT.sensor, range_noise=0.0, motion_distortion=True, range_max=30.0)  # type: ignore[arg-type]
     ticks, scans = split(replace(SHORT, sensor=sensor, duration_s=12.0))
     stamps = np.array([tick.stamp_ns for tick in ticks])
     straight, bent = [], []

@@ -27,7 +27,7 @@ def state(office: tuple[list[Odometry | PairedScan], Trajectory]) -> MapState:
     mapper = Mapper(GraphMapperParameters(), np.random.default_rng(0))
     for event in office[0][: len(office[0]) // 2]:
         mapper.update(event)
-    return mapper.finish().state
+    return mapper.finish().state  # type: ignore[return-value]
 
 
 def test_what_is_read_is_what_was_written(state: MapState, tmp_path: Path) -> None:

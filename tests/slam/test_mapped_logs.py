@@ -38,7 +38,7 @@ def read(path: Path) -> list[Any]:
                 ranges[ranges > 80.0] = np.inf
                 scan = Scan(events[-1].stamp_ns, ranges, -np.pi / 2, np.pi / 180, 0.02, 80.0)
                 odometry = next(event for event in reversed(events) if isinstance(event, Odometry))
-                events.append(PairedScan(scan, odometry.T_odom_base))
+                events.append(PairedScan(scan, odometry.T_odom_base))  # type: ignore[arg-type]
     return events
 
 

@@ -170,9 +170,9 @@ def test_next_to_nothing_is_no_error(office: tuple[list[Odometry | PairedScan], 
         "one scan": [scan],
         "standing": [scan] * 5,
     }[what]
-    result, said = mapped(told)
-    assert len(said) == len(told)
-    assert len(result.scan_poses) + len(result.odometry_poses) == len(told)
+    result, said = mapped(told)  # type: ignore[arg-type]
+    assert len(said) == len(told)  # type: ignore[arg-type]
+    assert len(result.scan_poses) + len(result.odometry_poses) == len(told)  # type: ignore[arg-type]
     assert result.quality.keyscans == (1 if what in ("one scan", "standing") else 0)
     assert result.quality.to_dict()["loop_max"] is None
 

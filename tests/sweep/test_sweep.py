@@ -64,7 +64,7 @@ def test_a_plan_is_all_combinations_with_names_of_their_own() -> None:
 
 def test_finished_runs_are_known_again_and_others_are_not(tmp_path: Path) -> None:
     runs = plan([OFFICE, HALL], DEFAULT, read=SHORT)
-    seen = []
+    seen: list[Any] = []
     first = sweep_in_threads(runs, tmp_path, progress=seen.append)
     assert states(first) == [DONE, DONE]
     assert {outcome.run.name for outcome in seen} == {item.name for item in runs}
@@ -135,8 +135,8 @@ def test_what_goes_wrong_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_a_run_that_ends_its_process_ends_no_other(tmp_path: Path) -> None:
     runs = plan([OFFICE], DEFAULT, range(3), read=SHORT)
-    runs[1] = replace(runs[1], spec=replace(runs[1].spec, labels=(Bomb(),)))
-    told = []
+    runs[1] = replace(runs[1], spec=replace(runs[1].spec, labels=(Bomb(),)))  # type: ignore[arg-type]
+    told: list[Any] = []
     outcomes = sweep_in_processes(runs, tmp_path, 2, told.append)
     assert states(outcomes) == [DONE, FAILED, DONE]
     assert outcomes[1].error.startswith("the process ended: ")
@@ -168,13 +168,13 @@ def command(capsys: pytest.CaptureFixture[str], *argv: Path | str) -> tuple[int,
 
 def test_the_command_varies_what_it_is_told_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = [OFFICE, "--out", tmp_path, "--end", "1.5", "--seeds", "5", "--vary", "hide.budget=100,200", "--json"]
-    code, out, err = command(capsys, *arguments)
+    code, out, err = command(capsys, *arguments)  # type: ignore[arg-type]
     assert (code, err) == (0, "")
     names = [row["run"] for row in json.loads(out)]
     assert names == [f"office-hide.budget={n}-seed5" for n in (100, 200)]
     assert "budget: 200" in (tmp_path / names[1] / "config.yaml").read_text()
     assert json.loads((tmp_path / "sweep.json").read_text()) == json.loads(out)
-    code, out, _ = command(capsys, *arguments[:-1], "--csv")
+    code, out, _ = command(capsys, *arguments[:-1], "--csv")  # type: ignore[arg-type]
     assert (code, out) == (0, (tmp_path / "sweep.csv").read_text())
     assert {row["state"] for row in csv.DictReader(io.StringIO(out))} == {"skipped"}
     code, out, err = command(capsys, OFFICE, tmp_path / "missing.mcap", "--out", tmp_path, "--end", "3")

@@ -98,7 +98,7 @@ def test_slipping_wheels_and_lost_readings_are_survived() -> None:
 
 def test_the_reports_own_set_up_is_localised_better_than_published() -> None:
     found = result("paper")
-    x, y, theta = evaluate(found.trajectory, found.reference).axis_rmse
+    x, y, theta = evaluate(found.trajectory, found.reference).axis_rmse  # type: ignore[arg-type]
     assert x < 0.0447
     assert y < 0.0623
     assert theta < 0.0351
@@ -117,7 +117,7 @@ def test_the_files_say_what_the_result_says(tmp_path: Path) -> None:
     assert np.array_equal(written.stamps_ns, found.trajectory.stamps_ns)
     np.testing.assert_allclose(written.poses[:, :2], found.trajectory.poses[:, :2], atol=1e-8)
     assert len(written) == len(found.odometry)
-    assert metrics["ape"]["trans_part"]["rmse"] == evaluate(found.trajectory, found.reference).ape.trans_part.rmse
+    assert metrics["ape"]["trans_part"]["rmse"] == evaluate(found.trajectory, found.reference).ape.trans_part.rmse  # type: ignore[arg-type]
     assert metrics["map"]["residuals"]["within_0.15_m"] > 0.99
 
 

@@ -116,7 +116,7 @@ def test_mistakes_are_told(first: tuple[Result, Path], tmp_path: Path) -> None:
         ({"map_path": tmp_path}, "without a map.yaml"),
     ):
         with pytest.raises(HslocError, match=said):
-            run(RunRequest(logs=(OFFICE,), **wrong))
+            run(RunRequest(logs=(OFFICE,), **wrong))  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="leave out one"):
         RunRequest(logs=(OFFICE,), resume=folder, map_path=folder)
     with pytest.raises(ConfigError, match="leave out one"):

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def ape(found: Result) -> Statistics:
-    return evaluate(found.trajectory, found.reference, alignment="se2").ape.trans_part
+    return evaluate(found.trajectory, found.reference, alignment="se2").ape.trans_part  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", ["office", "corridor_loop"])

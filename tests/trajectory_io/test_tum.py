@@ -74,7 +74,7 @@ def test_the_reader_is_tolerant(tmp_path: Path) -> None:
     file.write_text(f"\ufeff# t x y\n\n 1.0   2\t3 0 0 0 {HALF} {HALF} \r\n#x\n0.5 1 1 9 0 0 0 1", encoding="utf-8")
     path = read_tum(file)
     assert path.stamps_ns.tolist() == [1_000_000_000, 500_000_000]
-    np.testing.assert_allclose(path.poses, [[2, 3, np.pi / 2], [1, 1, 0]], atol=1e-12)
+    np.testing.assert_allclose(path.poses, [[2, 3, np.pi / 2], [1, 1, 0]], atol=1e-12)  # type: ignore[arg-type]
 
 
 def test_planar_lines_and_gzip(tmp_path: Path) -> None:

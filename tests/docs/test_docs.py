@@ -8,13 +8,20 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from paths import ROOT
 
 from hsloc.cli.main import COMMANDS, build_parser, main
+from hsloc.config import Config, to_dict
 
 GUIDES = sorted((ROOT / "docs").glob("*.md"))
+OF_OTHER_TOOLS = {
+    "coming-from.md": {
+        "--align", "--align_origin", "--all_pairs", "--correct_scale", "--delta_unit", "--save_results", "--t_max_diff",
+    },
+}  # fmt: skip
 _BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _EXIT = re.compile(r"#.*exit code (\d)")
 
@@ -75,10 +82,22 @@ def test_every_command_that_is_named_exists(path: Path) -> None:
         words = shlex.split(line, comments=True)
         if words[0] == "hsloc":
             build_parser().parse_args(words[1 : words.index(">") if ">" in words else None])
-    flags = set(re.findall(r"--[a-z][a-z0-9-]+", " ".join(re.findall(r"`([^`]+)`", path.read_text(encoding="utf-8")))))
+    inline = re.findall(r"`([^`]+)`", path.read_text(encoding="utf-8"))
+    flags = set(re.findall(r"--[a-z][a-z0-9_-]+", " ".join(inline)))
     known = {text for parser in parsers() for action in parser._actions for text in action.option_strings}
-    foreign = {"--version"}
-    assert flags - known - foreign == set()
+    assert flags - known - OF_OTHER_TOOLS.get(path.name, set()) - {"--version"} == set()
+
+
+@pytest.mark.parametrize("path", GUIDES, ids=lambda path: path.name)
+def test_every_parameter_that_is_named_exists(path: Path) -> None:
+    parameters = to_dict(Config())
+    for name in re.findall(r"`([a-z_]+(?:\.[a-z_0-9]+)+)`", path.read_text(encoding="utf-8")):
+        first, *rest = name.split(".")
+        part: Any = parameters.get(first)
+        if isinstance(part, dict):
+            for key in rest:
+                assert key in part, f"{name}: {key} is no parameter; known: {', '.join(part)}"
+                part = part[key]
 
 
 def parsers() -> list[argparse.ArgumentParser]:

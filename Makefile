@@ -29,7 +29,7 @@ lint: $(VENV)/.dev  ## style, types and the direction of imports
 	$(BIN)/lint-imports
 
 docs: $(VENV)/.docs  ## the documentation as a site in build/site; a warning is an error
-	$(BIN)/mkdocs build -q --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build -q --strict
 
 $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit("hsloc needs Python 3.11 or newer; set PYTHON=python3.11") if sys.version_info < (3, 11) else None'

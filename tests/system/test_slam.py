@@ -72,13 +72,14 @@ def test_a_log_that_has_no_odometry_at_all_is_mapped_and_written(
 
 
 @pytest.mark.data
-def test_intel_is_mapped_as_well_as_by_the_best(data: Path) -> None:
+def test_intel_is_mapped_better_than_published(data: Path) -> None:
     folder = data / "intel"
     found = run(RunRequest(logs=(folder / "intel.clf.gz",)))
     result = evaluate_relations(found.trajectory, read_relations(folder / "intel.relations"))
     assert result.matched == 2984
-    assert result.statistics.trans_part.mean <= 0.033
-    assert result.statistics.angle_deg.mean <= 0.8
+    # iris_lama: 0.0331 m, 0.83 deg; Cartographer, with all of the scans: 0.0229 m, 0.45 deg.
+    assert result.statistics.trans_part.mean < 0.0229
+    assert result.statistics.angle_deg.mean < 0.65
 
 
 @pytest.mark.data

@@ -1,4 +1,4 @@
-"""The files beside the code: one version, hooks that need no network, a citation, a site of which every page is listed."""
+"""The files beside the code: one version, hooks without a network, a citation, a site that lists every page."""
 
 from __future__ import annotations
 

@@ -9,11 +9,14 @@ from hsloc.cli.arguments import add_read_arguments, read_options
 if TYPE_CHECKING:
     import argparse
 
-    from hsloc.log.reader import Log
-    from hsloc.log.summary import LogSummary, Losses
+    from hsloc.log import Log, LogSummary, Losses
     from hsloc.model import Pose2
 
 HELP = "say what is in a log"
+EXAMPLES = """
+  hsloc info run.mcap
+  hsloc info bag_folder --quick --json
+"""
 
 YEAR_2000_NS = 946_684_800_000_000_000
 
@@ -31,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
     from json import dumps
 
-    from hsloc.log.reader import open_log
+    from hsloc.log import open_log
 
     # What is missing or ambiguous is what a user wants to be told here.
     log = open_log(arguments.log, replace(read_options(arguments), require_scan=False, require_odometry=False))
@@ -61,6 +64,8 @@ def _all_losses(log: Log) -> Losses:
 
 
 def _values(log: Log, losses: Losses, counts: dict[str, int]) -> dict[str, Any]:
+    from hsloc.dataclass_json import to_json
+
     summary = log.summary
     grid, start = log.map(), log.initial_pose()
     pose = summary.T_base_laser
@@ -104,7 +109,7 @@ def _values(log: Log, losses: Losses, counts: dict[str, int]) -> dict[str, Any]:
         "data_lost": losses.data_lost,
         "losses": losses.lines(),
         "reasons": losses.reasons,
-        "warnings": list(summary.warnings),
+        "warnings": [to_json(warning) for warning in summary.warnings],
     }
 
 
@@ -142,8 +147,8 @@ def _lines(summary: LogSummary, losses: Losses, report: dict[str, Any]) -> list[
     lines += [f"  {'order:':<12}{order}"]
     if report["events"]:
         lines += [f"  {'events:':<12}" + ", ".join(f"{n} {name}" for name, n in sorted(report["events"].items()))]
-    remarks = [*summary.warnings, *losses.lines(), *losses.reasons]
-    lines += ["", "remarks:", *(f"  {remark}" for remark in remarks)] if remarks else ["", "no remarks"]
+    warnings = [*summary.warnings, *losses.lines(), *losses.reasons]
+    lines += ["", "warnings:", *(f"  {warning}" for warning in warnings)] if warnings else ["", "no warnings"]
     if losses.data_lost:
         lines += ["part of the log is damaged; what is whole is read, and commands end with exit code 3"]
     return lines

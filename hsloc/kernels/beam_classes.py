@@ -1,4 +1,4 @@
-"""What a map says about each beam of a scan: it ends at a wall, before one, behind one, or where the map has nothing."""
+"""Where each beam of a scan ends on a map: at a wall, before one, behind one, or where nothing is mapped."""
 
 from __future__ import annotations
 
@@ -47,17 +47,17 @@ def classify_beams(
         dy = ends[i, 1] - origin[1]
         length = sqrt(dx * dx + dy * dy)
         reach = length - margin
-        steps = int(ceil(reach)) if reach > 0.0 else 0
+        steps = ceil(reach) if reach > 0.0 else 0
         through = False
         for k in range(steps):
             part = k / length
-            u = int(floor(origin[0] + part * dx))
-            v = int(floor(origin[1] + part * dy))
+            u = floor(origin[0] + part * dx)
+            v = floor(origin[1] + part * dy)
             if u >= 0 and v >= 0 and u < width and v < height and cells[v, u] >= occupied:
                 through = True
                 break
-        u = int(floor(ends[i, 0]))
-        v = int(floor(ends[i, 1]))
+        u = floor(ends[i, 0])
+        v = floor(ends[i, 1])
         known = u >= 0 and v >= 0 and u < width and v < height and cells[v, u] >= 0
         if through:
             classes[i] = THROUGH

@@ -32,19 +32,19 @@ FEWEST_POINTS = 5
 SAME_WALL = 0.97
 """Cosine of the largest angle between a point's normal and the mean normal of its wall: 14 deg."""
 DOUBTFUL_WEIGHT = 20.0
-"""A wall of this many cells counts by half: what is seen on a few cells may be a door or an object."""
+"""A wall seen on this many cells counts by half: what is seen on a few cells may be a door or an object."""
 _COLUMNS = 1 << 40
-"""Rows and columns of cells are told apart by an offset larger than any map."""
+"""Rows and columns of cells are distinguished by an offset larger than any map."""
 
 
 @njit(cache=True, nogil=True)
 def wall_normals(points: F64, max_gap: float, noise_variance: float, normals: F64) -> None:
     """Write the unit normal of the wall of each of the points (n, 2), in the order of the beams, into `normals` (n, 2).
 
-    A wall is fitted to each point and its neighbours by total least squares. Neighbours count within `SPAN`, and as long
-    as each is within `max_gap` metres, plus a tenth of its distance from the origin, of the next. Then the points of a
-    run whose normals agree take their mean. A point without a wall gets (0, 0): too few neighbours are near, or they
-    scatter across the line by more than a third of their spread along it, `noise_variance` (m^2) allowed for.
+    A wall is fitted to each point and its neighbours by total least squares. Neighbours count within `SPAN`, and as
+    long as each is within `max_gap` metres, plus a tenth of its distance from the origin, of the next. Then the points
+    of a run whose normals agree take their mean. A point without a wall gets (0, 0): too few neighbours are near, or
+    they scatter across the line by more than a third of their spread along it, `noise_variance` (m^2) allowed for.
     """
     n = len(points)
     for i in range(n):
@@ -86,9 +86,9 @@ def wall_rows(points: F64, normals: F64, pose: F64, cell: float, rows: I64) -> N
         nx = c * normals[i, 0] - s * normals[i, 1]
         ny = s * normals[i, 0] + c * normals[i, 1]
         if abs(nx) > abs(ny):
-            rows[i] = int(floor((pose[0] + c * points[i, 0] - s * points[i, 1]) / cell + 0.5)) + _COLUMNS
+            rows[i] = floor((pose[0] + c * points[i, 0] - s * points[i, 1]) / cell + 0.5) + _COLUMNS
         else:
-            rows[i] = int(floor((pose[1] + s * points[i, 0] + c * points[i, 1]) / cell + 0.5))
+            rows[i] = floor((pose[1] + s * points[i, 0] + c * points[i, 1]) / cell + 0.5)
 
 
 @njit(cache=True, nogil=True)
@@ -205,14 +205,14 @@ def _near(points: F64, a: int, b: int, max_gap: float) -> bool:
     dx = points[a, 0] - points[b, 0]
     dy = points[a, 1] - points[b, 1]
     gap = max_gap + 0.1 * sqrt(points[a, 0] ** 2 + points[a, 1] ** 2)
-    return dx * dx + dy * dy <= gap * gap
+    return bool(dx * dx + dy * dy <= gap * gap)
 
 
 @njit(cache=True, nogil=True)
 def _within(points: F64, a: int, b: int) -> bool:
     dx = points[a, 0] - points[b, 0]
     dy = points[a, 1] - points[b, 1]
-    return dx * dx + dy * dy <= SPAN * SPAN
+    return bool(dx * dx + dy * dy <= SPAN * SPAN)
 
 
 @njit(cache=True, nogil=True)

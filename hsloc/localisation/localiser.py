@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 from math import hypot, radians
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from hsloc.errors import ConfigError
 from hsloc.localisation.match_gate import MatchGate, MatchLimits
 from hsloc.localisation.motion import normalised_innovation, predict_covariance, update_with_information
 from hsloc.localisation.motion_gate import MotionGate
@@ -26,6 +25,7 @@ from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Evidence, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.parameters import Angle, Count, NonNegative, OneOf, Parameters, Positive, Ratio
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -41,59 +41,48 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LocaliserParameters:
-    """When a scan is matched, in which window, and what is believed. Names as in AMCL where the meaning is the same."""
+class LocaliserParameters(Parameters):
+    """When a scan is matched, in which window, and which match is accepted; where AMCL has it, by AMCL's name."""
 
-    update_min_d: float = 0.2
-    """A scan is matched after so many metres (m)."""
-    update_min_a: float = 0.2
-    """Or after so much turning (rad)."""
-    min_points: int = 10
-    """A scan with fewer hits is not matched ([P]: more than 5)."""
-    window_sigmas: float = 3.0
-    """Half-width of the window in standard deviations of the prediction."""
-    window_min: float = 0.15
-    """But at least so many metres (m)."""
-    window_min_angle: float = radians(5.0)
-    """And so much of an angle (rad)."""
-    min_fitness: float = 0.3
-    """A match below is refused, whatever was usual before."""
-    usual_fraction: float = 0.7
-    """A match below this part of the usual fitness (of the matches before) is refused."""
-    convincing_fraction: float = 0.9
-    """After a refusal a match in a wider window must reach this part of the usual fitness."""
-    lost_after: int = 5
-    """The pose is lost after so many refused matches in a row."""
+    update_min_d: NonNegative = 0.2
+    """Minimum translation between two matched scans [m]; a larger rotation alone is enough, too."""
+    update_min_a: NonNegative = 0.2
+    """Minimum rotation between two matched scans [rad]; a larger translation alone is enough, too."""
+    min_points: Count = 10
+    """Minimum number of hits of a scan that is matched; [P] asks for more than 5."""
+    window_sigmas: Positive = 3.0
+    """Half-width of the search window in standard deviations of the prediction."""
+    window_min: Positive = 0.15
+    """Minimum half-width of the search window in x and y [m]."""
+    window_min_angle: Angle = radians(5.0)
+    """Minimum half-width of the search window in heading [rad]."""
+    min_fitness: Ratio = 0.3
+    """Minimum fitness of an accepted match."""
+    min_fitness_ratio: Ratio = 0.7
+    """Minimum ratio of an accepted match's fitness to the usual fitness, the running mean of accepted matches."""
+    recovery_fitness_ratio: Ratio = 0.9
+    """Minimum ratio to the usual fitness of a match in the wide window that is searched after a refused match."""
+    wide_window: Positive = 0.5
+    """Half-width of the window that is searched after a refused match [m]; wheels may slip by as much."""
+    wide_window_angle: Angle = radians(20.0)
+    """Half-width in heading of the window that is searched after a refused match [rad]."""
+    max_consecutive_rejections: Count = 5
+    """Number of refused matches in a row after which the pose counts as lost and the whole map is searched."""
     fuse: bool = True
-    """Weigh match and prediction by their covariances (EKF); otherwise the match is the new pose ([P])."""
-    initial_sigma: float = 0.5
-    """Standard deviation of a given start in x and y (m)."""
-    initial_sigma_angle: float = radians(15.0)
-    """And in theta (rad)."""
-    motion_model: str = "differential"
-    """How the base moves, which chooses the noise of its odometry: one of differential, ackermann, omnidirectional."""
+    """Whether match and prediction are weighted by their covariances (EKF); otherwise the match is taken, as in [P]."""
+    initial_sigma: Positive = 0.5
+    """Standard deviation of a given initial pose in x and y [m]."""
+    initial_sigma_angle: Positive = radians(15.0)
+    """Standard deviation of a given initial pose in heading [rad]."""
+    motion_model: Annotated[str, OneOf(MOTION_MODELS)] = "differential"
+    """How the base moves, which chooses its odometry noise: differential drive, car-like, or in any direction."""
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
     ackermann_noise: AckermannNoise = field(default_factory=AckermannNoise)
     omnidirectional_noise: OmnidirectionalNoise = field(default_factory=OmnidirectionalNoise)
     relocaliser: RelocaliserParameters = field(default_factory=RelocaliserParameters)
     place_check: PlaceCheckParameters = field(default_factory=PlaceCheckParameters)
-    lost_probability: float = 0.99
-    """The pose is lost where the track is astray with this probability, and not unique on the map, in [0, 1]."""
-
-    def __post_init__(self) -> None:
-        for name in ("min_points", "lost_after"):
-            if not getattr(self, name) >= 1:
-                raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("update_min_d", "update_min_a", "min_fitness", "usual_fraction", "convincing_fraction"):
-            if not getattr(self, name) >= 0.0:
-                raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be 0 or more")
-        for name in ("window_sigmas", "window_min", "window_min_angle", "initial_sigma", "initial_sigma_angle"):
-            if not getattr(self, name) > 0.0:
-                raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be positive")
-        if self.motion_model not in MOTION_MODELS:
-            raise ConfigError(
-                f"localiser: motion_model is {self.motion_model!r}; it must be one of {', '.join(MOTION_MODELS)}"
-            )
+    lost_probability: Ratio = 0.99
+    """Probability of having gone astray from which the whole map is searched, where another place fits as well."""
 
     def noise(self) -> MotionModel:
         """The noise of the motion model that is chosen."""
@@ -108,19 +97,15 @@ class LocaliserParameters:
         """The limits of the match gate."""
         return MatchLimits(
             min_fitness=self.min_fitness,
-            min_fitness_ratio=self.usual_fraction,
-            recovery_fitness_ratio=self.convincing_fraction,
+            min_fitness_ratio=self.min_fitness_ratio,
+            recovery_fitness_ratio=self.recovery_fitness_ratio,
         )
 
 
-_WIDER = (0.5, radians(20.0))
-"""Half-widths (m, rad) of the window tried after a refused match: what a wheel may slip."""
 _FEWEST_JOINED = 4
 """Scans that a place is compared by, at least."""
 _FIRST_COMPARISON_M = 3.0
 """A new track is compared with the whole map after this path length (m), or after the usual one if that is shorter."""
-_SLIP = np.diag((_WIDER[0] ** 2, _WIDER[0] ** 2, _WIDER[1] ** 2)) / 9.0
-"""Added to the covariance with each refused match: a third of the wide window is one standard deviation of a slip."""
 _EXCESS_GAIN = 0.1
 """Gain of the running mean of squared innovations by their expected ones: it follows within about ten matches."""
 _MOST_EXCESS = 10.0
@@ -248,7 +233,7 @@ class Localiser:
         _, _, astray = self._track_filter.add(TrackRow(status, evidence))
         if evidence.rival >= 1.0 and astray > p.lost_probability:
             status = Status.SEARCHING
-            reason = f"lost: the map explains {evidence.explained:.2f}, another place fits {evidence.rival:.2f} times as well"
+            reason = f"lost: the map explains {evidence.explained:.2f}, another place fits {evidence.rival:.2f} times"
             self._lose()
         covariance = self._reported(covariance)
         return Estimate(scan.stamp_ns, pose, status, covariance, match.fitness, evaluations, reason, evidence=evidence)
@@ -314,9 +299,9 @@ class Localiser:
         if self._match_gate.usual is not None and self._match_gate.refusal(best.fitness):
             wide = Window(
                 predicted,
-                max(window.half_x, _WIDER[0]),
-                max(window.half_y, _WIDER[0]),
-                max(window.half_theta, _WIDER[1]),
+                max(window.half_x, p.wide_window),
+                max(window.half_y, p.wide_window),
+                max(window.half_theta, p.wide_window_angle),
             )
             match = self._matcher.match(points, self._field, wide, self._rng)
             evaluations += match.evaluations
@@ -335,10 +320,12 @@ class Localiser:
     ) -> Estimate:
         """The prediction stands; after too many refusals the pose is lost."""
         refusals = self._match_gate.refuse()
-        covariance = covariance + _SLIP
+        p = self._parameters
+        # The window for slip is taken for three standard deviations of a slip.
+        covariance = covariance + np.diag((p.wide_window**2, p.wide_window**2, p.wide_window_angle**2)) / 9.0
         self._take(predicted, covariance, paired.T_odom_base)
         status = Status.REJECTED
-        if refusals >= self._parameters.lost_after:
+        if refusals >= self._parameters.max_consecutive_rejections:
             self._lose()
             status, reason = Status.SEARCHING, f"lost: {reason}"
         covariance = self._reported(covariance)

@@ -56,7 +56,9 @@ def update_with_information(prediction: Pose2, covariance: F64, measured: Pose2,
 
 
 def normalised_innovation(prediction: Pose2, covariance: F64, measured: Pose2, information: F64) -> tuple[float, float]:
-    """Squared innovation by its expected covariance, and its degrees of freedom; directions not measured count for none.
+    """Squared innovation by its expected covariance, and its degrees of freedom.
+
+    Directions that are not measured count for none.
 
     With `P` the covariance of the prediction and `L` the information of the measurement the innovation's covariance is
     `P + L^-1`, its inverse `L (I + P L)^-1`, and the degrees of freedom are the trace of the gain.

@@ -6,14 +6,14 @@ into x, y and theta by the Jacobian at the motion that was measured.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from math import atan2, cos, hypot, pi, sin
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from hsloc.errors import ConfigError
 from hsloc.model.pose2 import wrap_angle
+from hsloc.parameters import NonNegative, Parameters
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,7 +40,7 @@ class MotionModel(Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OdometryNoise:
+class OdometryNoise(Parameters):
     """The odometry motion model of *Probabilistic Robotics* (Thrun, Burgard, Fox; 5.4), names as in AMCL.
 
     A motion is a turn, a straight line and a turn; their variances are `alpha1 rot^2 + alpha2 trans^2` (both turns)
@@ -49,17 +49,14 @@ class OdometryNoise:
     of Wean Hall.)
     """
 
-    alpha1: float = 0.04
-    """Variance of a turn per squared rotation [rad^2 / rad^2], 0 or more."""
-    alpha2: float = 0.02
-    """Variance of a turn per squared translation [rad^2 / m^2], 0 or more."""
-    alpha3: float = 0.01
-    """Variance of a translation per squared translation [m^2 / m^2], 0 or more."""
-    alpha4: float = 0.01
-    """Variance of a translation per squared rotation [m^2 / rad^2], 0 or more."""
-
-    def __post_init__(self) -> None:
-        _check_alphas(self, "odometry_noise")
+    alpha1: NonNegative = 0.04
+    """Variance of a turn per squared rotation [rad^2 / rad^2]."""
+    alpha2: NonNegative = 0.02
+    """Variance of a turn per squared translation [rad^2 / m^2]."""
+    alpha3: NonNegative = 0.01
+    """Variance of a translation per squared translation [m^2 / m^2]."""
+    alpha4: NonNegative = 0.01
+    """Variance of a translation per squared rotation [m^2 / rad^2]."""
 
     def covariance(self, motion: Pose2) -> F64:
         """See `MotionModel`. For a robot that drove backwards the first turn is taken from its back, as in AMCL."""
@@ -77,7 +74,7 @@ class OdometryNoise:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AckermannNoise:
+class AckermannNoise(Parameters):
     """The velocity motion model of *Probabilistic Robotics* (5.3, eq. 5.9 to 5.13) for a base that steers like a car.
 
     A motion is an arc of a circle: a distance along it, and a turn. The arc's length has the variance
@@ -86,21 +83,18 @@ class AckermannNoise:
     the motion comes from the turn alone.
     """
 
-    alpha1: float = 0.01
-    """Variance of the arc's length per squared length [m^2 / m^2], 0 or more."""
-    alpha2: float = 0.01
-    """Variance of the arc's length per squared rotation [m^2 / rad^2], 0 or more."""
-    alpha3: float = 0.02
-    """Variance of the arc's turn per squared length [rad^2 / m^2], 0 or more."""
-    alpha4: float = 0.04
-    """Variance of the arc's turn per squared rotation [rad^2 / rad^2], 0 or more."""
-    alpha5: float = 0.005
-    """Variance of the final rotation per squared length [rad^2 / m^2], 0 or more."""
-    alpha6: float = 0.01
-    """Variance of the final rotation per squared rotation [rad^2 / rad^2], 0 or more."""
-
-    def __post_init__(self) -> None:
-        _check_alphas(self, "ackermann_noise")
+    alpha1: NonNegative = 0.01
+    """Variance of the arc's length per squared length [m^2 / m^2]."""
+    alpha2: NonNegative = 0.01
+    """Variance of the arc's length per squared rotation [m^2 / rad^2]."""
+    alpha3: NonNegative = 0.02
+    """Variance of the arc's turn per squared length [rad^2 / m^2]."""
+    alpha4: NonNegative = 0.04
+    """Variance of the arc's turn per squared rotation [rad^2 / rad^2]."""
+    alpha5: NonNegative = 0.005
+    """Variance of the final rotation per squared length [rad^2 / m^2]."""
+    alpha6: NonNegative = 0.01
+    """Variance of the final rotation per squared rotation [rad^2 / rad^2]."""
 
     def covariance(self, motion: Pose2) -> F64:
         """See `MotionModel`. The arc is the one that ends in the motion's heading and has its chord's length."""
@@ -118,7 +112,7 @@ class AckermannNoise:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OmnidirectionalNoise:
+class OmnidirectionalNoise(Parameters):
     """AMCL's motion model of a holonomic base (`nav2_amcl::OmniMotionModel`), which also moves sideways.
 
     A motion is a translation in any direction and a turn at once. Along the translation the variance is
@@ -126,19 +120,16 @@ class OmnidirectionalNoise:
     `alpha1 rot^2 + alpha2 trans^2`.
     """
 
-    alpha1: float = 0.04
-    """Variance of a turn per squared rotation [rad^2 / rad^2], 0 or more."""
-    alpha2: float = 0.02
-    """Variance of a turn per squared translation [rad^2 / m^2], 0 or more."""
-    alpha3: float = 0.01
-    """Variance along the translation per squared translation [m^2 / m^2], 0 or more."""
-    alpha4: float = 0.01
-    """Variance of the translation per squared rotation [m^2 / rad^2], 0 or more."""
-    alpha5: float = 0.01
-    """Variance across the translation per squared translation [m^2 / m^2], 0 or more."""
-
-    def __post_init__(self) -> None:
-        _check_alphas(self, "omnidirectional_noise")
+    alpha1: NonNegative = 0.04
+    """Variance of a turn per squared rotation [rad^2 / rad^2]."""
+    alpha2: NonNegative = 0.02
+    """Variance of a turn per squared translation [rad^2 / m^2]."""
+    alpha3: NonNegative = 0.01
+    """Variance along the translation per squared translation [m^2 / m^2]."""
+    alpha4: NonNegative = 0.01
+    """Variance of the translation per squared rotation [m^2 / rad^2]."""
+    alpha5: NonNegative = 0.01
+    """Variance across the translation per squared translation [m^2 / m^2]."""
 
     def covariance(self, motion: Pose2) -> F64:
         """See `MotionModel`."""
@@ -151,13 +142,6 @@ class OmnidirectionalNoise:
         jacobian = np.array(((c, s, 0.0), (s, -c, 0.0), (0.0, 0.0, 1.0)))
         covariance: F64 = jacobian @ np.diag((var_along, var_across, var_turn)) @ jacobian.T
         return covariance
-
-
-def _check_alphas(noise: Any, name: str) -> None:
-    for item in fields(noise):
-        value = getattr(noise, item.name)
-        if not value >= 0.0:
-            raise ConfigError(f"{name}: {item.name} is {value}; it must be 0 or more")
 
 
 def _shortest(turn: float) -> float:

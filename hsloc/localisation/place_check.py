@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.errors import ConfigError
 from hsloc.kernels.beam_classes import SHORT, THROUGH, UNMAPPED, classify_beams
-from hsloc.kernels.bounds import best_on_lattice, pool
+from hsloc.kernels.branch_and_bound import Excluded, Lattice, best_on_lattice, pool
 from hsloc.kernels.fitness import point_scores
-from hsloc.matching.harmony_search import spread_order
-from hsloc.model.pose2 import Pose2
+from hsloc.matching.harmony_search import low_discrepancy_order
+from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,47 +27,37 @@ if TYPE_CHECKING:
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.model.events import PairedScan
     from hsloc.model.occupancy_grid import OccupancyGrid
+    from hsloc.model.pose2 import Pose2
 
     F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlaceCheckParameters:
+class PlaceCheckParameters(Parameters):
     """How a place is compared with all others on the map."""
 
-    interval: float = 8.0
+    interval: NonNegative = 8.0
     """Path length between two comparisons with the whole map [m]; 0 turns them off."""
-    length: float = 6.0
-    """Path length over which scans are joined for a comparison [m], positive."""
-    scans: int = 8
-    """Number of scans that are joined, at least 1."""
-    points: int = 12
-    """Number of points taken of each scan, at least 1."""
-    cell: float = 0.2
-    """Spacing of the lattice of other places [m], positive; multiples of the map's resolution are used."""
-    own_distance: float = 1.0
-    """Places nearer than this, and within `own_angle`, are the same place [m], positive."""
-    own_angle: float = 0.5
-    """Headings nearer than this, within `own_distance`, are the same place [rad], positive."""
-
-    def __post_init__(self) -> None:
-        for name in ("scans", "points"):
-            if not getattr(self, name) >= 1:
-                raise ConfigError(f"place_check: {name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("length", "cell", "own_distance", "own_angle"):
-            if not getattr(self, name) > 0.0:
-                raise ConfigError(f"place_check: {name} is {getattr(self, name)}; it must be positive")
-        if not self.interval >= 0.0:
-            raise ConfigError(f"place_check: interval is {self.interval}; it must be 0 or more")
+    length: Positive = 6.0
+    """Path length over which scans are joined for a comparison [m]."""
+    scans: Count = 8
+    """Number of scans that are joined."""
+    points: Count = 12
+    """Number of points taken of each scan."""
+    cell: Positive = 0.2
+    """Spacing of the lattice of other places [m]; multiples of the map's resolution are used."""
+    own_distance: Positive = 1.0
+    """Places nearer than this, and within `own_angle`, are the same place [m]."""
+    own_angle: Angle = 0.5
+    """Headings nearer than this, within `own_distance`, are the same place [rad]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
     """What the map explains of a scan at a pose.
 
-    `fitness` is the mean score over the beams that no object in free space cut short and that end where something is
-    mapped; `short`, `through` and
-    `unmapped` are the shares of all beams that end before a wall, behind one, or where nothing is mapped.
+    `fitness` is the mean score over the beams that neither end at an object in free space nor where nothing is mapped;
+    `short`, `through` and `unmapped` are the shares of all beams that end before a wall, behind one, or there.
     """
 
     fitness: float
@@ -148,7 +137,7 @@ class PlaceCheck:
 
     def few(self, points: F64) -> F64:
         """The points of a scan that take part in a comparison, spread evenly over its beams."""
-        return points[spread_order(len(points))[: self.parameters.points]]
+        return np.asarray(points[low_discrepancy_order(len(points))[: self.parameters.points]])
 
     def rival(self, scans: list[tuple[Pose2, F64]], pose: Pose2) -> float:
         """Fitness of the fittest other place on the map divided by that of this one; at least 0.8.
@@ -163,7 +152,9 @@ class PlaceCheck:
         nowhere = np.array((-1.0, -1.0, -1.0))
         found = np.empty(3)
         near = np.array((_OWN_HALF / side, _OWN_HALF / side, _OWN_HALF_ANGLE))
-        own, _ = best_on_lattice(pooled, points, here, near, step, here, nowhere, 0.0, _MOST_VISITS, found)
+        own, _ = best_on_lattice(
+            pooled, points, Lattice(here, near, step), Excluded(here, nowhere), 0.0, _MOST_VISITS, found
+        )
         if own <= 0.0:
             return 1.0
         height, width = pooled.shape[1:]
@@ -171,11 +162,13 @@ class PlaceCheck:
         whole = np.array((width / 2.0, height / 2.0, np.pi))
         p = self.parameters
         same = np.array((p.own_distance / side, p.own_distance / side, p.own_angle))
-        other, _ = best_on_lattice(pooled, points, middle, whole, step, here, same, _NEEDED * own, _MOST_VISITS, found)
+        other, _ = best_on_lattice(
+            pooled, points, Lattice(middle, whole, step), Excluded(here, same), _NEEDED * own, _MOST_VISITS, found
+        )
         return 1.0 if other < 0.0 else other / own
 
     def fittest(self, scans: list[tuple[Pose2, F64]], last: Pose2, needed: float) -> Pose2 | None:
-        """The fittest place on the whole map for scans that are joined by odometry, None if none is fitter than `needed`.
+        """The fittest place on the whole map for scans joined by odometry; None if none is fitter than `needed`.
 
         `scans` are poses of the base and points (n, 2) seen from them, `last` is the pose of the base whose place in
         the map is asked for, all in the frame of the odometry.
@@ -186,9 +179,10 @@ class PlaceCheck:
         middle = np.array((width / 2.0, height / 2.0, 0.0))
         whole = np.array((width / 2.0, height / 2.0, np.pi))
         nowhere = np.array((-1.0, -1.0, -1.0))
+        lattice = Lattice(middle, whole, step)
         found = np.empty(3)
         best, _ = best_on_lattice(
-            pooled, points, middle, whole, step, middle, nowhere, needed, _MOST_VISITS_OF_FITTEST, found
+            pooled, points, lattice, Excluded(middle, nowhere), needed, _MOST_VISITS_OF_FITTEST, found
         )
         if best <= needed:
             return None

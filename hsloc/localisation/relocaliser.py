@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.errors import ConfigError
 from hsloc.localisation.global_search import RelocaliserResult
 from hsloc.localisation.motion import fuse, predict_covariance
 from hsloc.localisation.motion_gate import MotionGate
@@ -29,6 +28,7 @@ from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Evidence, State
 from hsloc.model.pose2 import Pose2, wrap_angle
+from hsloc.parameters import Count, NonNegative, Parameters, Positive, Ratio
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -45,70 +45,47 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RelocaliserParameters:
-    """How the whole map is searched, and when one answer is believed."""
+class RelocaliserParameters(Parameters):
+    """How the whole map is searched, and when a hypothesis is accepted."""
 
-    tile: float = 1.5
-    """Side of a tile of free space (m)."""
-    sectors: int = 4
-    """Headings are searched in so many parts."""
-    budget: int = 240
-    """Fitness evaluations in each tile and sector."""
-    search_points: int = 60
-    """Points of the scan used while searching tiles."""
-    hypotheses: int = 400
-    """At most so many are kept."""
-    step_min_d: float = 0.3
-    """A scan counts after so many metres (m)."""
-    step_min_a: float = 0.3
-    """Or after so much turning (rad)."""
-    seed_scans: int = 3
-    """The whole map is searched with so many scans: what one misses another finds."""
-    min_points: int = 20
-    """A scan with fewer hits says too little."""
-    renew_distance: float = 3.0
-    """Path length after which the whole map is looked at again while no hypothesis fits [m], positive."""
-    min_scans: int = 4
-    """Scans before anything is believed."""
-    min_fitness: float = 0.35
-    """Mean fitness of the winner at least."""
-    lead: float = 1.0
-    """The winner's fitness, summed over the scans, must be ahead of every other's by this."""
-    drop: float = 2.5
-    """A hypothesis that is behind by this sum is dropped."""
-    max_rival_ratio: float = 0.93
-    """Mean fitness of the second best hypothesis by that of the best, at most, for the best to be believed [0..1]."""
-    keep_ratio: float = 0.85
-    """A hypothesis whose mean fitness reaches this part of the best one's is kept, however far behind its sum is [0..1]."""
-    min_evidence: float = 4.0
-    """Least log of the odds that the winner's own scans must give it against being a wrong place, 0 or more."""
-    confidence: float = 0.99
-    """Confidence of the test that the best hypothesis fits better than every other one, below 1."""
-    restart_below: float = 0.3
-    """If the best falls below this mean fitness, the search begins anew."""
-
-    def __post_init__(self) -> None:
-        for name in ("sectors", "budget", "search_points", "hypotheses", "seed_scans", "min_points", "min_scans"):
-            _check(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        for name in ("tile", "renew_distance"):
-            _check(getattr(self, name) > 0.0, name, getattr(self, name), "positive")
-        for name in (
-            "step_min_d",
-            "step_min_a",
-            "min_fitness",
-            "lead",
-            "drop",
-            "restart_below",
-            "min_evidence",
-            "max_rival_ratio",
-            "keep_ratio",
-        ):
-            _check(getattr(self, name) >= 0.0, name, getattr(self, name), "0 or more")
-
-
-def _check(ok: bool, name: str, value: object, rule: str) -> None:
-    if not ok:
-        raise ConfigError(f"relocaliser: {name} is {value}; it must be {rule}")
+    tile: Positive = 1.5
+    """Side of a tile of free space that is searched at once [m]."""
+    sectors: Count = 4
+    """Number of parts in which the headings are searched."""
+    budget: Count = 240
+    """Number of fitness evaluations in each tile and sector."""
+    search_points: Count = 60
+    """Maximum number of points of a scan that are used while tiles are searched."""
+    hypotheses: Count = 400
+    """Maximum number of hypotheses."""
+    step_min_d: NonNegative = 0.3
+    """Minimum translation between two scans that update the hypotheses [m]; a larger rotation is enough, too."""
+    step_min_a: NonNegative = 0.3
+    """Minimum rotation between two scans that update the hypotheses [rad]; a larger translation is enough, too."""
+    seed_scans: Count = 3
+    """Number of scans with which the whole map is searched."""
+    min_points: Count = 20
+    """Minimum number of hits of a scan that updates the hypotheses."""
+    min_scans: Count = 4
+    """Minimum number of scans before a hypothesis is accepted."""
+    min_fitness: Ratio = 0.35
+    """Minimum mean fitness of an accepted hypothesis."""
+    min_margin: NonNegative = 1.0
+    """Minimum difference between the summed fitness of an accepted hypothesis and that of any other."""
+    drop: NonNegative = 2.5
+    """Difference to the best summed fitness at which a hypothesis is dropped."""
+    max_rival_ratio: Ratio = 0.93
+    """Maximum ratio of another hypothesis's mean fitness to that of an accepted one, unless the paired test passes."""
+    keep_ratio: Ratio = 0.85
+    """Ratio to the best mean fitness from which a hypothesis is kept, however far its sum falls behind."""
+    confidence: Ratio = 0.99
+    """Confidence of the paired test that an accepted hypothesis fits better than every other one."""
+    min_evidence: NonNegative = 4.0
+    """Minimum logarithm of the odds that its scans and the whole map give an accepted hypothesis."""
+    renew_distance: Positive = 3.0
+    """Path length after which the whole map is searched again while no hypothesis fits [m]."""
+    restart_below: Ratio = 0.3
+    """Mean fitness of the best hypothesis below which the search starts again."""
 
 
 @dataclass(slots=True, eq=False)
@@ -138,7 +115,7 @@ _RESOLUTION = 0.02
 _WEIGHED = 12
 """Scans that the winner is weighed by, at most."""
 _FULL_M = 3.0
-"""Comparisons with other places count in full over this path length (m): on the spot one view is seen again and again."""
+"""Comparisons with other places count in full over this path length (m): on the spot one view is repeated."""
 _OFF_MAP = 0.87
 """Explained fitness by the usual one below which the best place does not fit."""
 _TRACE_LOST = 3
@@ -293,7 +270,7 @@ class Relocaliser:
         alone = len(self._hypotheses) == 1
         lead = p.drop if alone else best.total - self._hypotheses[1].total
         ratio = 0.0 if alone else self._hypotheses[1].mean / max(best.mean, 1e-9)
-        ahead = len(best.history) >= p.min_scans and best.mean >= p.min_fitness and lead >= p.lead
+        ahead = len(best.history) >= p.min_scans and best.mean >= p.min_fitness and lead >= p.min_margin
         pose = best.pose @ motion
         reason = f"{len(self._hypotheses)} hypotheses, best {best.mean:.2f}, lead {lead:.2f}, {best.scans} scans"
         evidence: Evidence | None = None

@@ -55,7 +55,7 @@ class StateLog:
         self._counts: list[int] = []
 
     def add(self, estimate: Estimate, odometry_count: int) -> None:
-        """Take what the estimator said to a scan, after so many odometry messages; scans without evidence are skipped."""
+        """Take the estimate at a scan and the number of odometry messages before; one without evidence is skipped."""
         if estimate.evidence is not None:
             self._estimates.append(estimate)
             self._counts.append(odometry_count)

@@ -5,10 +5,10 @@ begins right with a prior, and may go astray as the robot moves on or where a sc
 itself. Forward alone the model is a filter; forward and backward it is what an offline service can say: the scans to
 come count as well.
 
-Scans are evidence by what the map explains of them, by the metre and not by the scan: one that fits speaks against being
-astray, but not against a look-alike, so that what the map gets wrong in one of two like places does not add up like
-evidence. A comparison with the whole map speaks against both where it leaves all other places clearly behind, and
-against the place where another one fits clearly better.
+Scans are evidence by what the map explains of them, by the metre and not by the scan. One that fits is evidence against
+being astray, but none against a look-alike, so that errors of the map in one of two like places do not add up. A
+comparison with the whole map is evidence against both where it leaves all other places clearly behind, and against the
+place where another one fits clearly better.
 
 The figures of the likelihoods are from simulation: 24 kinds of runs in three worlds, right and wrong, two seeds (see
 benchmarks/README.md). Right places: explained 0.93 to 0.97, rival 0.80 to 1.05; wrong ones: 0.4 to 0.85, 0.93 to 1.8.
@@ -182,7 +182,7 @@ def usual_explained(rows: Sequence[TrackRow]) -> float:
 
 
 def _product(first: States, second: States) -> States:
-    """State by state, normalised to the sum 1; kept above the smallest numbers, so that no state is ruled out for ever."""
+    """State by state, normalised to the sum 1; none becomes zero, so that no state is ruled out for ever."""
     a, b, c = (max(x * y, _SMALLEST) for x, y in zip(first, second, strict=True))
     total = a + b + c
     return a / total, b / total, c / total

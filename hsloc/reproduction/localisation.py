@@ -1,4 +1,4 @@
-"""E3 (Fig. 5, 6 of [P]): localisation of the report's vehicle along the waypoints, with the product's localiser."""
+"""E3 (Fig. 5, 6 of [P]): localisation of the vehicle of [P] along the waypoints, with the product's localiser."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.config import PRESETS, preset
+from hsloc.config import preset
 from hsloc.evaluation import evaluate
 from hsloc.localisation.localiser import Localiser
 from hsloc.matching import LikelihoodField
 from hsloc.model.estimate import Status
+from hsloc.options import PRESETS
 from hsloc.replay.engine import replay
-from hsloc.replay.recording import Recording
+from hsloc.replay.run_history import RunHistory
 from hsloc.reproduction.variants import NAMES
 from hsloc.simulation.presets import preset as scenario_preset
 from hsloc.simulation.simulator import events
@@ -36,7 +37,7 @@ MATCHERS = ("hide", "harmony_search")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
-    """A drive to draw: the points of the map are in the material, all else is here."""
+    """A run for a figure: the points of the map are in the material, all else is here."""
 
     estimate: Trajectory
     truth: Trajectory
@@ -82,11 +83,11 @@ class Drive:
 def run_localisation(world: World, seeds: int, progress: Callable[[float], None]) -> tuple[Drive, ...]:
     """Drive with the seeds 0 to `seeds` - 1; each drive is localised by HIDE and HS with each preset.
 
-    Vehicle, sensor (every point within 50 m, seen through walls) and noise are the report's; so is the start, which
+    Vehicle, sensor (every point within 50 m, seen through walls) and noise are those of [P]; so is the start, which
     is known to within P0.
     """
     if world.points is None:
-        raise ValueError(f"the world {world.name} has no points: the report's sensor sees nothing")
+        raise ValueError(f"the world {world.name} has no points: the course report's sensor sees nothing")
     scenario = scenario_preset("paper")
     grid = world.occupancy_grid(scenario.map_resolution)
     configs = {
@@ -119,15 +120,15 @@ def _localise(
 ) -> Drive:
     rng = np.random.default_rng(seed)
     localiser = Localiser.from_parameters(grid, field, config.make_matcher(), config.localiser, rng, world.start())
-    recording = Recording()
+    history = RunHistory()
     begin = perf_counter()
     for event, estimate in replay(drive, localiser):
-        recording.add(event, estimate)
+        history.add(event, estimate)
     seconds = perf_counter() - begin
-    estimated, _ = recording.trajectory()
-    truth = recording.reference()
+    estimated, _ = history.trajectory()
+    truth = history.reference()
     assert truth is not None
-    diagnostics = recording.diagnostics()
+    diagnostics = history.diagnostics()
     return Drive(
         matcher=NAMES[config.matcher],
         preset=preset_name,
@@ -139,5 +140,5 @@ def _localise(
         evaluations=int(diagnostics.evaluations.sum()),
         length_m=truth.length(),
         duration_s=float(truth.stamps_ns[-1] - truth.stamps_ns[0]) * 1e-9,
-        path=Path(estimated, truth, recording.odometry()) if seed == 0 else None,
+        path=Path(estimated, truth, history.odometry()) if seed == 0 else None,
     )

@@ -1,4 +1,4 @@
-"""E4 (Fig. 7, 8 of [P]): SLAM of the report's vehicle along the waypoints, with the product's point mapper."""
+"""E4 (Fig. 7, 8 of [P]): SLAM of the vehicle of [P] along the waypoints, with the product's point mapper."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.config import PRESETS, preset
+from hsloc.config import preset
 from hsloc.evaluation import evaluate
 from hsloc.model.estimate import Status
 from hsloc.model.trajectory import Trajectory
+from hsloc.options import PRESETS
 from hsloc.replay.engine import replay
-from hsloc.replay.recording import Recording
+from hsloc.replay.run_history import RunHistory
 from hsloc.reproduction.localisation import MATCHERS, Path
 from hsloc.reproduction.variants import NAMES
 from hsloc.simulation.odometer import SteeringNoise
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
 
 RANGE = 60.0
-"""Every point within so many metres is seen, through walls [P]."""
+"""Distance (m) within which every point is seen, through walls, as in [P]."""
 NOISE = SteeringNoise(0.2, radians(1.0))
 """Of the wheels (m/s) and of the steering (rad) [P]."""
 NEAR = 3.0
@@ -82,7 +83,7 @@ class Mapped:
 def run_mapping(world: World, seeds: int, progress: Callable[[float], None]) -> tuple[Mapped, ...]:
     """Drive with the seeds 0 to `seeds` - 1; each drive is mapped with HIDE and HS, with each of `PRESETS`."""
     if world.points is None:
-        raise ValueError(f"the world {world.name} has no points: the report's sensor sees nothing")
+        raise ValueError(f"the world {world.name} has no points: the course report's sensor sees nothing")
     scenario = scenario_preset("paper")
     scenario = replace(scenario, sensor=replace(scenario.sensor, range_max=RANGE), odometry=NOISE)
     configs = {(name, matcher): replace(preset(name), matcher=matcher) for name in PRESETS for matcher in MATCHERS}
@@ -98,19 +99,19 @@ def run_mapping(world: World, seeds: int, progress: Callable[[float], None]) -> 
 def _map(drive: list[Event], world: World, config: Config, preset_name: str, seed: int) -> Mapped:
     rng = np.random.default_rng(seed)
     mapper = PointMapper(config.make_matcher(), config.point_mapper, rng, world.start())
-    recording = Recording()
+    history = RunHistory()
     known: dict[int, Pose2] = {}
     begin = perf_counter()
     for event, estimate in replay(drive, mapper):
-        recording.add(event, estimate)
+        history.add(event, estimate)
         if estimate is not None:
             known[estimate.stamp_ns] = estimate.T_map_base  # the scan's follows that of the odometry
     seconds = perf_counter() - begin
     estimated = Trajectory.from_pairs(sorted(known.items()))
-    truth = recording.reference()
+    truth = history.reference()
     assert truth is not None
     assert world.points is not None
-    diagnostics = recording.diagnostics()
+    diagnostics = history.diagnostics()
     points = mapper.points
     return Mapped(
         matcher=NAMES[config.matcher],
@@ -123,7 +124,7 @@ def _map(drive: list[Event], world: World, config: Config, preset_name: str, see
         points=len(points),
         complete=float((_distances(world.points, points) < NEAR).mean()),
         distance=float(_distances(points, world.points).mean()),
-        path=Path(estimated, truth, recording.odometry()) if seed == 0 else None,
+        path=Path(estimated, truth, history.odometry()) if seed == 0 else None,
         map_points=points if seed == 0 else None,
     )
 

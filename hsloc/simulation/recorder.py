@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.errors import OutputError
-from hsloc.log.transforms import Transform3
-from hsloc.log.writer import LogWriter
+from hsloc.log import LogWriter, Transform3
 from hsloc.model import Pose2, Scan
 from hsloc.simulation.simulator import Tick, simulate
 from hsloc.simulation.world_files import load_world
@@ -54,7 +53,7 @@ def record(
 ) -> Recording:
     """Drive `scenario` and write the log to `path`.
 
-    `world` overrides the scenario's, which is found by its name. `progress` is told the seconds and metres
+    `world` overrides the scenario's, which is found by its name. `progress` is called with the seconds and metres
     driven, once a simulated second. The file appears only when it is complete. Raises ConfigError for a world
     that is unknown, OutputError where the file exists (unless `overwrite`) or cannot be written.
     """

@@ -1,4 +1,4 @@
-"""The scans that carry the map, in the flat arrays that the kernels want."""
+"""Keyscans, the scans that make up the map, in the flat arrays that the kernels take."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.surfels import choose_hits, fit_surfels
+from hsloc.kernels.point_to_line import ScanArrays, choose_hits, fit_surfels
 from hsloc.model.events import Scan
 from hsloc.model.pose2 import Pose2
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
 
 _SURFEL_RADIUS = 0.2
-"""Hits within this distance (m) are fitted together."""
+"""Distance (m) of the hits to which a line is fitted. Internal: the size of the smallest walls, door frames."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyScan:
-    """A scan prepared: its hits with surfels, and its beams for looking up (hsloc/kernels/surfels.py)."""
+    """A scan prepared: its hits with surfels, and its beams for looking up (hsloc/kernels/point_to_line.py)."""
 
     points: F32
     normals: F32
@@ -70,7 +70,7 @@ class KeyScans:
     geometry: F64
 
     @staticmethod
-    def joined(scans: list[KeyScan]) -> KeyScans:
+    def from_scans(scans: list[KeyScan]) -> KeyScans:
         """Of at least one scan."""
         return KeyScans(
             np.concatenate([scan.points for scan in scans]),
@@ -90,10 +90,10 @@ class KeyScans:
         for k in range(len(start) - 1):
             hits, beams = slice(start[k], start[k + 1]), slice(table_start[k], table_start[k + 1])
             scans.append(KeyScan.fitted(points[hits], hit_of_beam[beams], ranges[beams], geometry[k]))
-        return KeyScans.joined(scans)
+        return KeyScans.from_scans(scans)
 
     @staticmethod
-    def together(first: KeyScans, second: KeyScans) -> KeyScans:
+    def concatenate(first: KeyScans, second: KeyScans) -> KeyScans:
         """Those of two logs."""
         return KeyScans(
             np.concatenate((first.points, second.points)),
@@ -119,8 +119,15 @@ class KeyScans:
         """Hits of a scan in the base's frame, shape (n, 2)."""
         return self.points[self.start[index] : self.start[index + 1]]
 
+    def arrays(self, most: int) -> ScanArrays:
+        """All of it for the kernels, with about `most` chosen hits of each scan."""
+        return ScanArrays(
+            self.points, self.normals, self.centroids, self.start, self.hit_of_beam, self.ranges, self.table_start,
+            self.geometry, *self.chosen(most),
+        )  # fmt: skip
+
     def chosen(self, most: int) -> tuple[I32, I64]:
-        """About `most` hits of each scan, evenly by the directions of their walls (`kernels.surfels.choose_hits`).
+        """About `most` hits of each scan, evenly by the directions of their walls (`choose_hits`).
 
         Returns the rows within each scan, one scan after the other, and where each begins, shape (n + 1,).
         """

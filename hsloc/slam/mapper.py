@@ -2,12 +2,12 @@
 
 While the log is read, each scan is matched against the scans just before it. At its end loops are closed between
 places, the pose graph is solved, all scans are refined against all that see the same walls, until nothing moves, and
-the map is drawn.
+the map is built.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,12 +16,10 @@ from hsloc.localisation.motion import predict_covariance
 from hsloc.model.estimate import Estimate, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY
-from hsloc.slam.drawing import DrawingParameters
+from hsloc.slam.back_end import finish
+from hsloc.slam.front_end import FLOOR, FrontEnd
 from hsloc.slam.keyscans import KeyScan
-from hsloc.slam.local_matching import FLOOR, LocalMatcher, LocalMatchingParameters
-from hsloc.slam.loop_closer import LoopParameters
-from hsloc.slam.refinement import RefinementParameters
-from hsloc.slam.track import Track
+from hsloc.slam.trajectory_correction import EventLog
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,45 +28,22 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.model.events import Scan
-    from hsloc.model.pose2 import Pose2
-    from hsloc.slam.local_matching import LocalMatch
+    from hsloc.slam.front_end import LocalMatch
+    from hsloc.slam.parameters import GraphMapperParameters, Resume
     from hsloc.slam.result import MappingResult
-    from hsloc.slam.state import MapState
 
     F64 = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GraphMapperParameters:
-    """All of the graph mapper's, one default for all logs."""
-
-    local_matching: LocalMatchingParameters = field(default_factory=LocalMatchingParameters)
-    loops: LoopParameters = field(default_factory=LoopParameters)
-    refinement: RefinementParameters = field(default_factory=RefinementParameters)
-    drawing: DrawingParameters = field(default_factory=DrawingParameters)
-    use_odometry: bool = True
-    """Otherwise a constant velocity predicts, and the log's odometry is not looked at."""
-    passes: int = 3
-    """The whole log is gone over again at most so often, until nothing moves."""
-
-
-@dataclass(frozen=True, slots=True)
-class Resume:
-    """A saved map to go on from, and where in it the log begins, if that is known."""
-
-    state: MapState
-    T_map_first: Pose2 | None = None
-
-
 class Mapper:
-    """An `Estimator` that draws its own map; `finish` tells what the whole log knows."""
+    """An `Estimator` that builds its own map; `finish` gives the result of the whole log."""
 
     def __init__(self, parameters: GraphMapperParameters, rng: Generator, resume: Resume | None = None) -> None:
         self._parameters = parameters
         self._rng = rng
         self._resume = resume
-        self._matcher = LocalMatcher(parameters.local_matching, rng, parameters.use_odometry)
-        self._track = Track(parameters.local_matching.turn_length)
+        self._matcher = FrontEnd(parameters.front_end, rng, parameters.use_odometry)
+        self._track = EventLog(parameters.front_end.turn_length)
         self._scans: list[KeyScan] = []
         self._stamps: list[int] = []
         self._local: list[LocalMatch] = []
@@ -81,7 +56,7 @@ class Mapper:
     def update(self, event: Odometry | PairedScan) -> Estimate:
         """Take an event; the estimate at its stamp, in the map as it is known so far (it drifts)."""
         if isinstance(event, Odometry):
-            # Without odometry the message tells nothing: it stands where the last scan stood.
+            # Without odometry the message gives no motion: the pose is that of the last scan.
             T_odom_base = event.T_odom_base if self._parameters.use_odometry else self._T_last_scan
             self._track.add(T_odom_base, is_scan=False)
             return Estimate(event.stamp_ns, self._T_map_odom @ T_odom_base, Status.PREDICTED)
@@ -120,7 +95,7 @@ class Mapper:
     def _keep_companions(self, event: PairedScan, found: LocalMatch) -> LocalMatch:
         """Make the companions of a keyscan keyscans before it; the keyscan's match, seen from the last of them.
 
-        From scan to scan of one cloud the odometry tells the motion: each keeps its own beams, for each has an origin.
+        Between the scans of one cloud the motion is the odometry's: each keeps its own beams, for each has an origin.
         """
         numbers = {id(held.scan): number for number, held in self._held}
         motion, covariance = found.motion, found.covariance
@@ -134,12 +109,10 @@ class Mapper:
         return replace(found, motion=motion, covariance=covariance)
 
     def finish(self, progress: Callable[[float], None] | None = None) -> MappingResult:
-        """Close loops, refine, draw; `progress` is told parts from 0 to 1. May be called once, at the end.
+        """Close loops, refine, build the map, once at the end; `progress` is called with parts from 0 to 1.
 
         Raises MapError if no connection with the saved map is found.
         """
-        from hsloc.slam.second_pass import finish
-
         return finish(
             self._scans, np.array(self._stamps, dtype=np.int64), self._local, self._track, self._parameters,
             self._rng, progress, self._resume,

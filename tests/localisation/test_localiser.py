@@ -123,7 +123,7 @@ def test_odometry_between_matches_is_composed():
     assert estimate.T_map_base.distance(Pose2(1.0, 2.5, 0.0)) < 1e-6
 
 
-@pytest.mark.parametrize("name", ["lost_after", "min_points", "window_min", "min_fitness"])
+@pytest.mark.parametrize("name", ["max_consecutive_rejections", "min_points", "window_min", "min_fitness"])
 def test_a_parameter_out_of_range_is_refused_by_name(name):
     with pytest.raises(ConfigError, match=name):
         LocaliserParameters(**{name: -1})

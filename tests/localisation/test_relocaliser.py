@@ -93,5 +93,5 @@ def test_the_same_seed_gives_the_same_verdicts():
 
 @pytest.mark.parametrize(("name", "value"), [("tile", 0.0), ("min_scans", 0), ("min_fitness", -0.1)])
 def test_a_parameter_out_of_range_is_refused_by_name(name, value):
-    with pytest.raises(ConfigError, match=f"relocaliser: {name}"):
+    with pytest.raises(ConfigError, match=f"RelocaliserParameters.{name} is"):
         RelocaliserParameters(**{name: value})

@@ -1,0 +1,79 @@
+"""What it takes to run a replay again: command, configuration, versions, checksums."""
+
+from __future__ import annotations
+
+import platform
+import shlex
+from hashlib import file_digest
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
+
+from hsloc.config import dump, preset
+from hsloc.options import OPTIONS, written
+from hsloc.replay.map_sources import map_files
+from hsloc.report.html import Provenance
+from hsloc.version import __version__
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hsloc.replay.run import Result
+    from hsloc.request import RunRequest
+
+_PACKAGES = ("numpy", "scipy", "numba", "mcap", "rosbags")
+
+
+def provenance(result: Result) -> Provenance:
+    """For the report."""
+    versions = {"hsloc": __version__, "Python": platform.python_version()}
+    versions |= {name: metadata.version(name) for name in _PACKAGES}
+    hashes = {" ".join(result.spec.names()): result.input_sha256}
+    if result.spec.map_path is not None:
+        hashes |= {path.name: _sha256(path) for path in map_files(result.spec.map_path)}
+    return Provenance(command(result.spec), dump(result.spec.config), versions, hashes)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return file_digest(stream, "sha256").hexdigest()
+
+
+def command(request: RunRequest) -> str:
+    """The command line that repeats the run, in the folder in which it was made; but for --out it is complete.
+
+    With an own matcher, or the server's files (`bare_names`), it says what to put in.
+    """
+    values = request.to_values()
+    words = ["hsloc", "replay", *request.paths()]
+    for option in OPTIONS:
+        if option.place != "check":
+            words += written(option, _default_matcher(option.name, values))
+    return " ".join(_quoted(word) for word in words)
+
+
+def _default_matcher(name: str, values: dict[str, Any]) -> Any:
+    """Matcher and mapper are named only where they are not the preset's."""
+    if name in ("matcher", "mapper") and values[name] == getattr(preset(values["preset"]), name):
+        return None
+    return values.get(name)
+
+
+def _quoted(word: str) -> str:
+    """A word for bash on one line; bytes of a name that are no UTF-8, and control characters, as `$'\\xfc'`."""
+    if word.isprintable():
+        return shlex.quote(word)
+    plain = word.replace("\\", "\\\\").replace("'", "\\'")
+    octets = plain.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return "$'" + "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in octets) + "'"
+
+
+def config_text(result: Result) -> str:
+    """The effective configuration; what else is needed to repeat the run stands above it."""
+    own = result.spec.own_matcher
+    lines = [
+        f"# hsloc {__version__}; run it again with: {command(result.spec)}",
+        *([] if own is None else [f"# matcher of the caller's own: {type(own).__name__}"]),
+        f"# preset: {result.spec.preset}",
+        f"# input sha256: {result.input_sha256}",
+    ]
+    return "\n".join(lines) + "\n" + dump(result.spec.config)

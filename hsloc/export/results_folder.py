@@ -1,0 +1,126 @@
+"""A result on disk: trajectory, map, metrics, reports and a recording to look at.
+
+Everything is written into a folder beside the target, which takes the target's name when it is complete: a run that
+fails, or is interrupted, leaves nothing half-written behind.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from hsloc.analysis import Analysis, analyse, run_timings
+from hsloc.errors import OutputError
+from hsloc.evaluation import write_json, write_tum
+from hsloc.export.provenance import config_text, provenance
+from hsloc.export.run_mcap import RunRecording
+from hsloc.maps import save_map
+from hsloc.report.html import write_report_html
+from hsloc.report.png import draw_report
+from hsloc.slam.map_state import STATE_FILE, write_state
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from hsloc.replay.run import Result
+    from hsloc.run_metrics import RunMetrics, RunTimings
+
+_OF_RESULTS = (("metrics.json", "config.yaml"), ("results.json", "report.md"))
+"""Files that a folder of results holds, of a run or of the reproduced experiments, and no other folder."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WrittenResults:
+    """What was written: the analysis of the run, and its wall times."""
+
+    analysis: Analysis
+    timings: RunTimings
+
+    @property
+    def metrics(self) -> RunMetrics:
+        """The content of metrics.json."""
+        return self.analysis.metrics
+
+
+def write_results(
+    result: Result,
+    folder: Path,
+    *,
+    overwrite: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> WrittenResults:
+    """Analyse the result and write it into `folder`, which must not exist yet unless `overwrite`.
+
+    Raises OutputError if the folder is there already, or cannot be written.
+    """
+    refuse_folder(folder, overwrite)
+    folder = folder.resolve()  # "." and ".." have no name of their own, and a link stays what it is
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir(parents=True)
+        written = _write(result, partial, progress)
+        if folder.exists():
+            shutil.rmtree(folder)
+        partial.rename(folder)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return written
+
+
+def refuse_folder(folder: Path, overwrite: bool) -> None:
+    """Raise OutputError for a folder in use; what is no folder of results is not replaced even if asked for."""
+    try:
+        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+            return
+        is_results = any(all((folder / name).is_file() for name in names) for names in _OF_RESULTS)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be read: {error.strerror or error}") from error
+    if not overwrite:
+        raise OutputError(f"{folder}: exists already; choose another --out, or pass --overwrite")
+    if not is_results:
+        raise OutputError(f"{folder}: holds no results of hsloc, so it is not overwritten; choose another --out")
+
+
+def _write(result: Result, folder: Path, progress: Callable[[float], None] | None) -> WrittenResults:
+    begin = time.perf_counter()
+    with RunRecording(result, folder / "run.mcap") as recording:
+        analysis = analyse(result, observer=recording.add, progress=progress)
+    seconds = {"analyse": time.perf_counter() - begin - recording.seconds, "run_mcap": recording.seconds}
+    begin = time.perf_counter()
+    write_tum(folder / "trajectory.tum", result.trajectory)
+    if len(result.odometry):
+        write_tum(folder / "odometry.tum", result.odometry)
+    if result.reference is not None:
+        write_tum(folder / "reference.tum", result.reference)
+    if result.mode == "slam":
+        save_map(result.grid, folder)
+    if result.mapping is not None:
+        result.mapping.graph.write_g2o(folder / "graph.g2o")
+        if result.mapping.state is not None:
+            write_state(result.mapping.state, folder / STATE_FILE)
+    write_json(folder / "metrics.json", analysis.metrics.to_json())
+    (folder / "config.yaml").write_text(config_text(result), encoding="utf-8")
+    shown = {
+        "title": " ".join(result.spec.names()),
+        "trajectory": result.trajectory,
+        "localised": result.localised,
+        "odometry": analysis.odometry,
+        "reference": result.reference,
+        "grid": result.grid,
+        "diagnostics": result.diagnostics,
+        "metrics": analysis.metrics,
+        "comparison": analysis.comparison,
+    }
+    draw_report(folder / "report.png", **shown)  # type: ignore[arg-type]
+    more = {"provenance": provenance(result), "convergence": analysis.convergence}
+    write_report_html(folder / "report.html", **shown, **more)  # type: ignore[arg-type]
+    seconds["reports"] = time.perf_counter() - begin
+    timings = run_timings(result, seconds)
+    write_json(folder / "timings.json", timings.to_json())
+    return WrittenResults(analysis, timings)

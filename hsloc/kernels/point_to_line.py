@@ -1,0 +1,325 @@
+"""Scan against scan: short pieces of wall, and the terms that pull one scan onto another.
+
+Each hit of a scan carries the line fitted to the hits around it (a surfel: centroid and normal). A point of another
+scan is looked up by its bearing in the scan it is compared with (projective association, as in Blais and Levine 1995),
+so that no field and no tree is needed, and what one side of a wall has seen is never paired with
+its other side. The residual is the distance from point to line (Chen and Medioni 1992; Censi 2008 for planar scans).
+
+Scans are stored one after the other (`ScanArrays`, made by `hsloc.slam.keyscans`).
+"""
+
+from __future__ import annotations
+
+from math import atan2, cos, pi, sin, sqrt
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numba import njit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    F32 = NDArray[np.float32]
+    F64 = NDArray[np.float64]
+    I32 = NDArray[np.int32]
+    I64 = NDArray[np.int64]
+
+_MOST_NEIGHBOURS = 16
+"""Maximum number of hits on each side of a hit. Internal: bounds the time where beams are dense."""
+_MOST_BEAMS = 4
+"""Maximum number of beams on each side of a point's own beam. Internal: bounds the time where beams are dense."""
+_DIRECTIONS = 16
+"""Sectors of the normals among which hits are chosen. Internal: walls of one direction in each, 22.5 degrees."""
+_SAME_FACE = 0.7
+"""Minimum cosine between the normals of one wall in two scans. Internal: 45 degrees, faces differ by 90 or 180."""
+_THROUGH = 0.25
+"""Distance (m) by which a beam that looked through a point ends behind it. Internal: above errors of range."""
+
+
+class ScanArrays(NamedTuple):
+    """Scans one after the other, and which of their hits are used.
+
+    In this module because a kernel's argument types decide whether it can be cached.
+    """
+
+    points: F32
+    """Hits of scan k in the base's frame (m): rows start[k] to start[k + 1], shape (P, 2)."""
+    normals: F32
+    """Normals of the hits, shape (P, 2); (0, 0) for a hit without a surfel."""
+    centroids: F32
+    """Centroids of the surfels of the hits (m), shape (P, 2)."""
+    start: I64
+    hit_of_beam: I32
+    """Row of a beam's hit within its scan, or -1; beams of scan k are entries table_start[k] to table_start[k + 1]."""
+    ranges: F32
+    """Range of each beam (m); infinite: no return; NaN: invalid."""
+    table_start: I64
+    geometry: F64
+    """The laser's x, y, theta in the base, angle_min and angle_increment of each scan, shape (n, 5)."""
+    chosen_hits: I32
+    """Rows of the hits that are used, within their scan: of k the entries chosen_start[k] to chosen_start[k + 1]."""
+    chosen_start: I64
+
+
+class Term(NamedTuple):
+    """Normal equations of one pose (x, y, theta): `information` (3, 3) and `gradient` (3,)."""
+
+    information: F64
+    gradient: F64
+
+
+@njit(cache=True, nogil=True)
+def fit_surfels(
+    points: F32, beams: I32, spacing: float, radius: float, normals: F32, centroids: F32, origin: F64
+) -> None:
+    """Fit a line to the hits around each hit; writes unit `normals` towards `origin` (the laser) and `centroids`.
+
+    The neighbours are those within `radius` metres, and at least two on either side, as long as the wall goes on:
+    no gap between two beams longer than a wall seen at a grazing angle would leave (`spacing` is the angle between
+    beams in rad). A hit without a straight neighbourhood gets the normal (0, 0).
+    """
+    n = len(points)
+    for i in range(n):
+        normals[i, 0] = normals[i, 1] = np.float32(0.0)
+        centroids[i] = points[i]
+        x0 = np.float64(points[i, 0])
+        y0 = np.float64(points[i, 1])
+        count = 1
+        sx = 0.0
+        sy = 0.0
+        sxx = 0.0
+        sxy = 0.0
+        syy = 0.0
+        for direction in (-1, 1):
+            k = i
+            for step in range(_MOST_NEIGHBOURS):
+                k += direction
+                if k < 0 or k >= n or abs(beams[k] - beams[k - direction]) > 2:
+                    break
+                px = np.float64(points[k, 0])
+                py = np.float64(points[k, 1])
+                qx = np.float64(points[k - direction, 0])
+                qy = np.float64(points[k - direction, 1])
+                depth = sqrt((px - origin[0]) ** 2 + (py - origin[1]) ** 2)
+                gap = sqrt((px - qx) ** 2 + (py - qy) ** 2)
+                if gap > min(0.1 + 4.0 * spacing * depth, 0.8):
+                    break
+                dx = px - x0
+                dy = py - y0
+                if step >= 2 and dx * dx + dy * dy > radius * radius:
+                    break
+                count += 1
+                sx += dx
+                sy += dy
+                sxx += dx * dx
+                sxy += dx * dy
+                syy += dy * dy
+        if count < 4:
+            continue
+        mx = sx / count
+        my = sy / count
+        cxx = sxx / count - mx * mx
+        cxy = sxy / count - mx * my
+        cyy = syy / count - my * my
+        half = 0.5 * (cxx + cyy)
+        root = sqrt(0.25 * (cxx - cyy) ** 2 + cxy * cxy)
+        smaller = max(half - root, 0.0)
+        larger = half + root
+        if larger <= 1e-6 or smaller > 0.03 * 0.03 or smaller > 0.08 * larger:
+            continue
+        # The normal is the eigenvector of the smaller eigenvalue: turned by a right angle from the larger one's.
+        angle = 0.5 * atan2(2.0 * cxy, cxx - cyy)
+        nx = -sin(angle)
+        ny = cos(angle)
+        if nx * (origin[0] - x0) + ny * (origin[1] - y0) < 0.0:
+            nx = -nx
+            ny = -ny
+        normals[i, 0] = nx
+        normals[i, 1] = ny
+        centroids[i, 0] = x0 + mx
+        centroids[i, 1] = y0 + my
+
+
+@njit(cache=True, nogil=True)
+def bearing(y: float, x: float) -> float:
+    """atan2(y, x) to 1e-5 rad, in a quarter of its time (Abramowitz and Stegun 4.4.49): good to find a beam."""
+    ax = abs(x)
+    ay = abs(y)
+    longer = max(ax, ay)
+    if longer == 0.0:
+        return 0.0
+    z = min(ax, ay) / longer
+    q = z * z
+    angle = z * (0.9998660 + q * (-0.3302995 + q * (0.1801410 + q * (-0.0851330 + q * 0.0208351))))
+    if ay > ax:
+        angle = 0.5 * pi - angle
+    if x < 0.0:
+        angle = pi - angle
+    return -angle if y < 0.0 else angle
+
+
+@njit(cache=True, nogil=True)
+def choose_hits(normals: F32, most: int, chosen: I32) -> int:
+    """Choose about `most` hits that have a surfel, evenly by the directions of their walls; returns how many.
+
+    In a corridor nearly all hits lie on its two sides, and only a handful, on door frames and at its end, fix
+    the position along it: of a frequent direction every n-th hit is taken, of a rare one all (normal-space
+    sampling, Rusinkiewicz and Levoy 2001). Writes the rows into `chosen`, in ascending order.
+    """
+    n = len(normals)
+    counts = np.zeros(_DIRECTIONS, dtype=np.int64)
+    direction = np.full(n, -1, dtype=np.int64)
+    for i in range(n):
+        nx = np.float64(normals[i, 0])
+        ny = np.float64(normals[i, 1])
+        if nx != 0.0 or ny != 0.0:
+            direction[i] = int((bearing(ny, nx) / (2.0 * pi) + 1.0) * _DIRECTIONS) % _DIRECTIONS
+            counts[direction[i]] += 1
+    # The quota: the largest that no more than `most` hits in all are within.
+    quota = 1
+    while quota < n and np.minimum(counts, quota + 1).sum() <= most:
+        quota += 1
+    taken = 0
+    passed = np.zeros(_DIRECTIONS, dtype=np.int64)
+    for i in range(n):
+        k = direction[i]
+        if k < 0:
+            continue
+        keep = min(counts[k], quota)
+        # The j-th of a direction is kept where j * keep / counts steps over a whole number.
+        if (passed[k] + 1) * keep // counts[k] > passed[k] * keep // counts[k]:
+            chosen[taken] = i
+            taken += 1
+        passed[k] += 1
+    return taken
+
+
+@njit(cache=True, nogil=True)
+def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: float, term: Term, counts: F64) -> None:
+    """Equations of scan i against scan j, the pose of i in j being `rel` (x, y, theta).
+
+    Overwrites `term`, information = sum w J^T J and gradient = sum w J^T r with the residuals r (m) and their
+    derivatives by `rel`, weights w = 1 / (1 + r^2 / scale^2)^2 (Geman-McClure), and `counts` =
+    (paired within `gate`, conflicts: points where j looked through, points in j's field of view, sum of w r^2, sum of
+    w). Of scan i the chosen hits are used.
+    """
+    points = scans.points
+    normals = scans.normals
+    centroids = scans.centroids
+    start = scans.start
+    hit_of_beam = scans.hit_of_beam
+    ranges = scans.ranges
+    table_start = scans.table_start
+    geometry = scans.geometry
+    chosen_hits = scans.chosen_hits
+    chosen_start = scans.chosen_start
+    rx = rel[0]
+    ry = rel[1]
+    rt = rel[2]
+    c = cos(rt)
+    s = sin(rt)
+    first = table_start[j]
+    n_beams = table_start[j + 1] - first
+    hits_j = start[j]
+    laser_x = geometry[j, 0]
+    laser_y = geometry[j, 1]
+    zero_angle = geometry[j, 2] + geometry[j, 3]
+    sense = 1.0 if geometry[j, 4] > 0.0 else -1.0
+    spacing = abs(geometry[j, 4])
+    turn = 2.0 * pi
+    gate2 = gate * gate
+    weaken = 1.0 / (scale * scale)
+    paired = conflicts = seen = 0
+    squares = weights = 0.0
+    xx = xy = xt = yy = yt = tt = gx = gy = gt = 0.0
+    for q in range(chosen_start[i], chosen_start[i + 1]):
+        a = start[i] + chosen_hits[q]
+        mx = np.float64(normals[a, 0])
+        my = np.float64(normals[a, 1])
+        if mx == 0.0 and my == 0.0:
+            continue
+        px = np.float64(points[a, 0])
+        py = np.float64(points[a, 1])
+        dx = c * px - s * py
+        dy = s * px + c * py
+        x = rx + dx
+        y = ry + dy
+        lx = x - laser_x
+        ly = y - laser_y
+        angle = sense * (bearing(ly, lx) - zero_angle) + 0.5 * spacing
+        angle -= turn * np.floor(angle / turn)
+        middle = int(angle / spacing)
+        if middle >= n_beams:
+            continue
+        seen += 1
+        depth = sqrt(lx * lx + ly * ly)
+        # The hit nearest to the point, among the beams around its own.
+        reach = min(int(gate / (depth * spacing + 1e-9)) + 1, _MOST_BEAMS)
+        best = np.inf
+        chosen = -1
+        for k in range(max(middle - reach, 0), min(middle + reach + 1, n_beams)):
+            row = hit_of_beam[first + k]
+            if row >= 0:
+                ex = x - np.float64(points[hits_j + row, 0])
+                ey = y - np.float64(points[hits_j + row, 1])
+                squared = ex * ex + ey * ey
+                if squared < best:
+                    best = squared
+                    chosen = hits_j + row
+        if best > gate2:
+            # Did j look through the point? Only where all three beams around it ended well behind it.
+            nearest = np.inf
+            known = 0
+            for k in range(max(middle - 1, 0), min(middle + 2, n_beams)):
+                end = np.float64(ranges[first + k])
+                if end == end:
+                    known += 1
+                    nearest = min(nearest, end)
+            if known >= 2 and depth + _THROUGH < nearest:
+                conflicts += 1
+                continue
+            if chosen < 0 or best > gate2 + (2.0 * spacing * depth) ** 2:
+                continue
+        nx = np.float64(normals[chosen, 0])
+        ny = np.float64(normals[chosen, 1])
+        # Both sides must have seen the same face of the wall; (0, 0), no surfel, fails here too.
+        if nx * (c * mx - s * my) + ny * (s * mx + c * my) < _SAME_FACE:
+            continue
+        ex = x - np.float64(centroids[chosen, 0])
+        ey = y - np.float64(centroids[chosen, 1])
+        r = nx * ex + ny * ey
+        if abs(r) > gate:
+            continue
+        w = 1.0 / (1.0 + r * r * weaken)
+        w *= w
+        jt = ny * dx - nx * dy
+        paired += 1
+        squares += w * r * r
+        weights += w
+        wx = w * nx
+        wy = w * ny
+        wt = w * jt
+        xx += wx * nx
+        xy += wx * ny
+        xt += wx * jt
+        yy += wy * ny
+        yt += wy * jt
+        tt += wt * jt
+        gx += wx * r
+        gy += wy * r
+        gt += wt * r
+    information = term.information
+    information[0, 0] = xx
+    information[0, 1] = information[1, 0] = xy
+    information[0, 2] = information[2, 0] = xt
+    information[1, 1] = yy
+    information[1, 2] = information[2, 1] = yt
+    information[2, 2] = tt
+    term.gradient[0] = gx
+    term.gradient[1] = gy
+    term.gradient[2] = gt
+    counts[0] = paired
+    counts[1] = conflicts
+    counts[2] = seen
+    counts[3] = squares
+    counts[4] = weights

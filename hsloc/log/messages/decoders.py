@@ -1,0 +1,186 @@
+"""Which decoder a channel gets."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+from hsloc.errors import LogFormatError
+from hsloc.log.messages import cdr_batch_decode as columns
+from hsloc.log.messages import decode, definitions, foxglove, from_objects, point_cloud, ros_json
+from hsloc.log.messages import definition_compatibility as schema
+from hsloc.log.messages.definitions import long_name
+from hsloc.warnings import RunWarning, WarningCode
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hsloc.log.container import Channel
+    from hsloc.log.messages.cdr_batch_decode import ColumnDecoder
+    from hsloc.log.messages.decode import Payload
+
+    Decoder = Callable[[Payload], Any]
+
+_ALIASES = {"tf/msg/tfMessage": definitions.TF_MESSAGE} | foxglove.TYPES
+"""ROS 1's old name of a type that is otherwise the same, and Foxglove's types."""
+
+BY_HAND = decode.BY_HAND | {definitions.POINT_CLOUD2: point_cloud.point_cloud}
+FROM_OBJECT = from_objects.FROM_OBJECT | {definitions.POINT_CLOUD2: point_cloud.object_point_cloud}
+_ENCODINGS = ("cdr", "ros1", "json")
+_ZSTD = b"\x28\xb5\x2f\xfd"
+"""How a payload begins that rosbag2 compressed by itself (`--compression-mode message`); CDR begins with a zero."""
+_MAX_UNPACKED_BYTES = 256 << 20
+
+
+class Undecodable(Exception):
+    """A payload that is not what its channel says. Internal: the reader counts it."""
+
+
+def canonical_type(typename: str) -> str:
+    """The type's name in ROS 2, whatever the log calls it."""
+    name = long_name(typename)
+    return _ALIASES.get(name, name)
+
+
+def is_decodable(channel: Channel) -> bool:
+    """Whether hsloc has a decoder for the channel's type and encoding."""
+    if channel.typename.startswith(foxglove.PREFIX):
+        return foxglove.is_foxglove(channel)
+    return channel.message_encoding in _ENCODINGS and canonical_type(channel.typename) in BY_HAND
+
+
+def decoder_for(channel: Channel, warnings: list[RunWarning] | None = None) -> Decoder:
+    """A function from payload to one of the tuples of `hsloc.log.messages.decode`; it raises `Undecodable` alone.
+
+    A definition of a standard type that is incomplete is replaced by the standard one, which is added to `warnings`.
+    Raises LogFormatError where the channel's definition cannot be used.
+    """
+    if foxglove.is_foxglove(channel):
+        return _guarded(foxglove.decoder(channel))
+    typename = canonical_type(channel.typename)
+    if channel.message_encoding == "json":
+        return _guarded(ros_json.decoder(FROM_OBJECT[typename]))
+    if channel.message_encoding == "cdr" and _is_known(channel, typename):
+        return _by_hand(channel, typename)
+    if _is_incomplete(channel, typename):
+        if warnings is not None:
+            text = (
+                f"{channel.topic}: the log's definition of {channel.typename} is incomplete; the standard one is used"
+            )
+            warnings.append(RunWarning(WarningCode.DEFINITION_INCOMPLETE, text))
+        channel = dataclasses.replace(channel, schema=b"", schema_encoding="")
+        return _by_hand(channel, typename) if channel.message_encoding == "cdr" else _by_rosbags(channel, typename)
+    return _by_rosbags(channel, typename)
+
+
+def column_decoder_for(channel: Channel) -> ColumnDecoder | None:
+    """A decoder of many messages with poses at once; None where the channel's are decoded one by one."""
+    typename = canonical_type(channel.typename)
+    if channel.message_encoding != "cdr" or foxglove.is_foxglove(channel) or not _is_known(channel, typename):
+        return None
+    return columns.BY_HAND.get(typename)
+
+
+def _is_known(channel: Channel, typename: str) -> bool:
+    if not channel.schema.strip():
+        # Recorders leave it out when they cannot find the package; the name then has to stand for the type.
+        return True
+    if channel.schema_encoding != "ros2msg":
+        return False
+    return schema.is_known(channel.schema.decode(errors="replace"), typename)
+
+
+def _is_incomplete(channel: Channel, typename: str) -> bool:
+    """Whether a definition says nothing against the standard one: it is empty, a mere name, or lacks its parts."""
+    if channel.schema_encoding not in ("ros2msg", "ros1msg", ""):
+        return False
+    return schema.is_incomplete(channel.schema.decode(errors="replace"), typename, channel.message_encoding == "ros1")
+
+
+def _by_hand(channel: Channel, typename: str) -> Decoder:
+    fast = BY_HAND[typename]
+    slow: list[Decoder] = []
+
+    def decoder(data: Payload) -> Any:
+        try:
+            return fast(data)
+        except decode.BAD_PAYLOAD as error:
+            if data[:4] == _ZSTD:
+                return decoder(_unpacked(data))
+            if data[:2] != decode.BIG_ENDIAN:
+                raise Undecodable(str(error)) from error
+        # Big endian: rare enough for the slow way.
+        if not slow:
+            slow.append(_by_rosbags(channel, typename))
+        return slow[0](data)
+
+    return decoder
+
+
+def _unpacked(data: Payload) -> bytes:
+    """A payload that was compressed by itself."""
+    import zstandard
+
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(bytes(data)) as reader:
+            found: bytes = reader.read(_MAX_UNPACKED_BYTES + 1)
+    except zstandard.ZstdError as error:
+        raise Undecodable(f"its compression is damaged ({error})") from error
+    if len(found) > _MAX_UNPACKED_BYTES or found[:4] == _ZSTD:
+        raise Undecodable(f"unpacks to more than {_MAX_UNPACKED_BYTES >> 20} MB, or is packed twice")
+    return found
+
+
+def _guarded(read: Callable[[Payload], Any]) -> Decoder:
+    def decoder(data: Payload) -> Any:
+        try:
+            return read(data)
+        except Exception as error:  # JSON and protobuf raise many things, down to RecursionError.
+            raise Undecodable(_short(error)) from error
+
+    return decoder
+
+
+def _by_rosbags(channel: Channel, typename: str) -> Decoder:
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    name = long_name(channel.typename)
+    text = channel.schema.decode(errors="replace")
+    encoding = channel.schema_encoding or ("ros1msg" if channel.message_encoding == "ros1" else "ros2msg")
+    reason = schema.refusal(text, encoding)
+    if reason:
+        raise LogFormatError(f"{channel.topic}: {reason}; name another topic")
+    try:
+        if not text.strip():
+            known = Stores.ROS1_NOETIC if channel.message_encoding == "ros1" else Stores.LATEST
+            store = get_typestore(known)
+        else:
+            store = get_typestore(Stores.EMPTY)
+            if encoding == "ros2idl":
+                separator = "=" * 80 + "\n"
+                parts = [part.partition("\n")[2] for part in text.split(separator) if part.startswith("IDL: ")]
+                for part in parts or [text]:
+                    store.register(get_types_from_idl(part))
+            else:
+                store.register(get_types_from_msg(text, name))
+        store.get_msgdef(name)
+    except Exception as error:  # The parser raises whatever its generated code does.
+        raise LogFormatError(
+            f"{channel.topic}: the definition of {name} cannot be used ({_short(error)}); name another topic"
+        ) from error
+    deserialise = store.deserialize_ros1 if channel.message_encoding == "ros1" else store.deserialize_cdr
+    convert = FROM_OBJECT[typename]
+
+    def decoder(data: Payload) -> Any:
+        if data[:4] == _ZSTD:
+            data = _unpacked(data)
+        try:
+            return convert(deserialise(data, name))
+        except Exception as error:  # As above.
+            raise Undecodable(_short(error)) from error
+
+    return decoder
+
+
+def _short(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}".splitlines()[0][:120]

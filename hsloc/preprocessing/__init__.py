@@ -1,0 +1,1 @@
+"""Preprocessing of events: merged scans, deskewing, continuous odometry."""

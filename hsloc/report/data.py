@@ -1,0 +1,214 @@
+"""What a report shows, prepared once for report.png and report.html."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.evaluation.association import interpolate_poses
+from hsloc.model import IDENTITY, Status
+from hsloc.trajectory_io.tum import NS_PER_S
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hsloc.evaluation import Comparison
+    from hsloc.model import ScanDiagnostics, Trajectory
+
+    Floats = NDArray[np.float64]
+
+
+LOG_ABOVE = 25.0
+"""A curve whose highest value is this many times its median is drawn on a logarithmic scale."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """Values over seconds since the start, in order of time: two columns of length n."""
+
+    seconds: Floats
+    values: Floats
+
+    def thinned(self, most: int) -> Curve:
+        """At most about `most` points, of which each stretch's lowest and highest are kept: no peak is lost."""
+        rows = peak_rows(self.values, most)
+        return Curve(self.seconds[rows], self.values[rows])
+
+
+def peak_rows(values: Floats, most: int) -> NDArray[np.intp]:
+    """Rows of at most about `most` of n values in order: the lowest and highest of each stretch, and both ends."""
+    n = len(values)
+    if n <= most:
+        return np.arange(n)
+    edges = np.linspace(0, n, max(most // 2, 1) + 1).astype(int)
+    start, stretch = edges[:-1], np.repeat(np.arange(len(edges) - 1), np.diff(edges))
+    known = np.isfinite(values)
+    # By stretch, and within it by value; the sort is stable, so that of equal values the first counts.
+    lowest, highest = (np.lexsort((np.where(known, sign * values, np.inf), stretch))[start] for sign in (1.0, -1.0))
+    nothing = ~np.logical_or.reduceat(known, start)
+    lowest[nothing] = highest[nothing] = start[nothing]
+    return np.unique(np.concatenate(([0, n - 1], lowest, highest)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Errors:
+    """Errors against the reference over time, in metres and degrees."""
+
+    translation_m: Curve
+    rotation_deg: Curve
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scans:
+    """What became of the scans, over time. `xy` (n, 2) is where the robot then was on its trajectory."""
+
+    seconds: Floats
+    status: tuple[str, ...]
+    reason: tuple[str, ...]
+    fitness: Floats
+    sigma_m: Floats
+    sigma_deg: Floats
+    evaluations: NDArray[np.int64]
+    xy: Floats
+    lost: tuple[tuple[float, float], ...]
+
+    def where(self, *statuses: str) -> NDArray[np.bool_]:
+        """Which scans have one of these statuses."""
+        return np.array([status in statuses for status in self.status], dtype=bool)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReportData:
+    """Everything in the frame of the map: metres, and seconds since the first pose.
+
+    `path` (n, 2) and `seconds` (n,) are the trajectory; `localised` (n,) marks its known poses.
+    `reference` has been moved onto the trajectory where an alignment was asked for.
+    """
+
+    path: Floats
+    seconds: Floats
+    localised: NDArray[np.bool_]
+    duration_s: float
+    length_m: float
+    odometry: Floats | None
+    reference: Floats | None
+    errors: Errors | None
+    scans: Scans | None
+
+
+def prepare(
+    trajectory: Trajectory,
+    odometry: Trajectory | None,
+    reference: Trajectory | None,
+    diagnostics: ScanDiagnostics | None,
+    comparison: Comparison | None = None,
+    localised: NDArray[np.bool_] | None = None,
+) -> ReportData:
+    """Prepare what a report shows; all poses in the map frame, but for the reference, which `comparison` aligns.
+
+    Without `comparison` there are no errors; without `localised` it is derived from the diagnostics.
+    """
+    start_ns = int(trajectory.stamps_ns.min()) if len(trajectory) else _first(diagnostics)
+    seconds = _since(trajectory.stamps_ns, start_ns)
+    scans = None if diagnostics is None or not len(diagnostics) else _scans(diagnostics, trajectory, start_ns)
+    if localised is None:
+        localised = np.ones(len(trajectory), dtype=bool)
+        for begin, end in () if scans is None else scans.lost:
+            localised &= (seconds < begin) | (seconds >= end)
+    T_map_reference = IDENTITY if comparison is None else comparison.T_reference_estimate.inverse()
+    return ReportData(
+        path=trajectory.poses[:, :2],
+        seconds=seconds,
+        localised=localised,
+        duration_s=float(seconds.max() - seconds.min()) if len(seconds) else 0.0,
+        length_m=trajectory.length(),
+        odometry=None if odometry is None else odometry.poses[:, :2],
+        reference=None if reference is None else T_map_reference @ reference.poses[:, :2],
+        errors=None if comparison is None else _errors(comparison, start_ns),
+        scans=scans,
+    )
+
+
+def status_counts(scans: Scans) -> dict[str, int]:
+    """How many scans had each status, in the order in which `Status` lists them."""
+    counts = Counter(scans.status)
+    known = [status.value for status in Status]
+    return {name: counts[name] for name in (*known, *sorted(set(counts) - set(known))) if counts[name]}
+
+
+def reason_counts(scans: Scans) -> list[tuple[str, str, int]]:
+    """(status, reason, how many scans) for all scans that were not used, the most frequent first.
+
+    Reasons that differ in their figures alone are one; the first is the example.
+    """
+    skipped: dict[tuple[str, str], list[str]] = {}
+    for status, reason in zip(scans.status, scans.reason, strict=True):
+        if reason or status in (Status.REJECTED, Status.NO_RETURNS, Status.SEARCHING):
+            skipped.setdefault((status, _FIGURES.sub("…", reason)), []).append(reason)
+    counts = [
+        (status, kind if len(set(reasons)) > 1 else reasons[0], reasons[0], len(reasons))
+        for (status, kind), reasons in skipped.items()
+    ]
+    counts.sort(key=lambda entry: (-entry[3], entry[:2]))
+    return [
+        (status, reason if reason == example else f"{reason} (first: {example})", count)
+        for status, reason, example, count in counts
+    ]
+
+
+_FIGURES = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+
+
+def _first(diagnostics: ScanDiagnostics | None) -> int:
+    return int(diagnostics.stamps_ns.min()) if diagnostics is not None and len(diagnostics) else 0
+
+
+def _since(stamps_ns: NDArray[np.int64], start_ns: int) -> Floats:
+    result: Floats = (stamps_ns - start_ns) / NS_PER_S
+    return result
+
+
+def _errors(comparison: Comparison, start_ns: int) -> Errors:
+    order = np.argsort(comparison.pairs.stamps_ns, kind="stable")
+    seconds = _since(comparison.pairs.stamps_ns, start_ns)[order]
+    errors = comparison.errors
+    return Errors(Curve(seconds, errors.trans_part[order]), Curve(seconds, errors.angle_deg[order]))
+
+
+def _scans(diagnostics: ScanDiagnostics, trajectory: Trajectory, start_ns: int) -> Scans:
+    order = np.argsort(diagnostics.stamps_ns, kind="stable")
+    stamps = diagnostics.stamps_ns[order]
+    seconds = _since(stamps, start_ns)
+    status = tuple(str(diagnostics.status[row]) for row in order)
+    sigma = diagnostics.sigma[order]
+    xy = interpolate_poses(trajectory, stamps)[:, :2] if len(trajectory) else np.full((len(stamps), 2), np.nan)
+    return Scans(
+        seconds=seconds,
+        status=status,
+        reason=tuple(diagnostics.reason[row] for row in order),
+        fitness=diagnostics.fitness[order],
+        sigma_m=np.hypot(sigma[:, 0], sigma[:, 1]),
+        sigma_deg=np.degrees(sigma[:, 2]),
+        evaluations=diagnostics.evaluations[order],
+        xy=xy,
+        lost=_lost_spans(seconds, status),
+    )
+
+
+def _lost_spans(seconds: Floats, status: tuple[str, ...]) -> tuple[tuple[float, float], ...]:
+    """From each first scan that did not know its pose to the next that did."""
+    spans = []
+    begin = None
+    for second, name in zip(seconds.tolist(), status, strict=True):
+        if name == Status.SEARCHING and begin is None:
+            begin = second
+        elif name != Status.SEARCHING and begin is not None:
+            spans.append((begin, second))
+            begin = None
+    if begin is not None:
+        spans.append((begin, float("inf")))
+    return tuple(spans)

@@ -1,0 +1,175 @@
+"""Joint registration: the poses at which every scan agrees best with all the scans that see the same walls.
+
+Where a scan-to-map matcher holds the map fixed, here both sides of each pair may move, and all pairs are solved for
+at once (a bundle adjustment of planar scans). Each round associates again, assembles the normal equations of all pairs
+(hsloc/kernels/normal_equations.py) and of the edges, the odometry among them, and solves them sparsely.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.kernels.normal_equations import Equations, add_edges, assemble_pairs
+from hsloc.model.pose2 import wrap_angles
+from hsloc.parameters import Count, CountOrNone, NonNegative, Parameters, Positive
+from hsloc.slam.pose_graph import apply_increment, solve_anchored
+from hsloc.slam.sparse_solver import BlockSystem
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from hsloc.slam.keyscans import KeyScans
+    from hsloc.slam.pose_graph import Edges
+
+    F64 = NDArray[np.float64]
+    I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointRegistrationParameters(Parameters):
+    """Which scans are compared, and how their differences are weighted."""
+
+    radius: Positive = 3.0
+    """Maximum distance between the poses of two scans that are compared [m]."""
+    max_partners: Count = 8
+    """Maximum number of scans that each scan is compared with, each in another place or with another heading."""
+    max_scans_per_view: Count = 16
+    """Maximum number of scans with one place and heading that are used as partners."""
+    temporal: CountOrNone = 3
+    """Number of scans just before a scan that it is compared with in any case."""
+    gates: tuple[Positive, ...] = (0.3, 0.2, 0.15)
+    """Maximum distance of a point to the wall that it is paired with [m], round by round; the last one stays."""
+    scale_of_gate: Positive = 0.33
+    """Scale of the Geman-McClure weight as a ratio to the gate."""
+    sigma: Positive = 0.02
+    """Standard deviation of a point's distance to its wall [m]."""
+    correlated_points: Positive = 20.0
+    """Number of points that count as one independent measurement, as neighbouring beams share their errors."""
+    points_per_scan: Count = 90
+    """Approximate number of hits of a scan that are used."""
+    rounds: Count = 6
+    """Maximum number of rounds in a pass."""
+    convergence_tolerance: NonNegative = 0.002
+    """Step below which a pass has converged [m], the 99th percentile over the poses; angles count 5 m/rad."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """What a pass found; `counts` (m, 5) of the pairs (m, 2) as in `kernels.point_to_line.pair_terms`."""
+
+    poses: F64
+    pairs: I64
+    counts: F64
+    rounds: int
+    moved: float
+    """What 99 of 100 poses moved less than in the last round (m; rad: a fifth)."""
+
+    @property
+    def rms(self) -> float:
+        """Root mean square distance of points to the walls of other scans, robustly weighted (m)."""
+        weights = self.counts[:, 4].sum()
+        return float(np.sqrt(self.counts[:, 3].sum() / weights)) if weights > 0.0 else float("nan")
+
+    @property
+    def conflict(self) -> float:
+        """Part of the points seen by another scan that lie where it looked through."""
+        seen = self.counts[:, 2].sum()
+        return float(self.counts[:, 1].sum() / seen) if seen > 0.0 else float("nan")
+
+
+def refine(
+    poses: F64,
+    scans: KeyScans,
+    edges: Edges,
+    parameters: JointRegistrationParameters,
+    progress: Callable[[float], None] | None = None,
+) -> Registration:
+    """Move `poses` (n, 3) until all pairs of scans and all edges agree best; the first pose stays."""
+    p = parameters
+    pairs = neighbour_pairs(poses, p.radius, p.max_partners, p.temporal, p.max_scans_per_view)
+    system = BlockSystem(
+        len(poses), np.concatenate((pairs[:, 0], edges.pairs[:, 0])), np.concatenate((pairs[:, 1], edges.pairs[:, 1]))
+    )
+    arrays = scans.arrays(p.points_per_scan)
+    weights = np.full(len(pairs), 1.0 / (p.sigma**2 * p.correlated_points))
+    counts = np.zeros((len(pairs), 5))
+    pair_blocks, edge_blocks = np.empty((len(pairs), 3, 3)), np.empty((len(edges), 3, 3))
+    moved, rounds = 0.0, 0
+    for rounds in range(1, p.rounds + 1):
+        gate = p.gates[min(rounds, len(p.gates)) - 1]
+        diagonal, right = np.zeros((len(poses), 3, 3)), np.zeros((len(poses), 3))
+        of_edges = Equations(diagonal, edge_blocks, right)
+        add_edges(poses, edges.pairs, edges.measured, edges.information, edges.scale, of_edges)
+        of_pairs = Equations(diagonal, pair_blocks, right)
+        assemble_pairs(poses, pairs, weights, arrays, gate, p.scale_of_gate * gate, of_pairs, counts)
+        step = solve_anchored(system, diagonal, np.concatenate((pair_blocks, edge_blocks)), right)
+        poses = apply_increment(poses, step)
+        moved = moved_scans(step)
+        if progress is not None:
+            progress(rounds / p.rounds)
+        if rounds >= len(p.gates) and moved < p.convergence_tolerance:
+            break
+    return Registration(poses, pairs, counts, rounds, moved)
+
+
+def moved_scans(step: F64) -> float:
+    """What 99 of 100 poses moved less than, of a step (n, 3): m, or rad as fifths of a metre.
+
+    Not the longest move: a scan with a handful of pairs may swing for ever between two walls.
+    """
+    return float(np.percentile(np.abs(step * (1.0, 1.0, 5.0)).max(axis=1), 99.0))
+
+
+_HEADINGS = 8
+"""Sectors of heading that count as different views. Internal: `max_partners` is what is to be set."""
+_AT_ONCE = 512
+"""Scans whose neighbours are listed together. Internal: memory alone, the results are the same."""
+
+
+def neighbour_pairs(poses: F64, radius: float, most: int, temporal: int, crowd: int) -> I64:
+    """Pairs of scans that should see the same walls: those just before, and the near ones in space.
+
+    Among the scans within `radius` metres the nearest of each of `most` sorts is taken, the sorts being
+    places (a grid) and headings: a hundred scans from one place add less than ten from ten. Of a sort with more than
+    `crowd` scans only `crowd`, even in time, are taken as partners, so that the equations stay sparse.
+    Returns (m, 2), the earlier first, sorted.
+    """
+    from scipy.spatial import cKDTree
+
+    n = len(poses)
+    sector = np.floor(poses[:, 2] / (2.0 * np.pi) * _HEADINGS).astype(np.int64) % _HEADINGS
+    cell = np.floor(poses[:, :2] / (0.5 * radius)).astype(np.int64)
+    sort = (cell[:, 0] * 1000003 + cell[:, 1]) * _HEADINGS + sector
+    known = _thinned(sort, crowd)
+    tree = cKDTree(poses[known, :2])
+    keys = [np.arange(n - gap) * n + np.arange(gap, n) for gap in range(1, temporal + 1)]
+    for begin in range(0, n, _AT_ONCE):
+        lists = tree.query_ball_point(poses[begin : begin + _AT_ONCE, :2], radius, return_sorted=True)
+        for k, found in enumerate(lists, start=begin):
+            near = known[np.array(found, dtype=np.int64)]
+            near = near[near != k]
+            if len(near) == 0:
+                continue
+            offset = poses[near] - poses[k]
+            distance = np.hypot(offset[:, 0], offset[:, 1]) + 0.5 * np.abs(wrap_angles(offset[:, 2]))
+            order = np.argsort(distance, kind="stable")
+            _, first = np.unique(sort[near[order]], return_index=True)
+            chosen = near[order[np.sort(first)[:most]]]
+            keys.append(np.minimum(chosen, k) * n + np.maximum(chosen, k))
+    unique = np.unique(np.concatenate(keys)) if keys else np.zeros(0, dtype=np.int64)
+    return np.column_stack((unique // n, unique % n)).astype(np.int64)
+
+
+def _thinned(sort: I64, crowd: int) -> I64:
+    """Of each sort all scans, or `crowd` of them, even in time; ascending."""
+    order = np.argsort(sort, kind="stable")
+    _, start, count = np.unique(sort[order], return_index=True, return_counts=True)
+    rank, of = np.arange(len(sort)) - np.repeat(start, count), np.repeat(count, count)
+    # Bresenham: of `of` in a row, `crowd` at even distances.
+    stands = (of <= crowd) | ((rank + 1) * crowd // of > rank * crowd // of)
+    return np.sort(order[stands])

@@ -1,0 +1,210 @@
+"""The process of one job: `python -m hsloc_service.execution.worker FOLDER --fd N --parent PID`.
+
+It has no database and no token: a folder with `job.json` and the input, and a pipe for progress as JSON lines. It calls
+the same `hsloc.replay.run` as the command line. Whatever an upload holds is parsed here, under the limits.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import errno
+import json
+import os
+import re
+import sys
+import time
+import traceback
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hsloc.options import BY_NAME
+from hsloc_service.execution import limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from hsloc.replay.run import Progress
+    from hsloc.request import RunRequest
+    from hsloc.run_metrics import RunMetrics, RunTimings
+
+EVERY_S = 0.25
+"""Progress is told this often at most."""
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the job; the exit code is 0 exactly if the last line of the pipe says `done`."""
+    parser = argparse.ArgumentParser(prog="hsloc_service.execution.worker")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--fd", type=int, required=True)
+    parser.add_argument("--parent", type=int, required=True)
+    arguments = parser.parse_args(argv)
+    job = json.loads((arguments.folder / "job.json").read_text(encoding="utf-8"))
+    limits.apply(job["limits"], arguments.parent)
+
+    def tell(line: dict[str, Any]) -> None:
+        os.write(arguments.fd, json.dumps(line).encode() + b"\n")
+
+    try:
+        tell({"done": execute(job, arguments.folder, _throttled(tell))})
+    except MemoryError:
+        tell({"failed": "out_of_memory", "message": "the job needed more memory than it is allowed"})
+        return 1
+    except Exception as error:
+        tell(explain(error))
+        traceback.print_exc()
+        return 1
+    return 0
+
+
+def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, float, int], None]) -> dict[str, Any]:
+    """Replay and write the results into `folder/output`; returns the summary for the job's row."""
+    from hsloc.analysis.limits import exceeded_limits
+    from hsloc.evaluation import read_relations
+    from hsloc.export.results_folder import write_results
+    from hsloc.replay.run import run
+    from hsloc_service.results.preview import write_viewer
+
+    report("open", 0.0, 1.0, 0)
+    spec = make_spec(job, folder)
+    if spec.relations is not None:
+        read_relations(spec.relations)  # what cannot be read is told now, not after an hour of replay
+
+    def replayed(progress: Progress) -> None:
+        report(progress.phase, progress.done_s, progress.total_s, progress.scans)
+
+    result = run(spec, replayed)
+    # Warnings are a part of the results, which are to be the same in every folder.
+    plain = tuple(dataclasses.replace(each, text=plain_names(each.text)) for each in result.warnings)
+    result = dataclasses.replace(result, warnings=plain)
+    scans = len(result.diagnostics)
+    written = write_results(
+        result,
+        folder / "output",
+        progress=lambda share: report("write", share, 1.0, scans),
+    )
+    write_viewer(result, written.analysis, folder / "output")
+    limits = exceeded_limits(spec, written.metrics)
+    found = {"outcome": "below_threshold" if limits else "ok", "limits": [line[:500] for line in limits]}
+    return found | summarise(written.metrics, written.timings)
+
+
+_SUMMARISED = ("verdict", "run", "log", "scans", "localised", "ape", "relations", "losses")
+"""Keys of metrics.json that the job's row holds, too."""
+_MOST_LINES = 50
+
+
+def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
+    """The summary of a job: the figures as the reports show them, the verdict, and all warnings of the run."""
+    from hsloc.dataclass_json import to_json
+    from hsloc.report.table import table_rows
+
+    values = metrics.to_json()
+    return {
+        "metrics": {key: values[key] for key in _SUMMARISED if key in values},
+        "figures": [{"name": row.label, "values": list(row.values)} for row in table_rows(metrics)],
+        "verdict_reasons": [_shortened(each) for each in values["verdict_reasons"]][:_MOST_LINES],
+        "data_lost": metrics.losses.data_lost,
+        "warnings": [_shortened(to_json(each)) for each in metrics.warnings][:_MOST_LINES],
+        "notes": [line[:500] for line in metrics.losses.notes][:_MOST_LINES],
+        "timings": timings.to_json(),
+    }
+
+
+def _shortened(values: dict[str, Any]) -> dict[str, Any]:
+    """Texts of at most 500 letters, lists of at most 50 entries: the row of a job stays small."""
+    return {
+        key: value[:500] if isinstance(value, str) else value[:_MOST_LINES] if isinstance(value, list) else value
+        for key, value in values.items()
+    }
+
+
+def make_spec(job: Mapping[str, Any], folder: Path) -> RunRequest:
+    """The run that the job asks for. Raises ConfigError or MapError for what does not fit."""
+    from hsloc.request import RunRequest
+
+    request = job["request"]
+    values = {name: request.get(name) for name in BY_NAME if name not in ("map", "resume")} | (
+        request.get("read") or {}
+    )
+    values |= {name: folder / name / job[name] for name in BY_NAME if BY_NAME[name].is_upload and job.get(name)}
+    if job.get("map") is not None:
+        values["map"] = linked_map(folder, job["map"], job["map_image"])
+    if job.get("resume") is not None:
+        values["resume"] = folder / job["resume"]
+    return RunRequest.from_values([folder / place for place in job["logs"]], {**values, "bare_names": True})
+
+
+def linked_map(folder: Path, name: str, image: str) -> Path:
+    """The map's YAML, with its image under the name that it asks for.
+
+    Of a path the last name counts: a YAML that says `image: /etc/passwd` must not have us read what was not uploaded.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    from hsloc.errors import MapError
+
+    path = folder / "map" / name
+    if path.stat().st_size > 1 << 20:
+        raise MapError(f"{name}: larger than 1 MiB, which no map's YAML is")
+    try:
+        values = YAML(typ="safe", pure=True).load(path)
+        wanted = values["image"]
+    except (YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise MapError(f"{name}: not a map's YAML with an `image`") from error
+    plain = wanted.replace("\\", "/").rpartition("/")[2] if isinstance(wanted, str) else ""
+    if plain in ("", ".", "..") or "\0" in plain or len(plain) > 200:
+        raise MapError(f"{name}: image is {wanted!r:.100}; it must name a file")
+    if plain != wanted:
+        # The path is of another machine: the image is the one that was uploaded, never a file of this machine.
+        values["image"] = plain
+        path.unlink()
+        with path.open("w", encoding="utf-8") as file:
+            YAML(typ="safe", pure=True).dump(values, file)
+    target = folder / "map" / plain
+    if not target.exists():
+        target.symlink_to(folder / "map" / image)
+    return path
+
+
+def explain(error: Exception) -> dict[str, Any]:
+    """A word and a sentence for whatever ended the run."""
+    from hsloc.errors import HslocError
+
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, MemoryError):
+            return {"failed": "out_of_memory", "message": "the job needed more memory than it is allowed"}
+        if isinstance(cause, OSError) and cause.errno == errno.EFBIG:
+            return {"failed": "output_limit", "message": "the job wrote more than it is allowed"}
+        if isinstance(cause, OSError) and cause.errno in _DISK_FULL:
+            return {"failed": "disk_full", "message": "the server's disk became full while the job ran"}
+        cause = cause.__cause__
+    if isinstance(error, HslocError):
+        message = plain_names(str(error))
+        return {"failed": "invalid_input", "message": message[:2000]}
+    return {"failed": "internal_error", "message": f"{type(error).__name__}: {error}"[:2000]}
+
+
+def plain_names(text: str) -> str:
+    """A message with the files' own names: the folder is the server's business, and differs from run to run."""
+    return re.sub(rf"{re.escape(str(Path.cwd()))}/(?:(?:input(?:-\d+)?|map|relations|reference|output)/)?", "", text)
+
+
+def _throttled(tell: Callable[[dict[str, Any]], None]) -> Callable[[str, float, float, int], None]:
+    last, phase = 0.0, ""
+
+    def report(now_in: str, done: float, total: float, scans: int) -> None:
+        nonlocal last, phase
+        now = time.monotonic()
+        if now - last >= EVERY_S or now_in != phase:
+            last, phase = now, now_in
+            tell({"phase": now_in, "part": done, "total": total, "scans": scans})
+
+    return report
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,77 @@
+"""Slow, obvious twins of the kernels, and small worlds to try things in. Nothing here is fast, all of it is plain."""
+
+from __future__ import annotations
+
+from math import cos, floor, sin
+from typing import Any
+
+import numpy as np
+
+from hsloc.model import OccupancyGrid, Pose2
+
+
+def bilinear(scores: Any, u: Any, v: Any) -> Any:
+    """Score at (u, v) in cells, bilinear between the nodes of `scores` (h, w); 0 outside."""
+    height, width = scores.shape
+    if not (0 <= u < width - 1 and 0 <= v < height - 1):
+        return 0.0
+    iu, iv = floor(u), floor(v)
+    fu, fv = u - iu, v - iv
+    return (
+        (1 - fu) * (1 - fv) * scores[iv, iu]
+        + fu * (1 - fv) * scores[iv, iu + 1]
+        + (1 - fu) * fv * scores[iv + 1, iu]
+        + fu * fv * scores[iv + 1, iu + 1]
+    )
+
+
+def score_sum(scores: Any, points: Any, x: Any, y: Any, theta: Any) -> Any:
+    """Sum of the bilinear scores of points (n, 2) moved by a pose, all in cells."""
+    total = 0.0
+    scores = np.asarray(scores, dtype=np.float64)
+    for px, py in np.asarray(points, dtype=np.float64):
+        total += bilinear(scores, x + cos(theta) * px - sin(theta) * py, y + sin(theta) * px + cos(theta) * py)
+    return total
+
+
+def distance_to_nearest(cells: Any, row: Any, column: Any) -> Any:
+    """Distance in cells from a cell's centre to the nearest occupied cell's centre, by looking at all of them."""
+    rows, columns = np.nonzero(cells)
+    return float(np.hypot(rows - row, columns - column).min())
+
+
+def room(resolution: float = 0.05, width: int = 160, height: int = 120) -> Any:
+    """A room with one inner wall; the walls run through the centres of cells. Returns (grid, wall segments (n, 4))."""
+    cells = np.zeros((height, width), dtype=np.int8)
+    cells[5, 5:-5] = cells[-6, 5:-5] = 100
+    cells[5:-5, 5] = cells[5:-5, -6] = 100
+    cells[5:60, 80] = 100
+    grid = OccupancyGrid(cells, resolution, Pose2(-1.0, -2.0, 0.0))
+    x0, y0 = -1.0 + 5.5 * resolution, -2.0 + 5.5 * resolution
+    x1, y1 = -1.0 + (width - 5.5) * resolution, -2.0 + (height - 5.5) * resolution
+    xm, ym = -1.0 + 80.5 * resolution, -2.0 + 59.5 * resolution
+    walls = [(x0, y0, x1, y0), (x1, y0, x1, y1), (x1, y1, x0, y1), (x0, y1, x0, y0), (xm, y0, xm, ym)]
+    return grid, np.array(walls)
+
+
+def cast(walls: Any, x: Any, y: Any, angle: Any) -> Any:
+    """Distance along a ray to the nearest wall segment; inf if it meets none."""
+    best = np.inf
+    dx, dy = cos(angle), sin(angle)
+    for ax, ay, bx, by in walls:
+        ex, ey = bx - ax, by - ay
+        denominator = dx * ey - dy * ex
+        if abs(denominator) < 1e-12:
+            continue
+        t = ((ax - x) * ey - (ay - y) * ex) / denominator
+        s = ((ax - x) * dy - (ay - y) * dx) / denominator
+        if t > 0 and -1e-9 <= s <= 1 + 1e-9:
+            best = min(best, t)
+    return best
+
+
+def scan_points(walls: Any, pose: Any, beams: int = 180) -> Any:
+    """End points, seen from the pose, of beams all around; shape (n, 2)."""
+    angles = np.linspace(-np.pi, np.pi, beams, endpoint=False)
+    ranges = np.array([cast(walls, pose.x, pose.y, pose.theta + angle) for angle in angles])
+    return np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))[np.isfinite(ranges)]

@@ -6,7 +6,6 @@ While the pose is unknown the relocaliser has the word.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
 from math import hypot, radians
 from typing import TYPE_CHECKING, Annotated
@@ -19,7 +18,7 @@ from hsloc.localisation.motion_gate import MotionGate
 from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, OdometryNoise, OmnidirectionalNoise
 from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
-from hsloc.localisation.track_evidence import TrackFilter, TrackRow
+from hsloc.localisation.track_monitor import TrackMonitor
 from hsloc.matching.observability import match_information
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Evidence, Status
@@ -102,10 +101,6 @@ class LocaliserParameters(Parameters):
         )
 
 
-_FEWEST_JOINED = 4
-"""Scans that a place is compared by, at least."""
-_FIRST_COMPARISON_M = 3.0
-"""A new track is compared with the whole map after this path length (m), or after the usual one if that is shorter."""
 _EXCESS_GAIN = 0.1
 """Gain of the running mean of squared innovations by their expected ones: it follows within about ten matches."""
 _MOST_EXCESS = 10.0
@@ -130,12 +125,7 @@ class Localiser:
         *,
         place_check: PlaceCheck | None = None,
     ) -> None:
-        self._place_check = place_check
-        self._track_filter = TrackFilter()
-        self._trail: deque[tuple[float, Pose2, F64]] = deque()
-        self._path_length = 0.0
-        self._checked_at = 0.0
-        self._seen_at = 0.0
+        self._monitor = None if place_check is None else TrackMonitor(place_check)
         self._field = likelihood
         self._matcher = matcher
         self._global_search = search
@@ -154,7 +144,6 @@ class Localiser:
         self._motion_gate = MotionGate(parameters.update_min_d, parameters.update_min_a)
         self._match_gate = MatchGate(parameters.match_limits())
         self._searching = initial_pose is None
-        self._begin_track()
 
     @classmethod
     def from_parameters(
@@ -209,11 +198,12 @@ class Localiser:
         noise = self._motion_model.covariance(motion)
         covariance = predict_covariance(self._covariance, self._T_map_match, motion, noise)
         points = paired.points_base()
-        self._path_length += hypot(motion.x, motion.y)
+        if self._monitor is not None:
+            self._monitor.move(hypot(motion.x, motion.y))
         if len(points) < p.min_points:
             self._take(predicted, covariance, T_odom_base)
             reason = f"{len(points)} returns"
-            evidence = Evidence(self._distance())
+            evidence = None if self._monitor is None else self._monitor.skipped()
             covariance = self._reported(covariance)
             return Estimate(scan.stamp_ns, predicted, Status.NO_RETURNS, covariance, reason=reason, evidence=evidence)
         match, evaluations = self._match(points, predicted, covariance)
@@ -228,52 +218,20 @@ class Localiser:
             pose, covariance = match.pose, match.covariance
         self._match_gate.accept(match.fitness)
         self._take(pose, covariance, T_odom_base)
-        evidence = self._weigh(paired, pose, points)
+        evidence = None if self._monitor is None else self._monitor.matched(paired, pose, points)
         status, reason = Status.MATCHED, ""
-        _, _, astray = self._track_filter.add(TrackRow(status, evidence))
-        if evidence.rival >= 1.0 and astray > p.lost_probability:
+        if self._monitor is not None and evidence is not None and self._monitor.is_astray(evidence, p.lost_probability):
             status = Status.SEARCHING
             reason = f"lost: the map explains {evidence.explained:.2f}, another place fits {evidence.rival:.2f} times"
             self._lose()
         covariance = self._reported(covariance)
         return Estimate(scan.stamp_ns, pose, status, covariance, match.fitness, evaluations, reason, evidence=evidence)
 
-    def _weigh(self, paired: PairedScan, pose: Pose2, points: F64) -> Evidence:
-        """What a matched scan says about the track; now and then its place is compared with the whole map."""
-        check = self._place_check
-        distance = self._distance()
-        if check is None:
-            return Evidence(distance)
-        p = check.parameters
-        self._trail.append((self._path_length, pose, check.few(points)))
-        while self._trail[0][0] < self._path_length - p.length:
-            self._trail.popleft()
-        rival = float("nan")
-        if self._path_length - self._checked_at >= p.interval and len(self._trail) >= _FEWEST_JOINED:
-            self._checked_at = self._path_length
-            chosen = np.unique(np.linspace(0, len(self._trail) - 1, p.scans).astype(np.int64))
-            rival = check.rival([self._trail[k][1:] for k in chosen], pose)
-        said = check.explain(paired, pose)
-        return Evidence(distance, said.fitness, said.short, said.through, said.unmapped, rival)
-
-    def _distance(self) -> float:
-        """Path length since the scan before."""
-        distance = self._path_length - self._seen_at
-        self._seen_at = self._path_length
-        return distance
-
     def _lose(self) -> None:
         """The pose is unknown from now on: search."""
         self._searching = True
         self._search_began = self._count
-        self._global_search.start(self._track_filter.usual)
-
-    def _begin_track(self) -> None:
-        """A new track begins here, of which nothing is known but its beginning; it is compared soon."""
-        self._track_filter.start()
-        self._trail.clear()
-        p = self._parameters.place_check
-        self._checked_at = self._path_length - max(p.interval - _FIRST_COMPARISON_M, 0.0)
+        self._global_search.start(None if self._monitor is None else self._monitor.usual_explained)
 
     def _weigh_innovation(self, predicted: Pose2, covariance: F64, measured: Pose2, information: F64) -> None:
         """Follow how large innovations really are; covariances that are reported grow with them.
@@ -329,8 +287,7 @@ class Localiser:
             self._lose()
             status, reason = Status.SEARCHING, f"lost: {reason}"
         covariance = self._reported(covariance)
-        evidence = Evidence(self._distance())
-        self._track_filter.add(TrackRow(Status.REJECTED, evidence))
+        evidence = None if self._monitor is None else self._monitor.refused()
         return Estimate(
             paired.scan.stamp_ns, predicted, status, covariance, match.fitness, evaluations, reason, evidence=evidence
         )
@@ -344,7 +301,8 @@ class Localiser:
         if result.is_sure:
             self._searching = False
             self._match_gate.restart(result.fitness)
-            self._begin_track()
+            if self._monitor is not None:
+                self._monitor.begin()
             status = Status.RELOCALISED
         self._take(pose, self._covariance if result.covariance is None else result.covariance, T_odom_base)
         return Estimate(
@@ -357,7 +315,7 @@ class Localiser:
             result.reason,
             self._revision(result),
             None if result.is_sure else result.state,
-            result.evidence or Evidence(0.0),
+            None if self._monitor is None else result.evidence or Evidence(0.0),
         )
 
     def _revision(self, result: RelocaliserResult) -> tuple[tuple[int, Pose2], ...]:

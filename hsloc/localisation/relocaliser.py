@@ -15,12 +15,13 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from math import floor, hypot, pi, radians
+from math import hypot, pi, radians
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.localisation.global_search import RelocaliserResult
+from hsloc.localisation.hypotheses import Hypothesis, Places, fits_better, tiles
 from hsloc.localisation.motion import fuse, predict_covariance
 from hsloc.localisation.motion_gate import MotionGate
 from hsloc.localisation.track_evidence import MOST_FROM_RIVAL, USUAL_EXPLAINED, fit_evidence, rival_evidence
@@ -88,30 +89,9 @@ class RelocaliserParameters(Parameters):
     """Mean fitness of the best hypothesis below which the search starts again."""
 
 
-@dataclass(slots=True, eq=False)
-class _Hypothesis:
-    pose: Pose2
-    covariance: F64
-    fitness: float
-    total: float
-    scans: int
-    history: list[float]
-    """Fitness of each scan since it was found."""
-
-    @property
-    def mean(self) -> float:
-        return self.total / self.scans
-
-
-_NEAR = 0.5
-_NEAR_ANGLE = radians(15.0)
 _STEP_WINDOW = (0.25, radians(8.0))
 _FITS = 0.8
 """Going backwards, a scan fits with at least this part of the winner's fitness."""
-_BLOCK = 7
-"""Scans of a block: two metres at the steps of the search."""
-_RESOLUTION = 0.02
-"""Standard deviation of the fitness of the same place, matched twice: what blocks differ by at least."""
 _WEIGHED = 12
 """Scans that the winner is weighed by, at most."""
 _FULL_M = 3.0
@@ -149,8 +129,8 @@ class Relocaliser:
         self._motion_model = motion_model
         self._gate = MotionGate(parameters.step_min_d, parameters.step_min_a)
         self._rng = rng
-        self._tiles = _tiles(grid, self._parameters.tile)
-        self._hypotheses: list[_Hypothesis] = []
+        self._tiles = tiles(grid, self._parameters.tile)
+        self._hypotheses: list[Hypothesis] = []
         self._T_odom_last: Pose2 | None = None
         self._seen: deque[tuple[int, F64, PairedScan]] = deque(maxlen=REMEMBERED)
 
@@ -197,7 +177,7 @@ class Relocaliser:
         poses, fitness, evaluations = self._search(points, windows)
         unsure = np.diag(np.square(half))
         self._hypotheses += [
-            _Hypothesis(pose, unsure, float(fit), float(fit) * scans, scans, [float(fit)])
+            Hypothesis(pose, unsure, float(fit), float(fit) * scans, scans, [float(fit)])
             for pose, fit in zip(poses, fitness, strict=True)
         ]
         return evaluations
@@ -215,7 +195,7 @@ class Relocaliser:
         half, half_angle = _STEP_WINDOW
         match = self._matcher.match(points, self._field, Window(found, half, half, half_angle), self._rng)
         fitness = match.fitness
-        self._hypotheses.append(_Hypothesis(match.pose, match.covariance, fitness, fitness * scans, scans, [fitness]))
+        self._hypotheses.append(Hypothesis(match.pose, match.covariance, fitness, fitness * scans, scans, [fitness]))
         return match.evaluations
 
     def _search(self, points: F64, windows: list[Window]) -> tuple[list[Pose2], F64, int]:
@@ -251,8 +231,8 @@ class Relocaliser:
         """Drop the hypotheses that fell behind, merge those that met: of each place the best stays."""
         p = self._parameters
         self._hypotheses.sort(key=lambda h: -h.total)
-        taken = _Places()
-        kept: list[_Hypothesis] = []
+        taken = Places()
+        kept: list[Hypothesis] = []
         for hypothesis in self._hypotheses:
             best = self._hypotheses[0]
             behind = hypothesis.total < best.total - p.drop and hypothesis.mean < p.keep_ratio * best.mean
@@ -296,13 +276,13 @@ class Relocaliser:
             evidence if sure else None,
         )
 
-    def _is_proven(self, best: _Hypothesis) -> bool:
+    def _is_proven(self, best: Hypothesis) -> bool:
         """Whether the best fits better than each other one in a paired t-test over blocks of scans."""
         confidence = self._parameters.confidence
         others = self._hypotheses[1:]
-        return all(_fits_better(best.history, other.history, confidence) for other in others) if others else False
+        return all(fits_better(best.history, other.history, confidence) for other in others) if others else False
 
-    def _state(self, best: _Hypothesis, pose: Pose2) -> State:
+    def _state(self, best: Hypothesis, pose: Pose2) -> State:
         """Why it is not sure: the best place does not fit, or several do."""
         p = self._parameters
         if self._check is not None and self._seen:
@@ -315,7 +295,7 @@ class Relocaliser:
         alike = sum(hypothesis.mean >= p.max_rival_ratio * best.mean for hypothesis in self._hypotheses)
         return State.AMBIGUOUS if alike > 1 else State.LOST
 
-    def _weigh(self, winner: _Hypothesis, motion: Pose2) -> Evidence:
+    def _weigh(self, winner: Hypothesis, motion: Pose2) -> Evidence:
         """What the last scans say for the winner: how the map explains them, and whether another place fits as well."""
         assert self._check is not None
         traced = self._trace(winner, motion, _WEIGHED)
@@ -326,7 +306,7 @@ class Relocaliser:
         rival = self._check.rival(scans, winner.pose @ motion)
         return Evidence(path, float(means[0]), float(means[1]), float(means[2]), float(means[3]), rival)
 
-    def _retrace(self, winner: _Hypothesis, motion: Pose2) -> tuple[tuple[tuple[int, Pose2], ...], bool]:
+    def _retrace(self, winner: Hypothesis, motion: Pose2) -> tuple[tuple[tuple[int, Pose2], ...], bool]:
         """The scans seen while searching, localised backwards from where the robot is now known to be.
 
         As far as they fit, and whether that is all of them: where several in a row do not, the trace is lost.
@@ -343,7 +323,7 @@ class Relocaliser:
         whole = len(self._seen) < REMEMBERED
         return tuple(reversed(track[: len(track) - misses])), whole and misses == 0
 
-    def _trace(self, winner: _Hypothesis, motion: Pose2, most: int) -> list[tuple[int, Pose2, PairedScan, float]]:
+    def _trace(self, winner: Hypothesis, motion: Pose2, most: int) -> list[tuple[int, Pose2, PairedScan, float]]:
         """(odometry messages before, T_map_base, scan, fitness) of the last scans, backwards; ends where none fits."""
         half, half_angle = _STEP_WINDOW
         pose, covariance = winner.pose @ motion, winner.covariance
@@ -380,57 +360,3 @@ class Relocaliser:
                 polish_iterations=10,
             )
         return self._matcher
-
-
-def _fits_better(best: list[float], other: list[float], confidence: float) -> bool:
-    """Student's paired t-test, one-sided, over means of blocks of scans.
-
-    Scans that follow each other see the same errors of the map, so that their differences are no independent evidence;
-    blocks about two metres long are taken for it. An error of the map in one place makes the blocks differ, and a sum
-    that comes from few of them proves nothing.
-    """
-    from scipy.special import stdtrit
-
-    n = min(len(best), len(other)) // _BLOCK
-    if n < 2:
-        return False
-    difference = np.array(best[-n * _BLOCK :]) - np.array(other[-n * _BLOCK :])
-    means = difference.reshape(n, _BLOCK).mean(axis=1)
-    error = np.sqrt((means.var(ddof=1) + _RESOLUTION**2) / n)
-    return bool(means.mean() >= float(stdtrit(n - 1, confidence)) * error)
-
-
-class _Places:
-    """Poses that differ; sorted into cells, so that the time does not grow with the square of the map."""
-
-    def __init__(self) -> None:
-        self._cells: dict[tuple[int, int], list[Pose2]] = {}
-
-    def add(self, pose: Pose2) -> bool:
-        """Take a pose, unless one is near already; whether it was taken."""
-        u, v = floor(pose.x / _NEAR), floor(pose.y / _NEAR)
-        near = (other for du in (-1, 0, 1) for dv in (-1, 0, 1) for other in self._cells.get((u + du, v + dv), ()))
-        if any(_same(pose, other) for other in near):
-            return False
-        self._cells.setdefault((u, v), []).append(pose)
-        return True
-
-
-def _same(first: Pose2, second: Pose2) -> bool:
-    return first.distance(second) < _NEAR and abs(wrap_angle(first.theta - second.theta)) < _NEAR_ANGLE
-
-
-def _tiles(grid: OccupancyGrid, side: float) -> list[tuple[float, float]]:
-    """Centres (metres, map frame) of the tiles in which a fair part of the cells is free."""
-    free = grid.free()
-    step = max(round(side / grid.resolution), 1)
-    centres: list[tuple[float, float]] = []
-    for row in range(0, free.shape[0], step):
-        for column in range(0, free.shape[1], step):
-            tile = free[row : row + step, column : column + step]
-            if tile.sum() >= 0.04 * step * step:
-                middle = grid.origin @ Pose2(
-                    (column + tile.shape[1] / 2) * grid.resolution, (row + tile.shape[0] / 2) * grid.resolution, 0.0
-                )
-                centres.append((middle.x, middle.y))
-    return centres

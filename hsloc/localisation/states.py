@@ -46,6 +46,10 @@ class StateRows:
     def __len__(self) -> int:
         return len(self.state)
 
+    def is_localised(self) -> NDArray[np.bool_]:
+        """Which rows are localised, shape (n,)."""
+        return np.array([state is State.LOCALISED for state in self.state], dtype=np.bool_)
+
 
 class StateLog:
     """Collects the estimates of the scans that say something of the state; `rows` judges them all in hindsight."""

@@ -90,6 +90,7 @@ def preset(name: str) -> Config:
             update_min_a=0.0,
             min_points=6,
             window_sigmas=1.0,
+            refine_first=False,
             fuse=False,
             place_check=PlaceCheckParameters(interval=0.0),
         ),

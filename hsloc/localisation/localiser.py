@@ -19,6 +19,7 @@ from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, Odom
 from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
 from hsloc.localisation.track_monitor import TrackMonitor
+from hsloc.matching.local_refinement import refine
 from hsloc.matching.observability import match_information
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Evidence, Status
@@ -67,6 +68,8 @@ class LocaliserParameters(Parameters):
     """Half-width in heading of the window that is searched after a refused match [rad]."""
     max_consecutive_rejections: Count = 5
     """Number of refused matches in a row after which the pose counts as lost and the whole map is searched."""
+    refine_first: bool = True
+    """Whether the optimum next to the prediction is taken where it fits as well as usual; otherwise always a search."""
     fuse: bool = True
     """Whether match and prediction are weighted by their covariances (EKF); otherwise the match is taken, as in [P]."""
     initial_sigma: Positive = 0.5
@@ -101,6 +104,8 @@ class LocaliserParameters(Parameters):
         )
 
 
+_AS_USUAL = 0.98
+"""Ratio to the usual fitness from which the optimum next to the prediction is taken without a search."""
 _EXCESS_GAIN = 0.1
 """Gain of the running mean of squared innovations by their expected ones: it follows within about ten matches."""
 _MOST_EXCESS = 10.0
@@ -237,8 +242,8 @@ class Localiser:
         """Follow how large innovations really are; covariances that are reported grow with them.
 
         What grows is not the weight of the odometry or of the match: which of the two is worse than assumed, an
-        innovation does not tell. (Where the odometry's noise alone was scaled, the matches pulled the pose from door to
-        door in the corridors of Wean Hall.)
+        innovation does not tell. (Where the odometry's noise was scaled, the matches pulled the pose from door to door
+        in the corridors of Wean Hall.)
         """
         squared, freedom = normalised_innovation(predicted, covariance, measured, information)
         if freedom > 0.0:
@@ -252,9 +257,16 @@ class Localiser:
         """Match in the window of the prediction; a refused match may give way to one in a wider window."""
         p = self._parameters
         window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
+        usual = self._match_gate.usual
+        evaluations = 0
+        if p.refine_first and usual is not None:
+            refined = refine(points, self._field, window)
+            if refined.fitness >= _AS_USUAL * usual and self._match_gate.refusals == 0:
+                return refined, refined.evaluations
+            evaluations = refined.evaluations
         best = self._matcher.match(points, self._field, window, self._rng)
-        evaluations = best.evaluations
-        if self._match_gate.usual is not None and self._match_gate.refusal(best.fitness):
+        evaluations += best.evaluations
+        if usual is not None and self._match_gate.refusal(best.fitness):
             wide = Window(
                 predicted,
                 max(window.half_x, p.wide_window),

@@ -42,7 +42,7 @@ class PlaceCheckParameters(Parameters):
     """Path length over which scans are joined for a comparison [m]."""
     scans: Count = 8
     """Number of scans that are joined."""
-    points: Count = 12
+    points: Count = 8
     """Number of points taken of each scan."""
     cell: Positive = 0.2
     """Spacing of the lattice of other places [m]; multiples of the map's resolution are used."""
@@ -70,7 +70,7 @@ _FITS = 0.3
 """A point scores this much within about 1.2 sigma of a wall."""
 _MARGIN_M = 0.1
 """A wall this near before a beam's end is the one that it ends at (m)."""
-_NEEDED = 0.8
+_NEEDED = 0.85
 """Other places below this part of the own fitness are not looked for: they make no difference."""
 _OWN_HALF, _OWN_HALF_ANGLE = 0.4, 0.15
 """The own place is the best of the lattice within these half-widths (m, rad): it gets the lattice's chances, too."""
@@ -140,7 +140,7 @@ class PlaceCheck:
         return np.asarray(points[low_discrepancy_order(len(points))[: self.parameters.points]])
 
     def rival(self, scans: list[tuple[Pose2, F64]], pose: Pose2) -> float:
-        """Fitness of the fittest other place on the map divided by that of this one; at least 0.8.
+        """Fitness of the fittest other place on the map divided by that of this one; at least 0.85.
 
         `scans` are poses of the base in the map and points (n, 2) seen from them, `pose` is the place in question.
         """

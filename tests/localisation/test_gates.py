@@ -20,18 +20,18 @@ LIMITS = MatchLimits(min_fitness=0.3, min_fitness_ratio=0.7, recovery_fitness_ra
         (Pose2(0.0, 0.0, -0.1), True),
     ],
 )
-def test_a_motion_gate_opens_by_distance_or_by_angle(motion, is_open):
+def test_a_motion_gate_opens_by_distance_or_by_angle(motion: Pose2, is_open: bool) -> None:
     assert MotionGate(0.2, 0.1).is_open(motion) is is_open
 
 
-def test_a_fresh_gate_refuses_by_the_least_fitness_alone():
+def test_a_fresh_gate_refuses_by_the_least_fitness_alone() -> None:
     gate = MatchGate(LIMITS)
     assert gate.is_fresh
     assert gate.refusal(0.3) == ""
     assert gate.refusal(0.29) == "fitness 0.29 below 0.30"
 
 
-def test_the_usual_fitness_follows_the_accepted_matches():
+def test_the_usual_fitness_follows_the_accepted_matches() -> None:
     gate = MatchGate(LIMITS)
     gate.accept(0.9)
     assert not gate.is_fresh
@@ -42,7 +42,7 @@ def test_the_usual_fitness_follows_the_accepted_matches():
     assert gate.refusal(0.62) == ""
 
 
-def test_refusals_are_counted_in_a_row():
+def test_refusals_are_counted_in_a_row() -> None:
     gate = MatchGate(LIMITS)
     assert [gate.refuse(), gate.refuse()] == [1, 2]
     assert not gate.is_fresh
@@ -50,7 +50,7 @@ def test_refusals_are_counted_in_a_row():
     assert gate.refuse() == 1
 
 
-def test_a_wide_match_must_gain_and_reach_most_of_the_usual_fitness():
+def test_a_wide_match_must_gain_and_reach_most_of_the_usual_fitness() -> None:
     gate = MatchGate(LIMITS)
     gate.accept(0.9)
     assert gate.is_recovered(0.5, 0.81)
@@ -58,7 +58,7 @@ def test_a_wide_match_must_gain_and_reach_most_of_the_usual_fitness():
     assert not gate.is_recovered(0.72, 0.815)
 
 
-def test_a_restart_takes_the_fitness_of_the_place_that_was_found():
+def test_a_restart_takes_the_fitness_of_the_place_that_was_found() -> None:
     gate = MatchGate(LIMITS)
     gate.refuse()
     gate.restart(0.8)

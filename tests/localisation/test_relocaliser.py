@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import pytest
 from rooms import L_SHAPE, beside, grid, seen
@@ -12,21 +15,31 @@ from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
 from hsloc.matching import Hide, LikelihoodField
 from hsloc.model import Pose2, wrap_angle
 
-ONE = [(0, 0, 9, 3), (0, 0, 4, 7)]
-TWO = [*ONE, (20, 0, 29, 3), (20, 0, 24, 7)]
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rooms import Box, Segments
+
+    from hsloc.localisation.global_search import RelocaliserResult
+
+ONE: list[Box] = [(0, 0, 9, 3), (0, 0, 4, 7)]
+TWO: list[Box] = [*ONE, (20, 0, 29, 3), (20, 0, 24, 7)]
 START = Pose2(1.5, 5.5, -1.2)
 STEP = Pose2(0.4, 0.0, 0.1)
 
 
-def search(segments, free, scans, *, start=START, **changes):
+def search(
+    segments: Segments, free: Sequence[Box], scans: int, **changes: Any
+) -> tuple[Relocaliser, list[RelocaliserResult], list[Pose2]]:
     """The verdicts on scans along an arc, and the true poses."""
     occupancy = grid(segments, free)
     field = LikelihoodField.from_grid(occupancy)
     subject = Relocaliser(
-        occupancy, field, Hide(), RelocaliserParameters(**changes), OdometryNoise(), np.random.default_rng(0)
+        occupancy, field, Hide(), replace(RelocaliserParameters(), **changes), OdometryNoise(), np.random.default_rng(0)
     )
-    true, odometry = start, Pose2()
-    verdicts, truth = [], []
+    true, odometry = START, Pose2()
+    verdicts: list[RelocaliserResult] = []
+    truth: list[Pose2] = []
     for k in range(scans):
         verdicts.append(subject.update(seen(segments, true, odometry, float(k)), k))
         truth.append(true)
@@ -34,20 +47,23 @@ def search(segments, free, scans, *, start=START, **changes):
     return subject, verdicts, truth
 
 
-def near(pose, other):
+def near(pose: Pose2 | None, other: Pose2) -> bool:
+    assert pose is not None
     return pose.distance(other) < 0.05 and abs(wrap_angle(pose.theta - other.theta)) < 0.03
 
 
-def test_a_room_that_exists_once_is_found():
+def test_a_room_that_exists_once_is_found() -> None:
     _, verdicts, truth = search(L_SHAPE, ONE, 5)
     sure = [k for k, verdict in enumerate(verdicts) if verdict.is_sure]
     assert sure
     assert sure[0] >= RelocaliserParameters().min_scans - 1
     assert near(verdicts[sure[0]].pose, truth[sure[0]])
-    assert verdicts[sure[0]].fitness > 0.9
+    fitness = verdicts[sure[0]].fitness
+    assert fitness is not None
+    assert fitness > 0.9
 
 
-def test_the_winner_carries_the_poses_of_the_scans_before():
+def test_the_winner_carries_the_poses_of_the_scans_before() -> None:
     _, verdicts, truth = search(L_SHAPE, ONE, 5)
     verdict = next(verdict for verdict in verdicts if verdict.is_sure)
     assert verdict.track_is_whole
@@ -59,14 +75,16 @@ def test_the_winner_carries_the_poses_of_the_scans_before():
         odometry = odometry @ STEP
 
 
-def test_of_two_rooms_that_look_alike_neither_is_claimed():
+def test_of_two_rooms_that_look_alike_neither_is_claimed() -> None:
     _, verdicts, truth = search(beside(L_SHAPE, 20.0), TWO, 9)
     assert not any(verdict.is_sure for verdict in verdicts)
-    x = verdicts[-1].pose.x
+    pose = verdicts[-1].pose
+    assert pose is not None
+    x = pose.x
     assert min(abs(x - truth[-1].x), abs(x - 20.0 - truth[-1].x)) < 0.1
 
 
-def test_a_scan_without_motion_adds_no_evidence():
+def test_a_scan_without_motion_adds_no_evidence() -> None:
     occupancy = grid(L_SHAPE, ONE)
     field = LikelihoodField.from_grid(occupancy)
     subject = Relocaliser(occupancy, field, Hide(), RelocaliserParameters(), OdometryNoise(), np.random.default_rng(0))
@@ -77,7 +95,7 @@ def test_a_scan_without_motion_adds_no_evidence():
         assert verdict.evaluations == 0
 
 
-def test_start_forgets_all_hypotheses():
+def test_start_forgets_all_hypotheses() -> None:
     subject, _, _ = search(L_SHAPE, ONE, 3)
     subject.start()
     verdict = subject.update(seen(L_SHAPE, START, Pose2(), 0.0, beams=10), 0)
@@ -85,13 +103,13 @@ def test_start_forgets_all_hypotheses():
     assert verdict.reason == "searching the whole map"
 
 
-def test_the_same_seed_gives_the_same_verdicts():
+def test_the_same_seed_gives_the_same_verdicts() -> None:
     first, second = (search(L_SHAPE, ONE, 4)[1] for _ in range(2))
     assert [v.pose for v in first] == [v.pose for v in second]
     assert [v.evaluations for v in first] == [v.evaluations for v in second]
 
 
 @pytest.mark.parametrize(("name", "value"), [("tile", 0.0), ("min_scans", 0), ("min_fitness", -0.1)])
-def test_a_parameter_out_of_range_is_refused_by_name(name, value):
+def test_a_parameter_out_of_range_is_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=f"RelocaliserParameters.{name} is"):
-        RelocaliserParameters(**{name: value})
+        replace(RelocaliserParameters(), **{name: value})  # type: ignore[arg-type]

@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, TypeAlias
+
 import numpy as np
-from scripted import SECOND_NS
+from numpy.typing import NDArray
+from scripted_matcher import SECOND_NS
 
 from hsloc.kernels.raycasting import cast_rays
-from hsloc.model import PairedScan, Pose2, Scan
-from hsloc.model.occupancy_grid import OccupancyGrid
+from hsloc.model import OccupancyGrid, PairedScan, Pose2, Scan
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+Segments: TypeAlias = NDArray[np.float64]
+Box: TypeAlias = tuple[float, float, float, float]
 
 NO_CIRCLES = np.empty((0, 3))
 
 
-def walls(*corners):
+def walls(*corners: tuple[float, float]) -> Segments:
     """Segments (m, 4) of a closed line through corners."""
-    corners = np.array(corners, dtype=np.float64)
-    return np.hstack((corners, np.roll(corners, -1, axis=0)))
+    points = np.array(corners, dtype=np.float64)
+    return np.hstack((points, np.roll(points, -1, axis=0)))
 
 
 L_SHAPE = walls((0, 0), (9, 0), (9, 3), (4, 3), (4, 7), (0, 7))
 """No two places of it look alike: the legs differ in length and width."""
 
 
-def beside(segments, x):
+def beside(segments: Segments, x: float) -> Segments:
     """The same walls again, `x` metres to the right."""
     return np.vstack((segments, segments + np.array((x, 0.0, x, 0.0))))
 
 
-def grid(segments, inside, resolution=0.05, margin=0.5):
+def grid(segments: Segments, inside: Sequence[Box], resolution: float = 0.05, margin: float = 0.5) -> OccupancyGrid:
     """A map of walls; free within the boxes `inside` (x0, y0, x1, y1), unknown elsewhere."""
     low = segments.reshape(-1, 2).min(axis=0) - margin
     high = segments.reshape(-1, 2).max(axis=0) + margin
@@ -44,7 +52,7 @@ def grid(segments, inside, resolution=0.05, margin=0.5):
     return OccupancyGrid(cells, resolution, Pose2(float(low[0]), float(low[1]), 0.0))
 
 
-def seen(segments, pose, T_odom_base, stamp_s, beams=180):
+def seen(segments: Segments, pose: Pose2, T_odom_base: Pose2, stamp_s: float, beams: int = 180) -> PairedScan:
     """What a lidar at a pose sees, paired with an odometry."""
     angles = 2.0 * np.pi * np.arange(beams) / beams
     heading = angles + pose.theta

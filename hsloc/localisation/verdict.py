@@ -54,7 +54,7 @@ def localisation_reasons(rows: StateRows, trajectory: Trajectory) -> tuple[Verdi
         spans = _spans(np.array([each is state for each in rows.state]))
         firsts = [first for first, _ in spans]
         start = int(trajectory.stamps_ns.min())
-        seconds = ((trajectory.stamps_ns - start) * 1e-9).tolist()
+        seconds = ((trajectory.stamps_ns - start) / 1e9).tolist()
         reasons.append(
             VerdictReason(
                 verdict,

@@ -18,10 +18,7 @@ GAP, NOISE = 0.2, 1e-4
 
 def normals_of(points: NDArray[np.float64]) -> NDArray[np.float64]:
     normals = np.empty_like(points)
-    wall_normals(points, if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-GAP, NOISE, normals)
+    wall_normals(points, GAP, NOISE, normals)
     return normals
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from hsloc.kernels.point_to_line import bearing, choose_hits, pair_terms
+from hsloc.kernels.point_to_line import Term, bearing, choose_hits, pair_terms
 from hsloc.model import Pose2, Scan
 from hsloc.slam.keyscans import KeyScan, KeyScans
 
@@ -36,11 +36,9 @@ def terms(
     scale: float = 1e6,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     information, gradient, counts = np.empty((3, 3)), np.empty(3), np.empty(5)
-    chosen, chosen_start = scans.chosen(10_000)
-    pair_terms(  # type: ignore[call-arg]
-        i, j, *pose, scans.points, scans.normals, scans.centroids, scans.start, scans.hit_of_beam, scans.ranges,
-        scans.table_start, scans.geometry, chosen, chosen_start, gate, scale, information, gradient, counts,
-    )  # fmt: skip
+    pair_terms(
+        i, j, np.array(pose, dtype=float), scans.arrays(10_000), gate, scale, Term(information, gradient), counts
+    )
     return information, gradient, counts
 
 

@@ -86,7 +86,7 @@ def test_the_check_of_the_mounting_uses_the_runs_matcher() -> None:
     cells[[10, 50], 10:51] = 100
     cells[10:51, [10, 50]] = 100
     matcher = Counting()
-    check = ExtrinsicsCheck(OccupancyGrid(cells, 0.1, IDENTITY), None, matcher, 0.2, 100, 2)
+    check = ExtrinsicsCheck(OccupancyGrid(cells, 0.1, IDENTITY), None, matcher, 0.2, 100, 2)  # type: ignore[arg-type, call-arg]
     scan = Scan(0, np.full(90, 2.0, dtype=np.float32), 0.0, 0.07, 0.1, 10.0, frame_id="front")
     check.add(scan, IDENTITY)
     assert matcher.calls == 1

@@ -16,7 +16,8 @@ from hsloc.log import LogWriter, ReadOptions
 from hsloc.model import Pose2, Trajectory
 from hsloc.replay.references import read_reference
 from hsloc.request import RunRequest
-from hsloc.trajectory_io.tum import read_tum, write_tum
+from hsloc.trajectory_io.reader import read_tum
+from hsloc.trajectory_io.tum import write_tum
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,9 +15,9 @@ demo: $(VENV)/.demo  ## replay a fixture recording on its map and show the error
 # The kernels run twice: compiled, where coverage cannot see into them, and as plain Python, where it can.
 test: $(VENV)/.dev  ## all tests on all cores, and the coverage gate (pyproject: fail_under)
 	rm -f .coverage .coverage.*
-	$(PYTEST) --cov --cov-report=
+	$(PYTEST) --cov --cov-report= --cov-fail-under=0
 	mv .coverage .coverage.compiled
-	NUMBA_DISABLE_JIT=1 $(PYTEST) -p no:cacheprovider --cov --cov-report= tests/kernels
+	NUMBA_DISABLE_JIT=1 $(PYTEST) -p no:cacheprovider --cov --cov-report= --cov-fail-under=0 tests/kernels
 	mv .coverage .coverage.plain
 	$(BIN)/coverage combine -q .coverage.compiled .coverage.plain
 	$(BIN)/coverage report

@@ -91,7 +91,9 @@ def _read_image(path: Path, metadata: MapMetadata) -> _Pixels:
                 opened.load()
                 return _planes(opened, metadata.mode)
     except FileNotFoundError as error:
-        raise MapError(f"{path}: its image {image} does not exist") from error
+        raise MapError(
+            f"{path}: its image {image} does not exist; put {image.name} beside the YAML, or name it under `image:`"
+        ) from error
     except MapError:
         raise
     except Exception as error:  # Decoders of images raise whatever they please on damage.

@@ -18,12 +18,14 @@ class Odometry:
     """Dead reckoning: the base's pose in the odometry frame.
 
     `covariance` is the 3 x 3 covariance of (x, y, theta) that the log states (m^2, rad^2), or None where it
-    states none (all zero means unknown, not perfect).
+    states none (all zero means unknown, not perfect). `has_heading` is False where the log states no orientation
+    (a quaternion of zeros); the heading is then 0.
     """
 
     stamp_ns: int
     T_odom_base: Pose2
     covariance: NDArray[np.float64] | None = None
+    has_heading: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -38,13 +38,34 @@ class TopicClock:
     """Effective stamps of one topic.
 
     `shares_log_clock` says whether header stamps and log times are of one clock, so that a missing stamp can be
-    replaced.
+    replaced. `offset_ns` is added to every stamp; with `by_log` the log's time is taken in place of each stamp.
     """
 
-    __slots__ = ("_last_log_ns", "_last_own_ns", "_losses", "_suspect", "kind", "last_ns", "shares_log_clock", "topic")
+    __slots__ = (
+        "_last_log_ns",
+        "_last_own_ns",
+        "_losses",
+        "_suspect",
+        "by_log",
+        "kind",
+        "last_ns",
+        "offset_ns",
+        "shares_log_clock",
+        "topic",
+    )
 
-    def __init__(self, topic: str, kind: int, losses: Losses, shares_log_clock: bool = True) -> None:
+    def __init__(
+        self,
+        topic: str,
+        kind: int,
+        losses: Losses,
+        shares_log_clock: bool = True,
+        offset_ns: int = 0,
+        by_log: bool = False,
+    ) -> None:
         self.topic = topic
+        self.offset_ns = offset_ns
+        self.by_log = by_log
         self.kind = kind
         self.shares_log_clock = shares_log_clock
         self.last_ns: int | None = None
@@ -55,13 +76,15 @@ class TopicClock:
 
     def stamp(self, stamp_ns: int, log_time_ns: int) -> int | None:
         """The stamp to use for a message: its own, the log's where it has none, None where it must be dropped."""
+        if self.by_log and log_time_ns > 0:
+            return log_time_ns + self.offset_ns
         if stamp_ns != 0 or log_time_ns == 0:
-            return stamp_ns
+            return stamp_ns + self.offset_ns
         if not self.shares_log_clock:
             self._losses.stamps_zero_dropped[self.topic] += 1
             return None
         self._losses.stamps_zero[self.topic] += 1
-        return log_time_ns
+        return log_time_ns + self.offset_ns
 
     def effective(self, stamp_ns: int, log_time_ns: int) -> tuple[int, bool]:
         """(effective stamp, whether it was raised) for the topic's next message."""

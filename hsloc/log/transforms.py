@@ -79,6 +79,7 @@ class Transform3:
 
 
 _MAX_STATEMENTS = 8
+"""Different values of one static transform that are kept for the warning."""
 MOVED_METRES, MOVED_RADIANS = 1e-3, 2e-3
 """Change (m, rad) above which a mounting counts as moving. Internal: above the noise of a joint's encoder."""
 

@@ -40,12 +40,12 @@ def test_the_schema_states_range_default_and_meaning() -> None:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_yaml_with_comments_is_read_back(name: Any, tmp_path: Path) -> None:
+def test_yaml_with_comments_is_read_back(name: str, tmp_path: Path) -> None:
     (tmp_path / "all.yaml").write_text(commented_yaml(preset(name)))
     assert load(tmp_path / "all.yaml") == preset(name)
 
 
-def leaves(schema: Any, path: Any = ()) -> Iterator[Any]:
+def leaves(schema: Any, path: tuple[str, ...] = ()) -> Iterator[Any]:
     for name, each in schema["properties"].items():
         if each["type"] == "object":
             yield from leaves(each, (*path, name))

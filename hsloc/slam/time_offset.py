@@ -9,22 +9,26 @@ the uncertainty.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from hsloc.log import open_log
 from hsloc.model.events import Odometry, Scan
 from hsloc.slam.laser_odometry import with_laser_odometry
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from pathlib import Path
 
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from hsloc.model.events import Event
+    from hsloc.log import open_log
+from hsloc.model.events import Event
     from hsloc.slam.front_end import FrontEndParameters
 
     F64 = NDArray[np.float64]
@@ -44,14 +48,17 @@ _HUBER = 1.345
 """Scale of the robust weights in standard deviations (Huber 1981): 95 % efficient on Gaussian errors."""
 SIGNIFICANT = 4.0
 """An offset counts if it is so many of its standard deviations from zero; under Gaussian errors once in 16,000 runs."""
+HINT_S = 0.15
+"""Difference of stamps and log times between scans and odometry (s) from which on the offset is worth an estimate: drivers
+and networks delay messages by less."""
 SMALLEST_S = 0.02
 """Offsets below this (s) are not worth a word: they move a beam by 2 cm at 1 m/s."""
 
 
 class Offset(NamedTuple):
-    """The scans' stamps are `seconds` later than the odometry's say; `sigma` is the standard deviation (s).
+    """The scans' stamps are `seconds` later than the odometry's; `sigma` is the standard deviation (s).
 
-    `seconds` of -0.1 means that a scan stamped t shows the robot where the odometry has it at t + 0.1 s.
+    0.1 means that a scan stamped t shows the robot where the odometry has it at t - 0.1 s.
     """
 
     seconds: float
@@ -120,13 +127,13 @@ def find_offset(scans: Headings, odometry: Headings, near_s: float = _NEAR_S, st
     return _refined(best, seen, steps)
 
 
-def _refined(best: float, seen: F64, steps: object) -> Offset:
+def _refined(best: float, seen: F64, steps: Callable[[float], tuple[F64, NDArray[np.bool_]]]) -> Offset:
     """Gauss-Newton on the offset, with Huber's weights; the standard deviation from the spread of the residuals."""
     half = 0.5 * _GRID_S
     sigma = float("inf")
     for _ in range(20):
-        told, inside = steps(best)  # type: ignore[operator]
-        later, earlier = steps(best + half)[0], steps(best - half)[0]  # type: ignore[operator]
+        told, inside = steps(best)
+        later, earlier = steps(best + half)[0], steps(best - half)[0]
         slope = ((later - earlier) / (2.0 * half))[inside]
         residual = (seen - told)[inside]
         scale = max(1.4826 * float(np.median(np.abs(residual - np.median(residual)))), 1e-5)
@@ -205,3 +212,41 @@ def _misfit(scans: Headings, odometry: Headings, offset_s: float) -> float:
         return float("inf")
     told = np.interp(at[inside].astype(np.float64), odometry.stamps_ns.astype(np.float64), odometry.theta)
     return float(np.mean(np.minimum(np.abs(np.diff(scans.theta[inside]) - np.diff(told)), 0.5)))
+
+
+def offsets_of_log(paths: Sequence[Path], options: ReadOptions, parameters: FrontEndParameters) -> dict[str, Offset]:
+    """The offset of each scan topic that is read, those that are determined; the whole log counts.
+
+    Raises LogError and TopicError as `open_log` does.
+    """
+    options = replace(options, time_offset=None, deskew=False, start_s=None, end_s=None)
+    topics = (open_log(paths, options).summary.scan_topic or "").split(",")
+    found = {}
+    for topic in topics if options.stamps == "header" else ():
+        # A text log has no topics to choose from.
+        named = replace(options, scan_topic=topic) if len(topics) > 1 else options
+        offset = estimate_offset(open_log(paths, named).events(), parameters, np.random.default_rng(0))
+        if isfinite(offset.sigma):
+            found[topic] = offset
+    return found
+
+
+def in_words(offset: Offset) -> str:
+    """An offset with its uncertainty, to be followed by what it is counted from."""
+    word = "later than" if offset.seconds > 0.0 else "earlier than"
+    return f"{abs(offset.seconds):.3f} +- {offset.sigma:.3f} s {word}"
+
+
+def offset_warning(topic: str, offset: Offset) -> RunWarning:
+    """The warning of an offset that was found and not removed."""
+    return RunWarning(
+        WarningCode.CLOCK_OFFSET,
+        f"the stamps of {topic} are {in_words(offset)} those of the odometry, by their headings",
+        f"--time-offset {topic}={-offset.seconds:.3f} removes it, --time-offset auto estimates it anew",
+    )
+
+
+def as_option(offsets: Mapping[str, Offset]) -> str | None:
+    """The value of `--time-offset` that removes the offsets that are significant; None where none is."""
+    items = [f"{topic}={-offset.seconds:.3f}" for topic, offset in offsets.items() if offset.is_significant]
+    return ",".join(items) or None

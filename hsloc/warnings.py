@@ -59,6 +59,8 @@ class WarningCode(StrEnum):
     """No transform leads from the child frame of the odometry to the base: they are assumed to be the same."""
     CLOCK_OFFSET = "clock_offset"
     """The stamps of the scans are earlier or later than those of the odometry, by what their headings show."""
+    CLOCK_OFFSET_LARGE = "clock_offset_large"
+    """The same by a tenth of a second or more."""
     CLOCK_OFFSET_APPLIED = "clock_offset_applied"
     """The offset between scans and odometry was estimated and removed, as asked for."""
     CLOCKS_APART = "clocks_apart"

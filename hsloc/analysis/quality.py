@@ -9,7 +9,7 @@ import numpy as np
 
 from hsloc.model.estimate import Status
 from hsloc.model.verdict import Verdict, VerdictReason
-from hsloc.slam.time_offset import Headings, find_offset, offset_warning
+from hsloc.slam.time_offset import Headings, find_offset, offset_warning, offsets_of_log
 from hsloc.trajectory_io.tum import NS_PER_S
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -26,7 +26,7 @@ _VERDICTS = {
     WarningCode.LASER_MISFIT: Verdict.CHECK,
     WarningCode.EXTRINSICS_DISAGREE: Verdict.CHECK,
     WarningCode.ODOMETRY_JUMPS: Verdict.CHECK,
-    WarningCode.CLOCK_OFFSET: Verdict.CHECK,
+    WarningCode.CLOCK_OFFSET_LARGE: Verdict.CHECK,
 }
 """Warnings that concern the whole result, with the verdict that each alone gives."""
 
@@ -55,7 +55,7 @@ def offset_warnings(result: Result) -> list[RunWarning]:
 
     The pose of a matched scan follows what the lidar saw; odometry with the same stamp should have turned as much.
     """
-    known = (WarningCode.CLOCK_OFFSET, WarningCode.CLOCK_OFFSET_APPLIED)
+    known = (WarningCode.CLOCK_OFFSET, WarningCode.CLOCK_OFFSET_LARGE, WarningCode.CLOCK_OFFSET_APPLIED)
     if result.lidar_only or not len(result.odometry) or any(w.code in known for w in result.warnings):
         return []
     stamps, odometry = result.diagnostics.stamps_ns, result.odometry
@@ -71,7 +71,17 @@ def offset_warnings(result: Result) -> list[RunWarning]:
         theta = result.trajectory.poses[rows, 2] - odometry.poses[rows, 2] + there
     scans = Headings.of(stamps[matched], theta[matched])
     offset = find_offset(scans, Headings.of(odometry.stamps_ns, odometry.poses[:, 2]))
-    return [offset_warning(result.summary.scan_topic or "the scans", offset)] if offset.is_significant else []
+    if not offset.is_significant:
+        return []
+    # Poses are weighed with the odometry, which hides a part of the offset: the scans alone show the whole of it.
+    spec = result.spec
+    found = offsets_of_log(spec.logs, spec.reading(), spec.config.graph_mapper.front_end)
+    given = spec.read.offsets_s()
+    return [
+        offset_warning(topic, each, given.get(topic.lstrip("/"), 0.0))
+        for topic, each in found.items()
+        if each.is_significant
+    ]
 
 
 def verdict_reasons(result: Result, warnings: Sequence[RunWarning]) -> tuple[VerdictReason, ...]:

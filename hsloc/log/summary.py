@@ -35,8 +35,8 @@ class ReadOptions:
 
     `scan_fix` overrides fields of scans (see `hsloc.log.session.scan_geometry.ScanFixes`). `slice` are two heights
     above the base [m], `LOW,HIGH`: point clouds are read as scans, the nearest point of each direction between them.
-    `time_offset` (`TOPIC=SECONDS`, several with commas, or `auto`) is added to the stamps of a topic. With `stamps` "log" the
-    log's times are used in place of the header stamps.
+    `time_offset` (`TOPIC=SECONDS`, several with commas, or `auto`) is added to the stamps of a topic. With `stamps`
+    "log" the log's times are used in place of the header stamps.
     """
 
     scan_topic: str | None = None

@@ -17,6 +17,7 @@ import numpy as np
 
 from hsloc.log import open_log
 from hsloc.model.events import Odometry, Scan
+from hsloc.options import AUTO
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from hsloc.log import open_log
-from hsloc.model.events import Event
+    from hsloc.log import ReadOptions
+    from hsloc.model.events import Event
     from hsloc.slam.front_end import FrontEndParameters
 
     F64 = NDArray[np.float64]
@@ -49,8 +50,10 @@ _HUBER = 1.345
 SIGNIFICANT = 4.0
 """An offset counts if it is so many of its standard deviations from zero; under Gaussian errors once in 16,000 runs."""
 HINT_S = 0.15
-"""Difference of stamps and log times between scans and odometry (s) from which on the offset is worth an estimate: drivers
-and networks delay messages by less."""
+"""Difference of stamps and log times between scans and odometry (s) from which on the offset is estimated before a run:
+drivers and networks delay messages by less."""
+LARGE_S = 0.1
+"""From here on (s) poses are wrong by 10 cm at 1 m/s and by 6 degrees at 1 rad/s: nobody would call that right."""
 SMALLEST_S = 0.02
 """Offsets below this (s) are not worth a word: they move a beam by 2 cm at 1 m/s."""
 
@@ -67,9 +70,7 @@ class Offset(NamedTuple):
     @property
     def is_significant(self) -> bool:
         """Whether it is neither chance nor too small to matter."""
-        return (
-            isfinite(self.sigma) and abs(self.seconds) > max(SIGNIFICANT * self.sigma, SMALLEST_S)
-        )
+        return isfinite(self.sigma) and abs(self.seconds) > max(SIGNIFICANT * self.sigma, SMALLEST_S)
 
 
 UNKNOWN = Offset(0.0, float("inf"))
@@ -161,23 +162,22 @@ def estimate_offset(
     The whole range of `RANGE_S` is searched; where two offsets fit nearly alike, the smaller one counts.
     """
     odometry: list[tuple[int, float]] = []
-    scans: list[tuple[int, float]] = []
 
     def kept() -> Iterable[Event]:
-        count = 0
+        count, last_ns = 0, 0
         for event in events:
             if isinstance(event, Odometry):
                 odometry.append((event.stamp_ns, event.T_odom_base.theta))
-                if count >= most_scans and event.stamp_ns > scans[-1][0] + RANGE_S * NANOSECONDS:
+                if count >= most_scans and event.stamp_ns > last_ns + RANGE_S * NANOSECONDS:
                     return
             elif isinstance(event, Scan):
                 count += 1
                 if count <= most_scans:
+                    last_ns = event.stamp_ns
                     yield event
 
-    for event in with_laser_odometry(kept(), parameters, rng):
-        if isinstance(event, Odometry):
-            scans.append((event.stamp_ns, event.T_odom_base.theta))
+    matched = with_laser_odometry(kept(), parameters, rng)
+    scans = [(event.stamp_ns, event.T_odom_base.theta) for event in matched if isinstance(event, Odometry)]
     if not scans or not odometry:
         return UNKNOWN
     seen, told = _headings(scans), _headings(odometry)
@@ -217,9 +217,12 @@ def _misfit(scans: Headings, odometry: Headings, offset_s: float) -> float:
 def offsets_of_log(paths: Sequence[Path], options: ReadOptions, parameters: FrontEndParameters) -> dict[str, Offset]:
     """The offset of each scan topic that is read, those that are determined; the whole log counts.
 
+    What the options add to the stamps is part of them.
+
     Raises LogError and TopicError as `open_log` does.
     """
-    options = replace(options, time_offset=None, deskew=False, start_s=None, end_s=None)
+    given = None if options.time_offset == AUTO else options.time_offset
+    options = replace(options, time_offset=given, deskew=False, start_s=None, end_s=None)
     topics = (open_log(paths, options).summary.scan_topic or "").split(",")
     found = {}
     for topic in topics if options.stamps == "header" else ():
@@ -237,16 +240,21 @@ def in_words(offset: Offset) -> str:
     return f"{abs(offset.seconds):.3f} +- {offset.sigma:.3f} s {word}"
 
 
-def offset_warning(topic: str, offset: Offset) -> RunWarning:
-    """The warning of an offset that was found and not removed."""
+def offset_warning(topic: str, offset: Offset, given_s: float = 0.0) -> RunWarning:
+    """The warning of an offset that was found and not removed; `given_s` is what the user already adds to the stamps."""
     return RunWarning(
-        WarningCode.CLOCK_OFFSET,
+        WarningCode.CLOCK_OFFSET_LARGE if abs(offset.seconds) >= LARGE_S else WarningCode.CLOCK_OFFSET,
         f"the stamps of {topic} are {in_words(offset)} those of the odometry, by their headings",
-        f"--time-offset {topic}={-offset.seconds:.3f} removes it, --time-offset auto estimates it anew",
+        f"--time-offset {_first(topic)}={given_s - offset.seconds:.3f} removes it, --time-offset auto estimates it anew",
     )
 
 
 def as_option(offsets: Mapping[str, Offset]) -> str | None:
     """The value of `--time-offset` that removes the offsets that are significant; None where none is."""
-    items = [f"{topic}={-offset.seconds:.3f}" for topic, offset in offsets.items() if offset.is_significant]
+    items = [f"{_first(topic)}={-offset.seconds:.3f}" for topic, offset in offsets.items() if offset.is_significant]
     return ",".join(items) or None
+
+
+def _first(topic: str) -> str:
+    """The topic; of the kinds of lines of a text log, which are joined by plus signs, the first."""
+    return topic.partition(" + ")[0]

@@ -241,11 +241,11 @@ def in_words(offset: Offset) -> str:
 
 
 def offset_warning(topic: str, offset: Offset, given_s: float = 0.0) -> RunWarning:
-    """The warning of an offset that was found and not removed; `given_s` is what the user already adds to the stamps."""
+    """The warning of an offset that was not removed; `given_s` is what the user adds to the stamps already (s)."""
     return RunWarning(
         WarningCode.CLOCK_OFFSET_LARGE if abs(offset.seconds) >= LARGE_S else WarningCode.CLOCK_OFFSET,
         f"the stamps of {topic} are {in_words(offset)} those of the odometry, by their headings",
-        f"--time-offset {_first(topic)}={given_s - offset.seconds:.3f} removes it, --time-offset auto estimates it anew",
+        f"--time-offset {_first(topic)}={given_s - offset.seconds:.3f} removes it, or --time-offset auto",
     )
 
 

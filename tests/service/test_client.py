@@ -88,6 +88,9 @@ def test_the_command(make_live: Callable[..., Live], log: Path, tmp_path: Path) 
     assert done.returncode == 0, done.stderr
     assert "succeeded" in done.stdout
     assert (tmp_path / "got" / "trajectory.tum").read_text().startswith("8 ")
+    assert "hsloc: warning: the stamps are 3.0 s apart; check the clocks\n" in done.stderr
+    assert "verdict: check\n" in done.stdout
+    assert " ".join(done.stdout.split()).endswith("APE rmse 1.23 cm 0.45°")
     log.write_bytes(b"bad-input")
     failed = submit(live, str(log), "--wait")
     assert failed.returncode == 1

@@ -54,15 +54,19 @@ def print_warnings(warnings: Iterable[RunWarning]) -> None:
 
 def print_job(summary: Mapping[str, Any]) -> None:
     """The result of a job of the service, as `print_summary` and `print_warnings` show that of a replay."""
-    from hsloc.report.table import Row
+    from hsloc.dataclass_json import from_json
+    from hsloc.model.verdict import VerdictReason
+    from hsloc.report.table import Row, reason_text
     from hsloc.warnings import RunWarning
 
     # A server of an earlier version sends warnings as text, and no figures.
-    found = [RunWarning("", each) if isinstance(each, str) else RunWarning(**each) for each in summary["warnings"]]
+    found = [
+        RunWarning("", each) if isinstance(each, str) else from_json(RunWarning, each) for each in summary["warnings"]
+    ]
     print_warnings(found)
     verdict = summary.get("metrics", {}).get("verdict")
     lines = [] if verdict is None else [f"verdict: {verdict}"]
-    lines += [f"  {reason['text']}" for reason in summary.get("verdict_reasons", ())]
+    lines += [f"  {reason_text(from_json(VerdictReason, each))}" for each in summary.get("verdict_reasons", ())]
     _print(lines + _table([Row(each["name"], tuple(each["values"])) for each in summary.get("figures", ())]))
 
 
@@ -80,9 +84,9 @@ def _print(lines: Iterable[str]) -> None:
 
 def summary_lines(metrics: RunMetrics, timings: RunTimings, folder: Path) -> list[str]:
     """The lines of `print_summary`."""
-    from hsloc.report.table import format_duration, format_length, table_rows
+    from hsloc.report.table import format_duration, format_length, reason_text, table_rows
 
-    lines = [f"verdict: {metrics.verdict}", *(f"  {reason.text}" for reason in metrics.verdict_reasons)]
+    lines = [f"verdict: {metrics.verdict}", *(f"  {reason_text(reason)}" for reason in metrics.verdict_reasons)]
     lines += _table(table_rows(metrics))
     if metrics.errors is not None:
         lines.append(

@@ -25,6 +25,7 @@ from hsloc.replay.engine import replay
 from hsloc.replay.garbage import seldom_collected
 from hsloc.replay.initial_pose import find_start, first_odometry
 from hsloc.replay.map_sources import load_grid, load_state, maps_beside, unread_maps
+from hsloc.replay.pose_covariances import pose_covariances
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory
 from hsloc.request import RunRequest
@@ -62,7 +63,7 @@ class Progress:
     scans: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Result:
     """What a run found, and what is needed to repeat it. `seconds` are wall times, the only thing not repeatable.
 
@@ -87,6 +88,28 @@ class Result:
     mapping: MappingResult | None = None
     true_grid: OccupancyGrid | None = None
     likelihood: LikelihoodField | None = None
+
+    def __repr__(self) -> str:
+        scans, share = self.diagnostics, 100.0 * float(self.localised.mean()) if len(self.localised) else 0.0
+        used = sum(status in ("matched", "relocalised") for status in scans.status)
+        name = " ".join(self.spec.names())
+        return (
+            f"<Result of {name if len(name) < 80 else f'{name[:77]}...'}: {self.mode}, {len(self.trajectory)} poses, "
+            f"{self.trajectory.length():.1f} m, {share:.1f} % localised, {used} of {len(scans)} scans matched, "
+            f"{len(self.warnings)} warnings, {'no' if self.reference is None else 'with a'} reference>"
+        )
+
+    def pose_covariances(self) -> NDArray[np.float64]:
+        """Covariance (n, 3, 3) of each pose of `trajectory` over (x, y, theta) in the map frame (m^2, m rad, rad^2).
+
+        Those of the matched scans, propagated by the odometry; NaN where a pose is not localised, before the first
+        match, and in a map of the graph mapper, which does not compute them.
+        """
+        if self.mapping is not None:
+            return np.full((len(self.trajectory), 3, 3), np.nan)
+        config = self.spec.config
+        noise = config.localiser.odometry_noise if self.mode == "localise" else config.point_mapper.odometry_noise
+        return pose_covariances(self.trajectory, self.localised, self.diagnostics, noise.covariance)
 
     @property
     def matcher_name(self) -> str | None:

@@ -32,6 +32,7 @@ class RunHistory:
         self._reason: list[str] = []
         self._fitness = array("d")
         self._sigma = array("d")
+        self._covariance = array("d")
         self._evaluations = array("q")
         self._believed = 0
         self._searching = False
@@ -63,8 +64,10 @@ class RunHistory:
         covariance = estimate.covariance
         if covariance is None:
             self._sigma.extend((float("nan"),) * 3)
+            self._covariance.extend((float("nan"),) * 9)
         else:
             self._sigma.extend(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+            self._covariance.extend(covariance.ravel())
         self._evaluations.append(estimate.evaluations)
         if estimate.revision:
             self._revisions.append((len(self._odometry_stamps), estimate.revision))
@@ -115,6 +118,7 @@ class RunHistory:
             sigma=np.array(self._sigma, dtype=np.float64).reshape(-1, 3),
             evaluations=np.array(self._evaluations, dtype=np.int64),
             reason=tuple(self._reason),
+            covariance=np.array(self._covariance, dtype=np.float64).reshape(-1, 3, 3),
         )
 
 

@@ -80,7 +80,9 @@ def request_of(given: Mapping[str, Any], upload: Callable[[Path], str]) -> dict[
     for name, value in merged(given).items():
         option = BY_NAME[name]
         if name == "map":
-            image = value.parent / str(read_values(value).get("image", ""))
+            from hsloc.maps.metadata import read_metadata
+
+            image = read_metadata(value).image
             request["map"] = {"yaml": upload(value), "image": upload(image)}
         elif name == "config":
             request["config"] = read_values(value)

@@ -132,7 +132,7 @@ def test_topics_missing_or_ambiguous_are_told_with_their_remedy(here, capsys):
 def test_localising_without_a_map_asks_for_one(here, capsys):
     write_log(here / "bare.mcap")
     assert "--map" in fails(capsys, "replay", "bare.mcap", "--mode", "localise", "--out", "out")
-    line = fails(capsys, "replay", OFFICE, "--mode", "localise", "--no-odom", "--out", "out")
+    line = fails(capsys, "replay", OFFICE, "--mapper", "point", "--mode", "slam", "--no-odom", "--out", "out")
     assert "--no-odom" in line
     assert empty(here)
 

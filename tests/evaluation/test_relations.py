@@ -10,7 +10,8 @@ from hsloc.errors import EvaluationError
 from hsloc.evaluation.relations import Relations, evaluate_relations, read_relations, relation_errors
 from hsloc.model import Pose2, Trajectory
 from hsloc.model.pose2 import compose_poses, relative_poses
-from hsloc.trajectory_io.tum import parse_stamp, read_tum
+from hsloc.trajectory_io.reader import read_tum
+from hsloc.trajectory_io.tum import parse_stamp
 
 S = 1_000_000_000
 

@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 from hsloc.cli.main import main
 from hsloc.log import open_log
 from hsloc.maps import save_map
-from hsloc.trajectory_io.tum import read_tum
+from hsloc.trajectory_io.reader import read_tum
 
 HALL = Path(__file__).parents[2] / "recordings" / "hall.mcap"
 

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 
-from hsloc.kernels.branch_and_bound import best_on_lattice, pool
+from hsloc.kernels.branch_and_bound import Excluded, Lattice, best_on_lattice, pool
 
 NOWHERE = np.array((-1.0, -1.0, -1.0))
+ALL = Excluded(NOWHERE, NOWHERE)
 
 
 def naive_best(scores, points, centre, half, step, excluded, exclusion):
@@ -52,7 +53,13 @@ def test_the_answer_is_that_of_trying_them_all(case, levels, exclusion):
     want, where = naive_best(scores, points, centre, half, 0.1, excluded, np.array(exclusion))
     pose = np.empty(3)
     found, visits = best_on_lattice(
-        pool(scores, levels), points, centre, half, 0.1, excluded, np.array(exclusion), 0.0, 10**7, pose
+        pool(scores, levels),
+        points,
+        Lattice(centre, half, 0.1),
+        Excluded(excluded, np.array(exclusion)),
+        0.0,
+        10**7,
+        pose,
     )
     assert found == pytest.approx(want, abs=1e-6)
     np.testing.assert_allclose(pose, where, atol=1e-9)
@@ -61,13 +68,13 @@ def test_the_answer_is_that_of_trying_them_all(case, levels, exclusion):
 
 def test_nothing_better_than_what_is_needed_is_said_so(case):
     scores, points, centre, half = case
-    found, _ = best_on_lattice(pool(scores, 3), points, centre, half, 0.1, NOWHERE, NOWHERE, 0.99, 10**7, np.empty(3))
+    found, _ = best_on_lattice(pool(scores, 3), points, Lattice(centre, half, 0.1), ALL, 0.99, 10**7, np.empty(3))
     assert found == pytest.approx(0.99)
 
 
 def test_out_of_visits_is_not_an_answer(case):
     scores, points, centre, half = case
-    found, visits = best_on_lattice(pool(scores, 3), points, centre, half, 0.1, NOWHERE, NOWHERE, 0.0, 60, np.empty(3))
+    found, visits = best_on_lattice(pool(scores, 3), points, Lattice(centre, half, 0.1), ALL, 0.0, 60, np.empty(3))
     assert found == -1.0
     assert visits > 60
 
@@ -75,5 +82,5 @@ def test_out_of_visits_is_not_an_answer(case):
 def test_bounds_save_work(case):
     scores, points, centre, half = case
     every = 13 * 11 * 7
-    _, visits = best_on_lattice(pool(scores, 3), points, centre, half, 0.1, NOWHERE, NOWHERE, 0.3, 10**7, np.empty(3))
+    _, visits = best_on_lattice(pool(scores, 3), points, Lattice(centre, half, 0.1), ALL, 0.3, 10**7, np.empty(3))
     assert visits < every

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hsloc.kernels.point_to_line import bearing, choose_hits, pair_terms
+from hsloc.kernels.point_to_line import Term, bearing, choose_hits, pair_terms
 from hsloc.model import Pose2, Scan
 from hsloc.slam.keyscans import KeyScan, KeyScans
 
@@ -21,11 +21,9 @@ def room_scan(pose, *, beams=181, noise=0.0, seed=0, increment=DEGREE):
 
 def terms(scans, i, j, pose, *, gate=0.3, scale=1e6):
     information, gradient, counts = np.empty((3, 3)), np.empty(3), np.empty(5)
-    chosen, chosen_start = scans.chosen(10_000)
     pair_terms(
-        i, j, *pose, scans.points, scans.normals, scans.centroids, scans.start, scans.hit_of_beam, scans.ranges,
-        scans.table_start, scans.geometry, chosen, chosen_start, gate, scale, information, gradient, counts,
-    )  # fmt: skip
+        i, j, np.array(pose, dtype=float), scans.arrays(10_000), gate, scale, Term(information, gradient), counts
+    )
     return information, gradient, counts
 
 

@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from hsloc.kernels.fitness import pack, score_sum
-from hsloc.kernels.search import STOPPED_AGREEMENT, STOPPED_BUDGET, SearchParameters, improve_memory, search
+from hsloc.kernels.search import (
+    STOPPED_AGREEMENT,
+    STOPPED_BUDGET,
+    Box,
+    Found,
+    Memory,
+    SearchParameters,
+    improve_memory,
+    search,
+)
 
 NONE = np.empty(0)
 
@@ -102,7 +111,7 @@ def test_hs_and_hide_are_the_plain_reading_of_the_papers(scene, changes):
     centre, half = np.array([22.0, 17.0, 0.1]), np.array([6.0, 6.0, 0.5])
     memory, sums = np.empty((p.memory_size, 3)), np.empty(p.memory_size)
     best, evaluations = improve_memory(
-        packed, points, centre, half, p, np.random.default_rng(7), memory, sums, NONE, True
+        packed, points, Box(centre, half), p, np.random.default_rng(7), Memory(memory, sums), NONE, True
     )
 
     def score(pose):
@@ -121,7 +130,7 @@ def test_the_memory_stays_in_the_box_and_never_gets_worse(scene):
     centre, half = np.array([20.0, 20.0, 3.0]), np.array([3.0, 5.0, 0.2])
     memory, sums, history = np.empty((8, 3)), np.empty(8), np.full(200, np.nan)
     best, evaluations = improve_memory(
-        packed, points, centre, half, p, np.random.default_rng(0), memory, sums, history, True
+        packed, points, Box(centre, half), p, np.random.default_rng(0), Memory(memory, sums), history, True
     )
     assert evaluations == 200
     assert (np.abs(memory - centre) <= half + 1e-12).all()
@@ -137,9 +146,14 @@ def test_search_is_repeatable_and_tells_why_it_stopped(scene):
     def run(seed, **changes):
         pose, information = np.empty(3), np.zeros((3, 3))
         told = search(
-            packed, points, points[:10], centre, half, parameters(**changes), np.random.default_rng(seed), pose,
-            information, NONE,
-        )  # fmt: skip
+            packed,
+            points,
+            points[:10],
+            Box(centre, half),
+            parameters(**changes),
+            np.random.default_rng(seed),
+            Found(pose, information, NONE),
+        )
         return pose, told
 
     many = {"restarts": 10, "agreement": 2, "polish_iterations": 10}

@@ -23,6 +23,7 @@ from hsloc.log.messages import foxglove
 from hsloc.log.messages.decoders import Undecodable, decoder_for
 from hsloc.log.reader import open_log
 from hsloc.log.session.extrinsics import Extrinsics
+from hsloc.log.session.transform_topics import TransformTopics
 from hsloc.log.summary import Losses, ReadOptions
 from hsloc.log.transforms import Mounting, Transform3
 from hsloc.log.writer import LogWriter
@@ -126,7 +127,7 @@ def test_the_pose_of_a_foxglove_scan_is_part_of_its_mounting() -> None:
     message.pose.orientation.x = 1.0  # head down
     scan = decoder_for(channel("foxglove.LaserScan"))(message.SerializeToString())
     assert scan.T_frame_laser == Transform3((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-    mountings = Extrinsics([], "base", None)
+    mountings = Extrinsics([], TransformTopics(), "base", None)
     mountings._spatial["laser"] = Transform3.from_pose2(Pose2(0.5, 0.25, np.pi / 2))
     mountings._known["laser"] = (Mounting(Pose2(0.5, 0.25, np.pi / 2)), "/tf_static")
     mounting = mountings.of("laser", scan.T_frame_laser)
@@ -258,6 +259,10 @@ def test_foxgloves_transforms_are_found_under_any_name(source: Path, tmp_path: P
 
     path = formats.foxglove_mcap(source, tmp_path / "all.mcap", "protobuf")
     log = open_log(formats.write(tmp_path / "renamed.mcap", renamed(), source))
-    assert (log.summary.odom_topic, log.summary.base_frame, log.summary.extrinsics) == ("/tf", "base_link", "/tf")
+    assert (log.summary.odom_topic, log.summary.base_frame, log.summary.extrinsics) == (
+        "/transforms",
+        "base_link",
+        "/transforms",
+    )
     expected = open_log(source, ReadOptions(odom_topic="tf")).events()
     assert [values(event) for event in log.events()] == [values(event) for event in expected]

@@ -7,7 +7,7 @@ import pytest
 
 from hsloc.model import Odometry, Pose2, Scan
 from hsloc.model.events import PairedScan
-from hsloc.preprocessing.merge_scans import clouds
+from hsloc.preprocessing.merge_scans import merged_scans
 
 MS = 1_000_000
 
@@ -20,7 +20,7 @@ def scan(frame: str, ms: float, at: Pose2 | None = None) -> PairedScan:
 def told(*scans: PairedScan) -> list[tuple[str, float, tuple[str, ...] | str]]:
     """(frame, ms, companions or "held") after an odometry message."""
     first = Odometry(0, Pose2())
-    passed = list(clouds([first, *scans]))
+    passed = list(merged_scans([first, *scans]))
     assert passed[0] is first
     return [
         (
@@ -35,7 +35,7 @@ def told(*scans: PairedScan) -> list[tuple[str, float, tuple[str, ...] | str]]:
 
 def test_one_laser_is_left_alone():
     scans = [scan("a", ms) for ms in (0, 100, 200)]
-    assert list(clouds([Odometry(0, Pose2()), *scans]))[1:] == scans
+    assert list(merged_scans([Odometry(0, Pose2()), *scans]))[1:] == scans
 
 
 @pytest.mark.parametrize("offset", [0, 20, 50])
@@ -93,7 +93,7 @@ def test_lasers_that_never_meet_are_matched_alone_now_and_then():
 
 def test_without_odometry_none_is_held():
     scans = [scan(frame, ms) for ms in (0, 100) for frame in "ab"]
-    assert list(clouds(scans)) == scans
+    assert list(merged_scans(scans)) == scans
 
 
 def test_the_points_of_a_companion_are_moved_by_odometry():

@@ -15,7 +15,8 @@ from hsloc.log import LogWriter, ReadOptions
 from hsloc.model import Pose2, Trajectory
 from hsloc.replay.references import read_reference
 from hsloc.request import RunRequest
-from hsloc.trajectory_io.tum import read_tum, write_tum
+from hsloc.trajectory_io.reader import read_tum
+from hsloc.trajectory_io.tum import write_tum
 
 HALL = Path(__file__).parents[2] / "recordings" / "hall.mcap"
 SECOND = 1_000_000_000

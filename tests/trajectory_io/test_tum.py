@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from hsloc.errors import EvaluationError, OutputError
 from hsloc.model import Trajectory
-from hsloc.trajectory_io.tum import format_stamp, format_tum, parse_stamp, read_tum, write_tum
+from hsloc.trajectory_io.reader import read_tum
+from hsloc.trajectory_io.tum import format_stamp, format_tum, parse_stamp, write_tum
 
 HALF = 2**-0.5
 

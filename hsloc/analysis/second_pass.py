@@ -8,8 +8,7 @@ from hsloc.log import open_log
 from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.preprocessing.odometry_resets import ContinuousOdometry
-from hsloc.replay.engine import pair
-from hsloc.replay.garbage import seldom_collected
+from hsloc.replay.engine import pair, seldom_collected
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

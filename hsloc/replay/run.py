@@ -22,8 +22,7 @@ from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
 from hsloc.preprocessing.odometry_resets import ContinuousOdometry
 from hsloc.preprocessing.odometry_watch import OdometryWatch, UnusableOdometry
-from hsloc.replay.engine import replay
-from hsloc.replay.garbage import seldom_collected
+from hsloc.replay.engine import replay, seldom_collected
 from hsloc.replay.initial_pose import find_start, first_odometry
 from hsloc.replay.map_sources import load_grid, load_state, maps_beside, unread_maps
 from hsloc.replay.pose_covariances import pose_covariances

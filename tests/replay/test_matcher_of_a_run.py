@@ -15,7 +15,7 @@ from hsloc.cli.main import main
 from hsloc.config import Config
 from hsloc.errors import ConfigError
 from hsloc.localisation.relocaliser import RelocaliserParameters
-from hsloc.matching import Hide
+from hsloc.matching import Hide, LikelihoodField
 from hsloc.model import IDENTITY, OccupancyGrid, Scan
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
@@ -86,7 +86,8 @@ def test_the_check_of_the_mounting_uses_the_runs_matcher() -> None:
     cells[[10, 50], 10:51] = 100
     cells[10:51, [10, 50]] = 100
     matcher = Counting()
-    check = ExtrinsicsCheck(OccupancyGrid(cells, 0.1, IDENTITY), None, matcher, 0.2, 100, 2)
+    field = LikelihoodField.from_grid(OccupancyGrid(cells, 0.1, IDENTITY))
+    check = ExtrinsicsCheck(field, matcher, 100, 2)
     scan = Scan(0, np.full(90, 2.0, dtype=np.float32), 0.0, 0.07, 0.1, 10.0, frame_id="front")
     check.add(scan, IDENTITY)
     assert matcher.calls == 1

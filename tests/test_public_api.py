@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from paths import RECORDINGS
 
 import hsloc
 
-RECORDINGS = Path(__file__).resolve().parents[1] / "recordings"
 OFFICE = str(RECORDINGS / "office.mcap")
 SLIP = str(RECORDINGS / "slip.mcap")
 

@@ -25,9 +25,8 @@ from hsloc.preprocessing.odometry_watch import OdometryWatch, UnusableOdometry
 from hsloc.replay.engine import replay, seldom_collected
 from hsloc.replay.initial_pose import find_start, first_odometry
 from hsloc.replay.map_sources import load_grid, load_state, maps_beside, unread_maps
-from hsloc.replay.pose_covariances import pose_covariances
 from hsloc.replay.references import read_reference
-from hsloc.replay.run_history import RunHistory
+from hsloc.replay.run_history import RunHistory, pose_covariances
 from hsloc.request import RunRequest
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -12,15 +13,18 @@ from hsloc.errors import ConfigError
 from hsloc.options import PRESETS
 from hsloc.parameter_reference import commented_yaml, json_schema, page
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_the_page_is_up_to_date():
+def test_the_page_is_up_to_date() -> None:
     """Otherwise: python -m hsloc.parameter_reference > docs/parameters.md."""
     assert (ROOT / "docs" / "parameters.md").read_text(encoding="utf-8") == page()
 
 
-def test_the_schema_states_range_default_and_meaning():
+def test_the_schema_states_range_default_and_meaning() -> None:
     localiser = json_schema()["properties"]["localiser"]["properties"]
     assert localiser["update_min_d"] == {
         "type": "number",
@@ -36,12 +40,12 @@ def test_the_schema_states_range_default_and_meaning():
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_yaml_with_comments_is_read_back(name, tmp_path):
+def test_yaml_with_comments_is_read_back(name: str, tmp_path: Path) -> None:
     (tmp_path / "all.yaml").write_text(commented_yaml(preset(name)))
     assert load(tmp_path / "all.yaml") == preset(name)
 
 
-def leaves(schema, path=()):
+def leaves(schema: Any, path: tuple[str, ...] = ()) -> Iterator[Any]:
     for name, each in schema["properties"].items():
         if each["type"] == "object":
             yield from leaves(each, (*path, name))
@@ -50,8 +54,8 @@ def leaves(schema, path=()):
 
 
 @pytest.mark.parametrize(("path", "schema"), list(leaves(json_schema())), ids=lambda value: ".".join(value)[:60])
-def test_the_limits_of_the_schema_are_those_that_are_checked(path, schema):
-    def nested(value):
+def test_the_limits_of_the_schema_are_those_that_are_checked(path: Any, schema: Any) -> None:
+    def nested(value: Any) -> Any:
         for name in reversed(path):
             value = {name: value}
         return value
@@ -69,7 +73,7 @@ def test_the_limits_of_the_schema_are_those_that_are_checked(path, schema):
             from_dict(type(preset("default")), nested(kind(value)))
 
 
-def test_the_command_prints_comments(capsys):
+def test_the_command_prints_comments(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["config"]) == 0
     printed = capsys.readouterr().out
     assert "  # Minimum translation between two matched scans [m]; a larger rotation alone is enough, too." in printed

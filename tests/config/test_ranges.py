@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -42,23 +44,23 @@ from hsloc.model.occupancy_grid import OccupancyGrid
         ({"mapper": "hector"}, "config.mapper is 'hector'; it must be one of graph, point"),
     ],
 )
-def test_a_number_out_of_all_range_is_refused(values, expected):
+def test_a_number_out_of_all_range_is_refused(values: dict[str, Any], expected: str) -> None:
     with pytest.raises(ConfigError) as told:
         from_dict(Config, values)
     assert expected in str(told.value)
 
 
-def test_the_defaults_are_within_the_ranges():
+def test_the_defaults_are_within_the_ranges() -> None:
     assert from_dict(Config, to_dict(Config())) == Config()
 
 
-def test_a_field_that_fits_no_memory_is_refused():
+def test_a_field_that_fits_no_memory_is_refused() -> None:
     grid = OccupancyGrid(np.full((3, 3), 100, dtype=np.int8), 0.05)
     with pytest.raises(MapError, match=r"choose a smaller likelihood_field\.margin or a coarser map"):
         LikelihoodField.from_grid(grid, margin=1e9)
 
 
-def test_points_beyond_all_range_score_nothing():
+def test_points_beyond_all_range_score_nothing() -> None:
     field = LikelihoodField.from_grid(OccupancyGrid(np.full((3, 3), 100, dtype=np.int8), 0.05))
     points = np.array(((1e38, 0.0), (3e38, 3e38)))
     from hsloc.model import Pose2

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from paths import RECORDINGS
 
 from hsloc.cli.arguments import request as run_request
 from hsloc.cli.main import build_parser, main
@@ -24,8 +25,6 @@ from hsloc.request import RunRequest
 
 if TYPE_CHECKING:
     from hsloc.options import Option
-
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 
 
 def paste(folder: Path, out: str) -> None:

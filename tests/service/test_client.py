@@ -11,8 +11,11 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from paths import RECORDINGS
 
+from hsloc.cli.main import main
 from hsloc.client import Client, ClientError
+from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -132,3 +135,23 @@ def test_the_command_sends_what_replay_takes(make_live: Callable[..., Live], log
     assert refused.returncode == 1
     assert "drew no map" in refused.stderr
     assert refused.stderr.count("\n") == 1
+
+
+def test_a_job_whose_result_does_not_keep_a_limit_is_below_threshold(
+    make_live: Callable[..., Live], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A limit, --duration and --set travel to the job; the answer is an outcome of the job and exit code 4."""
+    live = make_live(HSLOC_WORKER_COMMAND=",".join(Settings().worker_command), HSLOC_JOB_MEMORY_BYTES="4G")
+    argv = ["submit", str(RECORDINGS / "slip.mcap"), "--url", live.url, "--wait", "-q", "--duration", "4"]
+    assert main([*argv, "--set", "matcher.budget=150", "--max-ape", "0.0001", "--min-localised", "0.9"]) == 4
+    printed = capsys.readouterr()
+    assert [line[:40] for line in printed.err.splitlines()] == ["hsloc: limit not kept: --max-ape 0.0001:"]
+    job = Client(live.url).request("GET", f"/v1/jobs/{printed.out.strip()}").json()
+    assert (job["state"], job["outcome"]) == ("succeeded", "below_threshold")
+    assert job["summary"]["limits"][0].startswith("--max-ape 0.0001: the RMSE of the position is ")
+    assert job["request"]["read"]["end_s"] == 4.0
+    assert job["request"]["config"] == {"hide": {"budget": 150}}
+    assert main([*argv, "--max-ape", "1", "--matcher", "hs"]) == 0
+    job = Client(live.url).request("GET", f"/v1/jobs/{capsys.readouterr().out.strip()}").json()
+    assert job["outcome"] == "ok"
+    assert job["summary"]["metrics"]["run"]["matcher"] == "harmony_search"

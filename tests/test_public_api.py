@@ -66,7 +66,7 @@ def test_a_result_is_a_line_and_its_poses_are_arrays(mine: hsloc.Result) -> None
     long = hsloc.RunRequest(logs=tuple(Path("x" * 200) / f"{k}{'y' * 90}" for k in range(9)))
     from dataclasses import replace
 
-    assert len(repr(replace(mine, spec=long))) <= 300
+    assert len(repr(replace(mine, request=long))) <= 300
     frame = mine.trajectory.to_frame()
     assert list(frame.columns) == ["stamp_ns", "x", "y", "theta"]
     np.testing.assert_array_equal(frame[["x", "y", "theta"]].to_numpy(), mine.trajectory.poses)
@@ -128,5 +128,5 @@ def test_wrong_input_is_an_error_of_one_line(logs: Any, options: dict[str, Any],
 def test_a_request_takes_texts_for_paths() -> None:
     request = hsloc.RunRequest(logs="run.mcap", map_path="map.yaml")  # type: ignore[arg-type]
     assert (request.logs, request.map_path) == ((Path("run.mcap"),), Path("map.yaml"))
-    with pytest.raises(hsloc.ConfigError, match="a RunRequest says it all"):
+    with pytest.raises(hsloc.ConfigError, match="seed: options beside a RunRequest; put them into it"):
         hsloc.run(request, seed=3)

@@ -109,7 +109,7 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
     write_json(folder / "metrics.json", analysis.metrics.to_json())
     (folder / "config.yaml").write_text(config_text(result), encoding="utf-8")
     shown = {
-        "title": " ".join(result.spec.names()),
+        "title": " ".join(result.request.names()),
         "trajectory": result.trajectory,
         "localised": result.localised,
         "odometry": analysis.odometry,

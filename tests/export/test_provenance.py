@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from paths import RECORDINGS
 
-from hsloc.cli.arguments import request as run_request
+from hsloc.cli.arguments import run_request
 from hsloc.cli.main import build_parser, main
 from hsloc.evaluation import write_tum
 from hsloc.export.provenance import command

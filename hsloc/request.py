@@ -155,9 +155,15 @@ class RunRequest:
         found |= {name: getattr(self.config, name) for name in ("matcher", "mapper")}
         base = replace(base, matcher=self.config.matcher, mapper=self.config.mapper)
         found["set"] = differences(self.config, base)
-        if self.reference is not None and self.bare_names and Path(self.reference).exists():
-            found["reference"] = Path(self.reference).name
+        found["reference"] = self.reference_name
         return found
+
+    @property
+    def reference_name(self) -> str | None:
+        """What the reference is called in reports."""
+        if self.reference is not None and self.bare_names and Path(self.reference).exists():
+            return Path(self.reference).name
+        return self.reference
 
     @property
     def matcher(self) -> Matcher:

@@ -63,7 +63,7 @@ def log_metrics(result: Result) -> LogMetrics:
         LaserSummary(summary.scan_topic or "", summary.laser_frame or "", summary.T_base_laser, summary.laser_flipped,
                      summary.extrinsics),
     )  # fmt: skip
-    reference = summary.truth_topic if result.request.reference is None else result.request.reference
+    reference = result.request.reference_name or summary.truth_topic
     return LogMetrics(
         duration_s=duration(result),
         odometry_messages=len(result.odometry),

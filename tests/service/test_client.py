@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -155,3 +156,19 @@ def test_a_job_whose_result_does_not_keep_a_limit_is_below_threshold(
     job = Client(live.url).request("GET", f"/v1/jobs/{capsys.readouterr().out.strip()}").json()
     assert job["outcome"] == "ok"
     assert job["summary"]["metrics"]["run"]["matcher"] == "harmony_search"
+
+
+def test_a_reference_is_uploaded_and_named_without_the_servers_folders(
+    make_live: Callable[..., Live], tmp_path: Path
+) -> None:
+    live = make_live(HSLOC_WORKER_COMMAND=",".join(Settings().worker_command), HSLOC_JOB_MEMORY_BYTES="4G")
+    assert main(["replay", str(RECORDINGS / "slip.mcap"), "-q", "--end", "4", "--out", str(tmp_path / "here")]) == 0
+    argv = ["submit", str(RECORDINGS / "slip.mcap"), "--url", live.url, "-q", "--end", "4"]
+    argv += ["--reference", str(tmp_path / "here" / "reference.tum"), "--out", str(tmp_path / "there")]
+    assert main(argv) == 0
+    found, expected = (json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("there", "here"))
+    assert found["log"]["reference"] == "reference.tum"
+    assert found["ape"]["trans_part"]["rmse"] == pytest.approx(expected["ape"]["trans_part"]["rmse"], abs=1e-6)
+    for name in ("config.yaml", "report.html", "metrics.json"):
+        assert str(live.data) not in (tmp_path / "there" / name).read_text()
+    assert "--reference=reference.tum" in (tmp_path / "there" / "config.yaml").read_text()

@@ -13,7 +13,7 @@ from hsloc_service.db.tables import ENDED, FileRow, IdempotencyRow, JobRow
 from hsloc_service.errors import StoreError
 from hsloc_service.jobs.repository import base_job, delete_job
 from hsloc_service.logs import log
-from hsloc_service.results.deletion_queue import Removals
+from hsloc_service.results.deletion_queue import DeletionQueue
 from hsloc_service.uploads.repository import needed
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class Housekeeping:
 
     def __init__(self, database: Database, storage: Storage, settings: Settings, stores: ResultStores) -> None:
         self._database, self._storage, self._settings, self._stores = database, storage, settings, stores
-        self._removals = Removals(database, stores, settings.store_timeout_s)
+        self._removals = DeletionQueue(database, stores, settings.store_timeout_s)
         self._swept = -math.inf
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="housekeeping", daemon=True)

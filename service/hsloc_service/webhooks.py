@@ -11,11 +11,13 @@ import hashlib
 import hmac
 import http.client
 import ipaddress
+import json
 import secrets
 import socket
 import ssl
 import threading
 import time
+import uuid
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
@@ -23,11 +25,13 @@ from sqlalchemy import select
 
 from hsloc_service.db.tables import DeliveryRow, SecretRow
 from hsloc_service.logs import log
+from hsloc_service.storage import safe_name
 
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
 
     from hsloc_service.db.database import Database
+    from hsloc_service.db.tables import JobRow
     from hsloc_service.settings import Settings
 
 TIMEOUT_S = 5.0
@@ -43,6 +47,29 @@ _EMBEDDING = [ipaddress.IPv6Network(text) for text in ("64:ff9b::/96", "::/96")]
 
 class ForbiddenAddress(OSError):
     """The name leads to a private address."""
+
+
+def queue_webhook(session: Session, job: JobRow, event: str) -> None:
+    """Put an event of a job into the outbox, in the transaction that caused it; nothing if the job has no webhook.
+
+    A further event is one more call of this, with a name of its own. The body is the job's state at this moment.
+    """
+    if job.webhook is None:
+        return
+    ident, now = str(uuid.uuid4()), time.time()
+    body = {
+        "event": event,
+        "event_id": ident,
+        "job": job.id,
+        "state": job.state,
+        "reason": job.reason,
+        "message": job.message,
+        "log": safe_name(job.log_name, "log"),
+        "ended": job.ended,
+    }
+    row = DeliveryRow(id=ident, tenant=job.tenant, job_id=job.id, url=job.webhook, created=now, next_at=now, attempts=0)
+    row.body, row.state = json.dumps(body, separators=(",", ":")), "pending"
+    session.add(row)
 
 
 def secret_of(session: Session, tenant: str) -> str:

@@ -195,8 +195,8 @@ def test_many_readers_wait_for_their_turn() -> None:
         return k
 
     async def all_at_once() -> list[int]:
-        desk = BoundedExecutor(timeout_s=5.0, most=3)
-        return list(await asyncio.gather(*(desk.ask(functools.partial(read, k)) for k in range(30))))
+        executor = BoundedExecutor(timeout_s=5.0, max_calls=3)
+        return list(await asyncio.gather(*(executor.run(functools.partial(read, k)) for k in range(30))))
 
     assert asyncio.run(all_at_once()) == list(range(30))
     assert most == 3

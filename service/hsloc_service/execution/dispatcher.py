@@ -1,8 +1,8 @@
-"""Who wakes the workers. The truth is the job's row with its lease; a dispatcher only says when to look.
+"""Who starts the jobs. The job's row with its lease decides; a dispatcher only chooses when it is read.
 
 `LocalDispatcher` runs the jobs of this machine in N slots. A dispatcher over PostgreSQL and Procrastinate would satisfy
 the same protocol: `enqueue` defers a task that carries nothing but the job's id, in the transaction that inserts the
-row; its workers call the same `Attempt`; a task delivered twice finds the row taken and ends.
+row; its workers call the same `Supervisor`; a task delivered twice finds the row taken and ends.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from sqlalchemy.exc import OperationalError
 
 from hsloc_service.db.tables import FileRow
 from hsloc_service.execution.processes import kill_marked
-from hsloc_service.execution.supervisor import Attempt
+from hsloc_service.execution.supervisor import Supervisor
 from hsloc_service.logs import log
-from hsloc_service.results.deletion_queue import Removals
+from hsloc_service.results.deletion_queue import DeletionQueue
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,22 +38,22 @@ IDLE_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Capacity:
-    """Slots, and how many of them work."""
+    """Slots, and how many of them run a job."""
 
     slots: int
     busy: int
 
 
 class Dispatcher(Protocol):
-    """Law: after `enqueue` the job is looked at soon; after `cancel` a running job ends within its grace, or at the
-    next heartbeat where it runs elsewhere."""
+    """After `enqueue` a free slot claims the job within a second; after `cancel` a running job ends within its grace
+    time, or at the next heartbeat where it runs elsewhere."""
 
     def enqueue(self, job_id: str) -> None:
         """A job was queued and committed."""
         ...
 
     def cancel(self, job_id: str) -> None:
-        """The job's row says that it is to end."""
+        """A job was cancelled, and its row says so."""
         ...
 
     def capacity(self) -> Capacity:
@@ -70,8 +70,8 @@ class Dispatcher(Protocol):
 
 
 class LocalDispatcher:
-    """N slots on this machine, a thread each; a thread lives as long as its job, because the kernel's death signal
-    for the job's process is bound to the thread that started it."""
+    """N slots on this machine, a thread each. The kernel's death signal for a job's process is bound to the thread that
+    started it, so a thread lives at least as long as its job."""
 
     def __init__(
         self,
@@ -83,7 +83,8 @@ class LocalDispatcher:
         store_failed: Callable[[], None] = lambda: None,
     ) -> None:
         self._leases, self._storage, self._settings, self._stores = leases, storage, settings, stores
-        self._ended, self._store_failed = ended, store_failed
+        self._supervisor = Supervisor(leases, storage, settings, stores, store_failed)
+        self._ended = ended
         self._owner = uuid.uuid4().hex
         self._stop = threading.Event()
         self._work = threading.Condition()
@@ -96,13 +97,13 @@ class LocalDispatcher:
         return self._owner
 
     def start(self) -> None:
-        """Clean up after a server that died, then start the slots."""
+        """Clean up after a server that was killed, then start the slots."""
         if killed := kill_marked(f"{self._storage.instance}:"):
             log("orphans.killed", count=killed)
         for job_id in self._leases.recover(self._owner):
             log("job.requeued", job=job_id)
         sweep(self._leases.database, self._storage)
-        Removals(self._leases.database, self._stores, self._settings.store_timeout_s).sweep(self._stores.folder)
+        DeletionQueue(self._leases.database, self._stores, self._settings.store_timeout_s).sweep(self._stores.folder)
         for k in range(self._settings.slots):
             thread = threading.Thread(target=self._slot, name=f"slot-{k}", daemon=True)
             thread.start()
@@ -123,7 +124,7 @@ class LocalDispatcher:
             self._work.notify()
 
     def cancel(self, job_id: str) -> None:
-        """Tell the slot that runs the job, if it runs here."""
+        """Wake the slot that runs the job, if it runs here."""
         event = self._running.get(job_id)
         if event is not None:
             event.set()
@@ -135,11 +136,11 @@ class LocalDispatcher:
     def _slot(self) -> None:
         while not self._stop.is_set():
             try:
-                if not self._one():
+                if not self._run_next():
                     with self._work:
                         self._work.wait(IDLE_S)
             except OperationalError as error:
-                # A full disk or a locked database passes; the slot must not.
+                # A full disk or a locked database passes; the slot must survive it.
                 log("slot.database", error=str(error.orig))
                 self._storage.drop_ballast()
                 self._stop.wait(IDLE_S)
@@ -147,8 +148,8 @@ class LocalDispatcher:
                 log("slot.error", error=f"{type(error).__name__}: {error}")
                 self._stop.wait(IDLE_S)
 
-    def _one(self) -> bool:
-        """Run the next job; False if there is none, or none may start: without room each would end as `disk_full`."""
+    def _run_next(self) -> bool:
+        """Run the next job; False if there is none, or the disk is so full that it would end as `disk_full`."""
         if self._storage.free_bytes() < self._storage.min_free_bytes:
             return False
         claim = self._leases.claim(self._owner)
@@ -158,20 +159,10 @@ class LocalDispatcher:
         cancel = threading.Event()
         self._running[claim.job_id] = cancel
         try:
-            attempt = Attempt(
-                claim,
-                self._leases,
-                self._storage,
-                self._settings,
-                self._stores,
-                stop=self._stop,
-                cancel=cancel,
-                store_failed=self._store_failed,
-            )
-            self._ended(state := attempt.run())
+            self._ended(state := self._supervisor.run(claim, stop=self._stop, cancel=cancel))
         finally:
             self._running.pop(claim.job_id, None)
-        return state != "queued"  # what could not be started now will not a millisecond later: it has a breath
+        return state != "queued"  # a job that could not be started is not tried again before IDLE_S
 
 
 def sweep(database: Database, storage: Storage) -> None:

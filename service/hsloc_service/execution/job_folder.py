@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 def prepare(folder: Path, claim: Claim, storage: Storage, settings: Settings) -> None:
     """`job.json`, the input under its own names (read-only), and an empty folder for temporary files.
 
-    The logs are in `input`, `input-2`, …: two parts of a run may have one name. A saved map is to be put beside
-    `job.json` as `map.npz`.
+    The logs are in `input`, `input-2`, and so on, because two parts of a run may have the same name. The saved map of a
+    job that is extended belongs beside `job.json`: see `download`.
     """
     shutil.rmtree(folder, ignore_errors=True)
     for name in ("map", "tmp"):
@@ -52,7 +52,7 @@ def prepare(folder: Path, claim: Claim, storage: Storage, settings: Settings) ->
     }
     if request.get("map") is not None:
         job["map"] = link("map", request["map"]["yaml"], "map.yaml")
-        # Any name but those that the YAML may ask for; the worker links the one it does ask for.
+        # A name that no YAML can ask for; the worker links the name that this YAML does ask for.
         (folder / "map" / ".image").symlink_to(storage.upload_path(request["map"]["image"]).absolute())
         job["map_image"] = ".image"
     if request.get("relations") is not None:
@@ -62,7 +62,7 @@ def prepare(folder: Path, claim: Claim, storage: Storage, settings: Settings) ->
     (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
 
 
-def fetch(store: ResultStore, source: Source, folder: Path) -> None:
+def download(store: ResultStore, source: Source, folder: Path) -> None:
     """Copy the saved map of an earlier job into the folder. Raises OSError if it is not what its manifest says."""
     digest = hashlib.sha256()
     with (folder / MAP_STATE).open("wb") as file:

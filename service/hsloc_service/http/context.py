@@ -14,11 +14,11 @@ from hsloc_service.call_timeout import BoundedExecutor
 from hsloc_service.execution.dispatcher import Dispatcher
 from hsloc_service.http.schemas import Problem
 from hsloc_service.jobs.repository import Jobs
-from hsloc_service.results.deletion_queue import Removals
+from hsloc_service.results.deletion_queue import DeletionQueue
 from hsloc_service.results.stores import ResultStores
 from hsloc_service.settings import Settings
 from hsloc_service.uploads.repository import Files
-from hsloc_service.uploads.upload_stream import Receiver
+from hsloc_service.uploads.upload_stream import UploadReceiver
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,11 +36,11 @@ class Context:
     storage: Storage
     files: Files
     jobs: Jobs
-    receiver: Receiver
+    receiver: UploadReceiver
     dispatcher: Dispatcher
     stores: ResultStores
-    removals: Removals
-    desk: BoundedExecutor
+    deletions: DeletionQueue
+    store_calls: BoundedExecutor
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server begins to shut down: event streams end."""
     streams: Counter[str] = field(default_factory=Counter)

@@ -180,7 +180,7 @@ def _blocks(store: ResultStore, folder: str, name: str, span: range) -> Iterator
 
 async def _paced(ctx: Context, blocks: Iterator[bytes]) -> AsyncIterator[bytes]:
     """The blocks, each waited for outside the event loop and not for ever."""
-    while (block := await ctx.desk.ask(lambda: next(blocks, None))) is not None:
+    while (block := await ctx.store_calls.run(lambda: next(blocks, None))) is not None:
         yield block
 
 

@@ -15,9 +15,9 @@ from hsloc_service.db.tables import ACTIVE, AssetRow, DeliveryRow, EventRow, Fil
 from hsloc_service.errors import ServiceError, busy, conflict, not_found
 from hsloc_service.jobs.events import record
 from hsloc_service.results.deletion_queue import removal_of
-from hsloc_service.storage import safe_name
 from hsloc_service.stored_request import MAP_STATE, logs_of
 from hsloc_service.uploads.repository import need_quota
+from hsloc_service.webhooks import queue_webhook
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -124,7 +124,7 @@ class Jobs:
             return job
 
     def delete(self, who: Principal, job_id: str) -> None:
-        """Remove a job that has ended; its results are noted down for `Removals`.
+        """Remove a job that has ended; its results are noted down for `DeletionQueue`.
 
         Raises ServiceError 409 while it is active, or while an active job extends its map.
         """
@@ -180,31 +180,7 @@ def finish_job(session: Session, job: JobRow, state: str, reason: str | None, me
     job.ended = time.time()
     job.owner = job.lease_until = None
     record(session, job, "state", {"state": state, "reason": reason, "message": message})
-    if job.webhook is not None:
-        ident = str(uuid.uuid4())
-        body = {
-            "event": "job.ended",
-            "event_id": ident,
-            "job": job.id,
-            "state": state,
-            "reason": reason,
-            "message": message,
-            "log": safe_name(job.log_name, "log"),
-            "ended": job.ended,
-        }
-        session.add(
-            DeliveryRow(
-                id=ident,
-                tenant=job.tenant,
-                job_id=job.id,
-                url=job.webhook,
-                body=json.dumps(body, separators=(",", ":")),
-                state="pending",
-                attempts=0,
-                next_at=job.ended,
-                created=job.ended,
-            )
-        )
+    queue_webhook(session, job, "job.ended")
 
 
 def delete_job(session: Session, job: JobRow) -> None:

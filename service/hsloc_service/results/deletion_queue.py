@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import or_, select
 
-from hsloc_service.call_timeout import wait
+from hsloc_service.call_timeout import call_within
 from hsloc_service.db.tables import JobRow, RemovalRow
 from hsloc_service.errors import StoreError
 from hsloc_service.logs import log
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Removals:
-    """Works off what `erase` noted down in the transaction that removed the job."""
+class DeletionQueue:
+    """Removes the results that `delete_job` queued in the transaction that deleted the job."""
 
     database: Database
     stores: ResultStores
@@ -70,13 +70,13 @@ class Removals:
         return len(doomed)
 
     def _names(self, store: ResultStore) -> list[str]:
-        return store.names() if store.url is None else wait(store.names, self.timeout_s)
+        return store.names() if store.url is None else call_within(self.timeout_s, store.names)
 
     def _remove(self, store: ResultStore, name: str) -> None:
         if store.url is None:
             store.remove(name)
         else:
-            wait(lambda: store.remove(name), self.timeout_s)
+            call_within(self.timeout_s, lambda: store.remove(name))
 
     def _rows(self) -> list[RemovalRow]:
         with self.database.read() as session:

@@ -31,7 +31,7 @@ SAFE_EVERY = 32 << 20
 _MAX_HASHES = 1024
 
 
-class Receiver:
+class UploadReceiver:
     """Takes the bodies of uploads. Lives on the event loop; files and database are touched in threads."""
 
     def __init__(self, files: Files, settings: Settings) -> None:
@@ -69,16 +69,16 @@ class Receiver:
         if offset != row.received:
             raise ServiceError(409, "offset", f"the offset is {row.received}, not {offset}")
         limit = self._settings.max_upload_bytes if row.size is None else row.size
-        taking = _Taking(self._files, who, row, limit, self._hash(file_id, offset), checksum)
+        append = _Append(self._files, who, row, limit, self._hash(file_id, offset), checksum)
         try:
-            await taking.run(body, drop=random.random() < self._settings.fault_drop_uploads)
+            await append.run(body, drop=random.random() < self._settings.fault_drop_uploads)
         except ClientDisconnect:
-            if taking.safe != row.size:
+            if append.safe != row.size:
                 raise
         finally:
-            self._hashes[file_id] = (taking.digest, taking.safe)
-        row.received = taking.safe
-        if taking.safe == row.size:
+            self._hashes[file_id] = (append.digest, append.safe)
+        row.received = append.safe
+        if append.safe == row.size:
             return await self.finish(file_id)
         return row
 
@@ -117,7 +117,7 @@ class Receiver:
         return digest if counted == offset else None
 
 
-class _Taking:
+class _Append:
     """One body being appended. `safe` is the offset that is on the disk and in the database.
 
     The offset of the last byte comes into the database by `Files.complete` alone: an upload that says that it has all

@@ -23,6 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--slots", type=int, metavar="N", help="jobs at the same time (default: 1)")
     parser.add_argument("--allowed-host", action="append", metavar="NAME", help="answer to this name, too; * for any")
     parser.add_argument("--retention-days", type=float, metavar="D", help="remove jobs that ended so long ago")
+    parser.add_argument(
+        "--backup", type=Path, metavar="DIR", help="copy the data folder to DIR, also while a server runs, and end"
+    )
     group = parser.add_argument_group("tokens")
     group.add_argument("--first-token", action="store_true", help="make a token on the first start and print it")
     group.add_argument("--open-to-all", action="store_true", help="listen beyond loopback without any token")
@@ -50,6 +53,8 @@ def run(arguments: argparse.Namespace) -> int:
             from dataclasses import replace
 
             chosen = replace(chosen, allowed_hosts=(*chosen.allowed_hosts, *arguments.allowed_host))
+        if arguments.backup is not None:
+            return int(service.back_up_folder(chosen, arguments.backup))
         if arguments.new_token is not None:
             return int(service.new_token(chosen, arguments.new_token, arguments.scopes, arguments.expires_days))
         if arguments.list_tokens:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 import time
@@ -13,12 +14,12 @@ from hsloc_service.db.tables import ENDED, FileRow, IdempotencyRow, JobRow
 from hsloc_service.errors import StoreError
 from hsloc_service.jobs.repository import base_job, delete_job
 from hsloc_service.logs import log
-from hsloc_service.results.deletion_queue import DeletionQueue
+from hsloc_service.results.deletion_queue import delete_upload
 from hsloc_service.uploads.repository import needed
 
 if TYPE_CHECKING:
     from hsloc_service.db.database import Database
-    from hsloc_service.results.stores import ResultStores
+    from hsloc_service.results.deletion_queue import DeletionQueue
     from hsloc_service.settings import Settings
     from hsloc_service.storage import Storage
 
@@ -31,9 +32,8 @@ KEY_S = 7 * 86400.0
 class Housekeeping:
     """A thread that tidies up."""
 
-    def __init__(self, database: Database, storage: Storage, settings: Settings, stores: ResultStores) -> None:
-        self._database, self._storage, self._settings, self._stores = database, storage, settings, stores
-        self._removals = DeletionQueue(database, stores, settings.store_timeout_s)
+    def __init__(self, database: Database, storage: Storage, settings: Settings, deletions: DeletionQueue) -> None:
+        self._database, self._storage, self._settings, self._deletions = database, storage, settings, deletions
         self._swept = -math.inf
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="housekeeping", daemon=True)
@@ -59,39 +59,41 @@ class Housekeeping:
     def tidy(self, now: float) -> None:
         """One round."""
         self._storage.restore_ballast()
-        paths = self._expired_uploads(now)
+        self._expire_uploads(now)
         if self._settings.retention_s is not None:
-            paths += self._old(now - self._settings.retention_s)
+            self._delete_old(now - self._settings.retention_s)
         with self._database.write() as session:
             session.execute(delete(IdempotencyRow).where(IdempotencyRow.created < now - KEY_S))
-        for file_id in paths:
-            self._storage.upload_path(file_id).unlink(missing_ok=True)
-        results = self._removals.clear()
-        if paths or results:
-            log("tidy", uploads=len(paths), results=results)
+        uploads, results = self._deletions.clear_uploads(), self._deletions.clear()
+        if uploads or results:
+            log("tidy", uploads=uploads, results=results)
         self._sweep(now)
 
     def _sweep(self, now: float) -> None:
-        """Leftovers in the object store: at the first round and then now and then. (The folder's go at start-up.)"""
-        store = self._stores.current
+        """Remove abandoned results from the object store: in the first round and then every SWEEP_S.
+
+        Those of the data folder are removed at the start, by `reconcile`.
+        """
+        store = self._deletions.stores.current
         if store.url is None or now - self._swept < SWEEP_S:
             return
         try:
-            self._removals.sweep(store)
+            unknown = self._deletions.sweep(store)
         except StoreError as error:
             log("store.error", what="sweep", error=str(error))
         else:
             self._swept = now
+            if unknown:
+                log("result.unknown", logging.WARNING, store=store.url, count=len(unknown), first=unknown[0])
 
-    def _expired_uploads(self, now: float) -> list[str]:
+    def _expire_uploads(self, now: float) -> None:
         with self._database.write() as session:
             rows = session.scalars(select(FileRow).where(FileRow.state == "receiving", FileRow.expires < now)).all()
             for row in rows:
-                session.delete(row)
-            return [row.id for row in rows]
+                delete_upload(session, row)
 
-    def _old(self, before: float) -> list[str]:
-        """Erase jobs that ended before and uploads of that age, but none that an active job needs; the uploads' ids."""
+    def _delete_old(self, before: float) -> None:
+        """Delete jobs that ended before `before` and uploads of that age, but none that an active job needs."""
         with self._database.write() as session:
             jobs = session.scalars(select(JobRow).where(JobRow.state.in_(ENDED), JobRow.ended < before)).all()
             for job in jobs:
@@ -100,5 +102,4 @@ class Housekeeping:
             query = select(FileRow).where(FileRow.state == "complete", FileRow.created < before)
             files = [row for row in session.scalars(query) if not needed(session, row.id)]
             for row in files:
-                session.delete(row)
-            return [row.id for row in files]
+                delete_upload(session, row)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import uvicorn
 
 from hsloc_service.auth import SCOPES, Tokens
+from hsloc_service.backup import back_up
 from hsloc_service.db.database import Database
 from hsloc_service.http.app import create_app
 from hsloc_service.http.timeouts import protocol_class
@@ -23,6 +24,7 @@ from hsloc_service.storage import Storage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from fastapi import FastAPI
 
@@ -108,6 +110,15 @@ def with_tokens(settings: Settings, host: str, open_to_all: bool, first_token: b
         )
     hosts = settings.allowed_hosts if host in settings.allowed_hosts else (*settings.allowed_hosts, host)
     return dataclasses.replace(settings, require_token=required, allowed_hosts=hosts)
+
+
+def back_up_folder(settings: Settings, target: Path) -> int:
+    """Make a backup and show what it holds; works while the service runs. Raises SettingsError."""
+    report = back_up(settings.data, target)
+    lost = f"; {report.deleted} were deleted meanwhile" if report.deleted else ""
+    counts = f"{report.uploads} uploads, {report.jobs} jobs, {report.results} results, {report.bytes} bytes"
+    sys.stdout.write(f"{target}: {counts}{lost}\n")
+    return 0
 
 
 def new_token(settings: Settings, tenant: str, scopes: str = ",".join(SCOPES), days: float | None = None) -> int:

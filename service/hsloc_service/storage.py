@@ -17,7 +17,7 @@ from hsloc_service.errors import no_space
 from hsloc_service.settings import SettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
 
 BALLAST = "ballast"
@@ -32,7 +32,7 @@ class Storage:
         self.root = root
         self.min_free_bytes = min_free_bytes
         self.uploads, self.work, self.results = root / "uploads", root / "work", root / "results"
-        self.cache = root / "cache"
+        self.cache, self.quarantine = root / "cache", root / "quarantine"
         try:
             for folder in (self.uploads, self.work, self.results, self.cache):
                 folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -106,12 +106,6 @@ class Storage:
     def remove_work(self, path: Path) -> None:
         """Remove the folder of an attempt."""
         shutil.rmtree(path, ignore_errors=True)
-
-    def leftovers(self) -> Iterator[tuple[str, Path]]:
-        """Every upload and attempt on the disk, with its kind."""
-        for kind, folder in (("upload", self.uploads), ("work", self.work)):
-            for path in folder.iterdir():
-                yield kind, path
 
 
 def hash_file(path: Path, sync: bool = False) -> tuple[int, str]:

@@ -273,7 +273,7 @@ def test_what_a_broken_attempt_left_behind_is_swept(client: TestClient) -> None:
     wait(client, job)
     Faulty.fault = ""
     context = client.app.state.context  # type: ignore[attr-defined]
-    assert context.removals.sweep(context.stores.current) == 1
+    assert context.deletions.sweep(context.stores.current) == []
     assert stored(job) == []
 
 
@@ -285,13 +285,13 @@ def test_deleting_does_not_wait_for_the_store_and_is_not_forgotten(client: TestC
     assert client.delete(f"/v1/jobs/{job}").status_code == 204
     assert time.monotonic() - begin < 2.0
     assert client.get(f"/v1/jobs/{job}/results/metrics.json").status_code == 404
-    removals = client.app.state.context.removals  # type: ignore[attr-defined]
-    assert removals.clear() == 0
+    deletions = client.app.state.context.deletions  # type: ignore[attr-defined]
+    assert deletions.clear() == 0
     assert len(stored(job)) == 2
     Faulty.fault = ""
-    assert removals.clear() == 1
+    assert deletions.clear() == 1
     assert stored(job) == []
-    assert removals.clear() == 0
+    assert deletions.clear() == 0
     Faulty.release.set()
 
 
@@ -318,11 +318,11 @@ def test_a_disk_that_is_not_mounted_is_away_and_nothing_is_gone(
     waiting = submit(client, seed=3)
     wait_for_store(client, waiting)
     assert client.delete(f"/v1/jobs/{doomed}").status_code == 204
-    removals = client.app.state.context.removals  # type: ignore[attr-defined]
-    assert removals.clear() == 0
+    deletions = client.app.state.context.deletions  # type: ignore[attr-defined]
+    assert deletions.clear() == 0
     assert not mounted.exists()  # made anew, it would be on another disk, and hidden when the right one is there again
     aside.rename(mounted)
     assert wait(client, waiting)["state"] == "succeeded"
     assert client.get(f"/v1/jobs/{first}/results/metrics.json").status_code == 200
-    assert removals.clear() == 1
+    assert deletions.clear() == 1
     assert sorted(path.name for path in next(mounted.iterdir()).iterdir()) == sorted([f"{first}.1", f"{waiting}.1"])

@@ -25,7 +25,7 @@ def test_old_jobs_go_with_results_and_uploads_but_active_ones_stay(make_client: 
     wait(client, old)
     active = submit(client, b"slow 30")
     context = client.app.state.context  # type: ignore[attr-defined]
-    tidy = Housekeeping(context.database, context.storage, context.settings, context.stores).tidy
+    tidy = Housekeeping(context.database, context.storage, context.settings, context.deletions).tidy
     tidy(time.time() + 50.0)
     assert client.get(f"/v1/jobs/{old}").status_code == 200
     tidy(time.time() + 150.0)
@@ -42,7 +42,7 @@ def test_without_retention_nothing_goes(make_client: Callable[..., TestClient]) 
     job = submit(client)
     wait(client, job)
     context = client.app.state.context  # type: ignore[attr-defined]
-    Housekeeping(context.database, context.storage, context.settings, context.stores).tidy(time.time() + 1e9)
+    Housekeeping(context.database, context.storage, context.settings, context.deletions).tidy(time.time() + 1e9)
     assert client.get(f"/v1/jobs/{job}/results").status_code == 200
 
 

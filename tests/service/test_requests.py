@@ -208,7 +208,7 @@ def test_what_an_active_job_reads_stays(make_client: Callable[..., TestClient]) 
         assert client.delete(f"/v1/files/{file}").json()["code"] == "in_use"
     assert client.delete(f"/v1/jobs/{drawn}").json()["code"] == "in_use"
     context = client.app.state.context  # type: ignore[attr-defined]
-    Housekeeping(context.database, context.storage, context.settings, context.stores).tidy(time.time() + 150.0)
+    Housekeeping(context.database, context.storage, context.settings, context.deletions).tidy(time.time() + 150.0)
     assert client.get(f"/v1/jobs/{drawn}/results/map.npz").content == b"a saved map"
     assert len(client.get("/v1/files").json()["files"]) == 3
     client.post(f"/v1/jobs/{job}/cancel")

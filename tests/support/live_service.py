@@ -28,7 +28,7 @@ SMALL: dict[str, Any] = {
 
 
 def settings(folder: Path, **changes: Any) -> Settings:
-    return Settings(data=folder / "data", **{**SMALL, **changes})
+    return Settings(**{"data": folder / "data", **SMALL, **changes})
 
 
 def upload(client: Any, content: bytes = b"ok", name: str = "run.mcap") -> str:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from sqlalchemy import JSON, Index, Text, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 """Stored in the database; what leads from one to the next is in `migrations`."""
 
 JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
@@ -122,6 +122,14 @@ class RemovalRow(Base):
     __tablename__ = "removal"
     folder: Mapped[str] = mapped_column(primary_key=True)
     store: Mapped[str | None]
+    created: Mapped[float]
+
+
+class UploadDeletionRow(Base):
+    """An upload that was deleted, and whose bytes are still to be removed from the disk."""
+
+    __tablename__ = "upload_deletion"
+    id: Mapped[str] = mapped_column(primary_key=True)
     created: Mapped[float]
 
 

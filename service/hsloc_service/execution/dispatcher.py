@@ -7,28 +7,23 @@ row; its workers call the same `Supervisor`; a task delivered twice finds the ro
 
 from __future__ import annotations
 
-import os
-import shutil
 import threading
 import uuid
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from sqlalchemy import select, update
 from sqlalchemy.exc import OperationalError
 
-from hsloc_service.db.tables import FileRow
 from hsloc_service.execution.processes import kill_marked
 from hsloc_service.execution.supervisor import Supervisor
 from hsloc_service.logs import log
-from hsloc_service.results.deletion_queue import DeletionQueue
+from hsloc_service.reconciliation import reconcile
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hsloc_service.db.database import Database
     from hsloc_service.jobs.leases import Leases
+    from hsloc_service.results.deletion_queue import DeletionQueue
     from hsloc_service.results.stores import ResultStores
     from hsloc_service.settings import Settings
     from hsloc_service.storage import Storage
@@ -79,10 +74,12 @@ class LocalDispatcher:
         storage: Storage,
         settings: Settings,
         stores: ResultStores,
+        deletions: DeletionQueue,
+        *,
         ended: Callable[[str], None] = lambda state: None,
         store_failed: Callable[[], None] = lambda: None,
     ) -> None:
-        self._leases, self._storage, self._settings, self._stores = leases, storage, settings, stores
+        self._leases, self._storage, self._settings, self._deletions = leases, storage, settings, deletions
         self._supervisor = Supervisor(leases, storage, settings, stores, store_failed)
         self._ended = ended
         self._owner = uuid.uuid4().hex
@@ -102,8 +99,7 @@ class LocalDispatcher:
             log("orphans.killed", count=killed)
         for job_id in self._leases.recover(self._owner):
             log("job.requeued", job=job_id)
-        sweep(self._leases.database, self._storage)
-        DeletionQueue(self._leases.database, self._stores, self._settings.store_timeout_s).sweep(self._stores.folder)
+        reconcile(self._leases.database, self._storage, self._deletions)
         for k in range(self._settings.slots):
             thread = threading.Thread(target=self._slot, name=f"slot-{k}", daemon=True)
             thread.start()
@@ -163,34 +159,3 @@ class LocalDispatcher:
         finally:
             self._running.pop(claim.job_id, None)
         return state != "queued"  # a job that could not be started is not tried again before IDLE_S
-
-
-def sweep(database: Database, storage: Storage) -> None:
-    """Remove what a killed server left: folders of attempts, bytes that no upload names.
-
-    Only at start-up, when nothing runs.
-    """
-    for file_id in reopen(database):
-        with suppress(OSError):
-            storage.upload_path(file_id).chmod(0o600)
-    with database.read() as session:
-        files = set(session.scalars(select(FileRow.id)))
-    for kind, path in storage.leftovers():
-        if kind == "work" or path.name not in files:
-            log("sweep", kind=kind, name=path.name)
-            with suppress(OSError):
-                shutil.rmtree(path) if path.is_dir() else os.unlink(path)
-
-
-def reopen(database: Database) -> list[str]:
-    """Ask for the last byte again of uploads that have all their bytes, but are not complete; their ids.
-
-    A server of an older hsloc that died at that moment left such; to a client they look finished, to a job they do not.
-    """
-    whole = (FileRow.state == "receiving", FileRow.size == FileRow.received, FileRow.received > 0)
-    with database.read() as session:
-        found = list(session.scalars(select(FileRow.id).where(*whole)))
-    if found:  # else nothing is written: a server must start on a full disk, too
-        with database.write() as session:
-            session.execute(update(FileRow).where(*whole).values(received=FileRow.received - 1))
-    return found

@@ -89,11 +89,13 @@ def open_context(settings: Settings) -> Context:
         storage.close()
         raise
     files = Files(database, storage, settings)
+    deletions = DeletionQueue(database, storage, stores, settings.store_timeout_s)
     dispatcher = LocalDispatcher(
         Leases(database, settings.lease_s, settings.max_attempts),
         storage,
         settings,
         stores,
+        deletions,
         ended=lambda state: metrics.ENDED.labels(state).inc(),
         store_failed=metrics.STORE_ERRORS.inc,
     )
@@ -106,7 +108,7 @@ def open_context(settings: Settings) -> Context:
         receiver=UploadReceiver(files, settings),
         dispatcher=dispatcher,
         stores=stores,
-        deletions=DeletionQueue(database, stores, settings.store_timeout_s),
+        deletions=deletions,
         store_calls=BoundedExecutor(settings.store_timeout_s),
     )
 
@@ -115,7 +117,7 @@ def open_context(settings: Settings) -> Context:
 async def running(context: Context) -> AsyncIterator[None]:
     """The lifespan: slots, webhooks and housekeeping run inside it; the data folder is closed behind it."""
     settings, database, storage = context.settings, context.database, context.storage
-    helpers = (WebhookSender(database, settings), Housekeeping(database, storage, settings, context.stores))
+    helpers = (WebhookSender(database, settings), Housekeeping(database, storage, settings, context.deletions))
     context.dispatcher.start()
     for helper in helpers:
         helper.start()

@@ -11,6 +11,7 @@ from sqlalchemy import case, func, select, tuple_
 
 from hsloc_service.db.tables import ACTIVE, FileRow, JobRow
 from hsloc_service.errors import ServiceError, conflict, no_space, not_found
+from hsloc_service.results.deletion_queue import delete_upload
 from hsloc_service.stored_request import files_of
 
 if TYPE_CHECKING:
@@ -127,7 +128,7 @@ class Files:
             row = _file(session, who, file_id)
             if needed(session, file_id):
                 raise conflict("in_use", "an active job needs this file; cancel it first")
-            session.delete(row)
+            delete_upload(session, row)
         self.storage.upload_path(file_id).unlink(missing_ok=True)
 
 

@@ -242,3 +242,19 @@ def test_an_unwritable_target_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"missing/map\.pgm: cannot be written"):
         save_map(grid, tmp_path / "missing" / "map")
     assert list(tmp_path.iterdir()) == []
+
+
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\nshowpage\n%%EOF\n"
+
+
+@pytest.mark.parametrize("kind", ["EPS", "GIF", "TIFF", "JPEG", "WEBP"])
+def test_an_image_of_another_format_is_refused_by_its_content(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "map.yaml").write_text(
+        "image: map.pgm\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    )
+    if kind == "EPS":
+        (tmp_path / "map.pgm").write_bytes(EPS)
+    else:
+        Image.new("L", (4, 4)).save(tmp_path / "map.pgm", format=kind)
+    with pytest.raises(MapError, match="no PGM, PNG or BMP image; convert it"):
+        load_map(tmp_path / "map.yaml")

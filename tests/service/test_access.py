@@ -299,3 +299,15 @@ def test_made_up_methods_are_one_series(client: TestClient) -> None:
     lines = client.get("/metrics").text.splitlines()
     assert not [line for line in lines if "MADE" in line]
     assert [line for line in lines if 'hsloc_requests_total{method="other"' in line]
+
+
+def test_a_token_made_while_an_open_server_runs_closes_it(
+    make_live: Callable[..., Live], capsys: pytest.CaptureFixture[str]
+) -> None:
+    live = make_live()
+    with live.client() as client:
+        assert client.get("/v1/jobs").status_code == 200
+        assert program(["serve", "--data", str(live.data), "--new-token", "one"]) == 0
+        token = capsys.readouterr().out.split(": ")[1].strip()
+        assert client.get("/v1/jobs").status_code == 401
+        assert client.get("/v1/jobs", headers={"Authorization": f"Bearer {token}"}).status_code == 200

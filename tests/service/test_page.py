@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from live_service import upload
+from live_service import submit, upload
 
 from hsloc_service.settings import Settings
 
@@ -292,4 +292,19 @@ def test_an_upload_goes_on_after_a_broken_line_and_after_a_reload(
     with live.client() as client:
         (file,) = client.get("/v1/files").json()["files"]
     assert file["sha256"] == hashlib.sha256(log.read_bytes()).hexdigest()
+    context.close()
+
+
+def test_a_page_goes_on_when_the_server_was_restarted(make_live: Callable[..., Live], browser: Any) -> None:
+    live = make_live()
+    with live.client() as client:
+        job = submit(client, b"slow 4")
+    context = browser.new_context()
+    page = context.new_page()  # refused connections are in the console, as they should be
+    page.goto(f"{live.url}/#job={job}")
+    page.wait_for_selector("#job-state .running")
+    assert live.end() == 0  # the stream ends in good order, and the job does not
+    page.wait_for_timeout(1000)
+    live.start()
+    page.wait_for_selector("#job-state .succeeded", timeout=30_000)
     context.close()

@@ -51,6 +51,8 @@ class Guard:
     def __init__(self, app: ASGIApp, settings: Settings, tokens: Tokens) -> None:
         self._app, self._settings, self._tokens = app, settings, tokens
         self._rates = Rates(settings.requests_per_s)
+        self._closed = settings.require_token
+        """Whether a token is required: by the settings, or because one was made meanwhile."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request pass, or answer it."""
@@ -131,9 +133,12 @@ class Guard:
         kind, _, token = headers.get("authorization", "").partition(" ")
         if kind.lower() == "bearer" and token:
             return await to_thread.run_sync(self._tokens.principal, token.strip())
-        if "authorization" in headers or self._settings.require_token:
+        if "authorization" in headers:
             return None
-        return ANYBODY
+        if not self._closed:
+            # `hsloc serve --new-token` writes to the database of a server that runs.
+            self._closed = await to_thread.run_sync(self._tokens.any)
+        return None if self._closed else ANYBODY
 
     def _counted(self, scope: Scope, receive: Receive) -> Receive:
         """Bodies other than uploads are small; counted as received, whatever Content-Length says."""

@@ -49,6 +49,7 @@ $("token-form").addEventListener("submit", (event) => {
   notice("");
   refresh();
   about();
+  if (chosen) show(chosen, false);
 });
 
 async function about() {

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
+import math
 import os
 import sys
 from dataclasses import dataclass, field
@@ -107,24 +109,59 @@ class Settings:
     """The program of a job's process; gets the job's folder, a pipe and the server's process id."""
 
     def __post_init__(self) -> None:
-        for name in ("slots", "max_upload_bytes", "max_queued", "max_attempts", "job_memory_bytes", "job_output_bytes"):
-            if getattr(self, name) < 1:
-                raise SettingsError(f"{name} is {getattr(self, name)}; it must be 1 or more")
-        for name in ("requests_per_s", "refusals_per_s", "store_timeout_s", "body_timeout_s", "header_timeout_s"):
-            if not getattr(self, name) > 0.0:
-                raise SettingsError(f"{name} is {getattr(self, name)}; it must be above 0")
+        for each in dataclasses.fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                _check_number(each.name, value)
+        for name in ("allowed_hosts", "worker_command"):
+            if not getattr(self, name):
+                raise SettingsError(f"{name} is empty; give at least one value, or leave it out")
         if not 0.0 < self.heartbeat_s < self.lease_s:
             raise SettingsError(
                 f"heartbeat_s is {self.heartbeat_s}; it must be above 0 and below lease_s {self.lease_s}"
             )
 
 
+MAY_BE_ZERO = ("min_free_bytes", "grace_s", "webhook_backoff_s")
+MAX_SECONDS = 1e9
+"""Thirty years: times beyond that are misprints, and overflow."""
+
+
+def _check_number(name: str, value: float) -> None:
+    """Raises SettingsError for a number that makes no sense: not finite, negative, zero, or no part of 1."""
+    if name.startswith("fault_"):
+        if not 0.0 <= value <= 1.0:
+            raise SettingsError(f"{name} is {value}; it must be from 0 to 1")
+        return
+    least = "0 or more" if name in MAY_BE_ZERO else "1 or more" if isinstance(value, int) else "above 0"
+    if not math.isfinite(value) or value < 0 or (value == 0 and name not in MAY_BE_ZERO):
+        raise SettingsError(f"{name} is {value}; it must be {least}, and finite")
+    if name.endswith("_s") and not name.endswith("per_s") and value > MAX_SECONDS:
+        raise SettingsError(f"{name} is {value:g} s; it must be at most {MAX_SECONDS:g} s")
+
+
+OTHER_VARIABLES = ("HSLOC_DATA", "HSLOC_SERVE_DATA", "HSLOC_TOKEN", "HSLOC_PORT", "HSLOC_JOB")
+"""Variables of hsloc that are no settings: a folder of logs, the data folder, the operator's token, the port of
+compose.yaml, the mark of a job's processes."""
+
+
+def _check_names(environment: Mapping[str, str]) -> None:
+    """Raises SettingsError for a variable `HSLOC_...` that is no setting: misspelt, its value would be ignored."""
+    known = [f"HSLOC_{each.name.upper()}" for each in dataclasses.fields(Settings) if each.name != "data"]
+    for name in sorted(environment):
+        if name.startswith("HSLOC_") and name not in known and name not in OTHER_VARIABLES:
+            close = difflib.get_close_matches(name, [*known, *OTHER_VARIABLES], 1)
+            remedy = f"did you mean {close[0]}?" if close else "remove it, or see settings.py for the names"
+            raise SettingsError(f"{name} is not a setting of the service; {remedy}")
+
+
 def from_environment(environment: Mapping[str, str] = os.environ, **changes: Any) -> Settings:
     """Settings from `HSLOC_<NAME>` variables; `changes` (those that are not None) stand above them.
 
     The folder is `HSLOC_SERVE_DATA`: elsewhere `HSLOC_DATA` is where somebody keeps logs, no place to write to.
-    Raises SettingsError for a value that cannot be read.
+    Raises SettingsError for a value that cannot be used, and for a variable `HSLOC_...` that is no setting.
     """
+    _check_names(environment)
     values: dict[str, Any] = {}
     hints = get_type_hints(Settings)
     for each in dataclasses.fields(Settings):

@@ -18,7 +18,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from live_service import settings, submit, wait
 
 from hsloc_service.call_timeout import BoundedExecutor
-from hsloc_service.execution import retry as patience
+from hsloc_service.execution import retry
 from hsloc_service.http import results_routes
 from hsloc_service.http.app import create_app
 
@@ -75,8 +75,8 @@ fsspec.register_implementation("faulty", Faulty, clobber=True)
 
 @pytest.fixture(autouse=True)
 def _fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(patience, "FIRST_WAIT_S", 0.05)
-    monkeypatch.setattr(patience, "LONGEST_WAIT_S", 0.2)
+    monkeypatch.setattr(retry, "FIRST_WAIT_S", 0.05)
+    monkeypatch.setattr(retry, "MAX_WAIT_S", 0.2)
     monkeypatch.setattr(Faulty, "store", {})
     monkeypatch.setattr(Faulty, "pseudo_dirs", [""])
     monkeypatch.setattr(Faulty, "fault", "")

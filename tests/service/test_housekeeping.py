@@ -56,3 +56,35 @@ def test_settings_from_variables(tmp_path: Path) -> None:
         with pytest.raises(SettingsError):
             from_environment({f"HSLOC_{name}": value})
     assert settings(tmp_path).retention_s is None
+
+
+@pytest.mark.parametrize(
+    ("variable", "value"),
+    [
+        ("RETENTION_S", "-5"),  # everything was deleted
+        ("RETENTION_S", "0"),
+        ("RETENTION_S", "nan"),
+        ("UPLOAD_TTL_S", "inf"),
+        ("JOB_WALL_S", "-1"),
+        ("JOB_WALL_S", "1e30"),
+        ("TENANT_BYTES", "0"),
+        ("MAX_CONNECTIONS", "-1"),
+        ("WEBHOOK_ATTEMPTS", "0"),
+        ("MIN_FREE_BYTES", "-1"),
+        ("FAULT_FAIL_JOBS", "1.5"),
+        ("FAULT_FAIL_JOBS", "nan"),
+        ("ALLOWED_HOSTS", ","),
+    ],
+)
+def test_a_setting_without_sense_is_refused(variable: str, value: str) -> None:
+    with pytest.raises(SettingsError, match=rf"^{variable.lower()} is .*(must|give)"):
+        from_environment({f"HSLOC_{variable}": value})
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"), [("HSLOC_RETENTON_S", "did you mean HSLOC_RETENTION_S"), ("HSLOC_COLOUR", "remove it")]
+)
+def test_a_misspelt_variable_is_refused(name: str, remedy: str) -> None:
+    with pytest.raises(SettingsError, match=remedy):
+        from_environment({name: "5"})
+    from_environment({"HSLOC_TOKEN": "x", "HSLOC_DATA": "/logs", "HSLOCATION": "x"})

@@ -74,7 +74,7 @@ class Live:
         return f"http://127.0.0.1:{self.port}"
 
     def start(self) -> Live:
-        environment = os.environ | {
+        environment = {k: v for k, v in os.environ.items() if not k.startswith("HSLOC_")} | {
             "HSLOC_MIN_FREE_BYTES": "1M",
             "HSLOC_GRACE_S": "0.3",
             "HSLOC_HEARTBEAT_S": "0.5",

@@ -44,6 +44,8 @@ from hsloc_service.webhooks import WebhookSender
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from fastapi.routing import APIRoute
+
     from hsloc_service.settings import Settings
 
 ROUTERS = tuple(
@@ -68,6 +70,7 @@ def create_app(settings: Settings) -> FastAPI:
         openapi_url=None,  # FastAPI's own route builds the description on the event loop: see `add_openapi`
         redoc_url=None,
         license_info={"name": "Apache-2.0"},
+        generate_unique_id_function=operation_id,
     )
     app.state.context = context
     app.add_middleware(Guard, settings=settings, tokens=Tokens(context.database))
@@ -133,6 +136,11 @@ async def running(context: Context) -> AsyncIterator[None]:
         database.close()
         storage.close()
         log("stop")
+
+
+def operation_id(route: APIRoute) -> str:
+    """`jobs_submit`: the names of functions in generated clients."""
+    return "_".join([*(str(tag) for tag in route.tags), route.name])
 
 
 def _add_page(app: FastAPI) -> None:

@@ -31,8 +31,12 @@ SANDBOX = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 )
 """A report may run its own script, but in an origin of its own and without the network."""
-_KINDS = sorted({kind.partition(";")[0] for kind in MEDIA_TYPES.values()} | {"application/octet-stream"})
-_BINARY: dict[str, Any] = {"description": "the bytes", "content": {kind: {"schema": {}} for kind in _KINDS}}
+_OCTETS = "application/octet-stream"
+"""First among the kinds: generated clients take the first that they know, and must not parse the bytes."""
+_KINDS = (_OCTETS, *sorted({kind.partition(";")[0] for kind in MEDIA_TYPES.values()} - {_OCTETS}))
+_BYTES: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
+_BINARY: dict[str, Any] = {"description": "the bytes", "content": dict.fromkeys(_KINDS, _BYTES)}
+_ZIP: dict[str, Any] = {"description": "the archive", "content": dict.fromkeys((_OCTETS, "application/zip"), _BYTES)}
 
 
 @router.get("/{job_id}/results", responses=problems(404, 409))
@@ -51,7 +55,7 @@ def manifest(ctx: Ctx, who: Reader, job_id: JobId) -> Manifest:
     "/{job_id}/results.zip",
     response_class=StreamingResponse,
     responses={
-        200: {"description": "the archive", "content": {"application/zip": {"schema": {"type": "string"}}}},
+        200: _ZIP,
         **problems(404, 409),
     },
 )

@@ -15,7 +15,7 @@ from hsloc_service.errors import StoreError
 from hsloc_service.jobs.repository import base_job, delete_job
 from hsloc_service.logs import log
 from hsloc_service.results.deletion_queue import delete_upload
-from hsloc_service.uploads.repository import needed
+from hsloc_service.uploads.repository import needed_files
 
 if TYPE_CHECKING:
     from hsloc_service.db.database import Database
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 EVERY_S = 60.0
 SWEEP_S = 3600.0
+BATCH = 100
+"""Rows that are deleted in one transaction."""
 KEY_S = 7 * 86400.0
 """An Idempotency-Key is remembered for a week."""
 
@@ -93,13 +95,33 @@ class Housekeeping:
                 delete_upload(session, row)
 
     def _delete_old(self, before: float) -> None:
-        """Delete jobs that ended before `before` and uploads of that age, but none that an active job needs."""
+        """Delete jobs that ended before `before` and uploads of that age, but none that an active job needs.
+
+        In batches of BATCH, a transaction each, so that other writes wait for one batch at most.
+        """
+        seq: int | None = 0
+        while seq is not None and not self._stop.is_set():
+            seq = self._delete_jobs(before, seq)
+        ident: str | None = ""
+        while ident is not None and not self._stop.is_set():
+            ident = self._delete_uploads(before, ident)
+
+    def _delete_jobs(self, before: float, after: int) -> int | None:
+        """Delete a batch of jobs; the `seq` of the last one, None if there are no more."""
+        query = select(JobRow).where(JobRow.state.in_(ENDED), JobRow.ended < before, JobRow.seq > after)
         with self._database.write() as session:
-            jobs = session.scalars(select(JobRow).where(JobRow.state.in_(ENDED), JobRow.ended < before)).all()
+            jobs = session.scalars(query.order_by(JobRow.seq).limit(BATCH)).all()
             for job in jobs:
                 if not base_job(session, job.id):
                     delete_job(session, job)
-            query = select(FileRow).where(FileRow.state == "complete", FileRow.created < before)
-            files = [row for row in session.scalars(query) if not needed(session, row.id)]
+            return jobs[-1].seq if jobs else None
+
+    def _delete_uploads(self, before: float, after: str) -> str | None:
+        """Delete a batch of uploads; the id of the last one, None if there are no more."""
+        query = select(FileRow).where(FileRow.state == "complete", FileRow.created < before, FileRow.id > after)
+        with self._database.write() as session:
+            files, needed = session.scalars(query.order_by(FileRow.id).limit(BATCH)).all(), needed_files(session)
             for row in files:
-                delete_upload(session, row)
+                if row.id not in needed:
+                    delete_upload(session, row)
+            return files[-1].id if files else None

@@ -140,9 +140,9 @@ def _check_number(name: str, value: float) -> None:
         raise SettingsError(f"{name} is {value:g} s; it must be at most {MAX_SECONDS:g} s")
 
 
-OTHER_VARIABLES = ("HSLOC_DATA", "HSLOC_SERVE_DATA", "HSLOC_TOKEN", "HSLOC_PORT", "HSLOC_JOB")
-"""Variables of hsloc that are no settings: a folder of logs, the data folder, the operator's token, the port of
-compose.yaml, the mark of a job's processes."""
+OTHER_VARIABLES = ("HSLOC_DATA", "HSLOC_SERVE_DATA", "HSLOC_TOKEN", "HSLOC_URL", "HSLOC_PORT", "HSLOC_JOB")
+"""Variables of hsloc that are no settings: a folder of logs, the data folder, the operator's token, the server that
+`hsloc submit` asks, the port of compose.yaml, the mark of a job's processes."""
 
 
 def _check_names(environment: Mapping[str, str]) -> None:
@@ -150,8 +150,9 @@ def _check_names(environment: Mapping[str, str]) -> None:
     known = [f"HSLOC_{each.name.upper()}" for each in dataclasses.fields(Settings) if each.name != "data"]
     for name in sorted(environment):
         if name.startswith("HSLOC_") and name not in known and name not in OTHER_VARIABLES:
-            close = difflib.get_close_matches(name, [*known, *OTHER_VARIABLES], 1)
-            remedy = f"did you mean {close[0]}?" if close else "remove it, or see settings.py for the names"
+            names = [each.removeprefix("HSLOC_") for each in (*known, *OTHER_VARIABLES)]
+            close = difflib.get_close_matches(name.removeprefix("HSLOC_"), names, 1)
+            remedy = f"did you mean HSLOC_{close[0]}?" if close else "remove it, or see settings.py for the names"
             raise SettingsError(f"{name} is not a setting of the service; {remedy}")
 
 

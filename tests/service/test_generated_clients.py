@@ -1,7 +1,7 @@
 """Clients generated from our OpenAPI upload a log, submit a job, wait for it and download its results.
 
-openapi-python-client comes with the extra `dev`. For openapi-typescript set HSLOC_NODE_MODULES to a `node_modules` with
-openapi-typescript, openapi-fetch and typescript.
+openapi-python-client comes with the extra `dev`. For openapi-typescript set TYPESCRIPT_NODE_MODULES to a `node_modules`
+with openapi-typescript, openapi-fetch and typescript.
 """
 
 from __future__ import annotations
@@ -99,13 +99,13 @@ def test_openapi_python_client(make_live: Callable[..., Live], tmp_path: Path) -
 
 
 @pytest.mark.skipif(
-    "HSLOC_NODE_MODULES" not in os.environ or shutil.which("node") is None,
-    reason="TYPESCRIPT CLIENTS ARE NOT TESTED: node and HSLOC_NODE_MODULES are needed",
+    "TYPESCRIPT_NODE_MODULES" not in os.environ or shutil.which("node") is None,
+    reason="TYPESCRIPT CLIENTS ARE NOT TESTED: node and TYPESCRIPT_NODE_MODULES are needed",
 )
 def test_openapi_typescript(make_live: Callable[..., Live], tmp_path: Path) -> None:
     live = make_live(HSLOC_TOKEN=TOKEN)
     document = describe(live, tmp_path)
-    modules = Path(os.environ["HSLOC_NODE_MODULES"])
+    modules = Path(os.environ["TYPESCRIPT_NODE_MODULES"])
     (tmp_path / "node_modules").symlink_to(modules)
     (tmp_path / "package.json").write_text('{"type": "module"}')
     (tmp_path / "client.ts").write_text(TYPESCRIPT_CLIENT)

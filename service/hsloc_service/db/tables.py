@@ -154,7 +154,7 @@ class IdempotencyRow(Base):
     tenant: Mapped[str] = mapped_column(primary_key=True)
     key: Mapped[str] = mapped_column(primary_key=True)
     sha256: Mapped[str]
-    job_id: Mapped[str]
+    job_id: Mapped[str] = mapped_column(index=True)
     created: Mapped[float]
 
 

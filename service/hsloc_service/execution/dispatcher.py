@@ -85,6 +85,8 @@ class LocalDispatcher:
         self._owner = uuid.uuid4().hex
         self._stop = threading.Event()
         self._work = threading.Condition()
+        self._claiming = threading.Lock()
+        """A job is claimed and entered into `_running` in one step; else another slot would take it for abandoned."""
         self._running: dict[str, threading.Event] = {}
         self._threads: list[threading.Thread] = []
 
@@ -148,12 +150,13 @@ class LocalDispatcher:
         """Run the next job; False if there is none, or the disk is so full that it would end as `disk_full`."""
         if self._storage.free_bytes() < self._storage.min_free_bytes:
             return False
-        claim = self._leases.claim(self._owner)
-        if claim is None:
-            self._leases.recover()
-            return False
-        cancel = threading.Event()
-        self._running[claim.job_id] = cancel
+        with self._claiming:
+            claim = self._leases.claim(self._owner)
+            if claim is None:
+                for job_id in self._leases.recover(held=self._running):
+                    log("job.requeued", job=job_id)
+                return False
+            cancel = self._running[claim.job_id] = threading.Event()
         try:
             self._ended(state := self._supervisor.run(claim, stop=self._stop, cancel=cancel))
         finally:

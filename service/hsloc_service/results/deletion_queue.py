@@ -54,11 +54,11 @@ class DeletionQueue:
         for row in self._rows():
             if row.store is None:
                 self.stores.folder.remove(row.folder)
-                self._done(row)
+                self._confirm([row.folder])
 
     def clear(self) -> int:
         """Remove all deleted results that can be reached; how many. Blocks for as long as a slow store takes."""
-        count = 0
+        done: list[str] = []
         for row in self._rows():
             if row.store not in (None, self.stores.current.url):
                 continue  # until the settings name that store again
@@ -67,9 +67,11 @@ class DeletionQueue:
             except StoreError as error:
                 log("store.error", what="remove", name=row.folder, error=str(error))
                 break  # the others would fail as well; they are tried in the next round
-            self._done(row)
-            count += 1
-        return count
+            done.append(row.folder)
+            if len(done) % BATCH == 0:
+                self._confirm(done[-BATCH:])
+        self._confirm(done[len(done) // BATCH * BATCH :])
+        return len(done)
 
     def sweep_folder(self) -> list[str]:
         """`sweep` of the data folder."""
@@ -112,11 +114,11 @@ class DeletionQueue:
         with self.database.read() as session:
             return list(session.scalars(select(RemovalRow).order_by(RemovalRow.created)))
 
-    def _done(self, row: RemovalRow) -> None:
-        with self.database.write() as session:
-            found = session.get(RemovalRow, row.folder)
-            if found is not None:
-                session.delete(found)
+    def _confirm(self, folders: list[str]) -> None:
+        """Forget deletions that are done."""
+        if folders:
+            with self.database.write() as session:
+                session.execute(delete(RemovalRow).where(RemovalRow.folder.in_(folders)))
 
 
 def removal_of(job: JobRow) -> RemovalRow:

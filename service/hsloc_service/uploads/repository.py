@@ -126,7 +126,7 @@ class Files:
         """Remove an upload. Raises ServiceError 409 while an active job needs it."""
         with self.database.write() as session:
             row = _file(session, who, file_id)
-            if needed(session, file_id):
+            if file_id in needed_files(session):
                 raise conflict("in_use", "an active job needs this file; cancel it first")
             delete_upload(session, row)
         self.storage.upload_path(file_id).unlink(missing_ok=True)
@@ -145,10 +145,10 @@ def need_quota(session: Session, who: Principal, most: int, size: int = 0) -> No
         raise no_space(f"your uploads take {uploads} and your results {results} of {most} bytes; delete some")
 
 
-def needed(session: Session, file_id: str) -> bool:
-    """Whether a job that has not ended reads the file."""
+def needed_files(session: Session) -> set[str]:
+    """Ids of the files that jobs read which have not ended."""
     active = session.scalars(select(JobRow.request).where(JobRow.state.in_(ACTIVE)))
-    return any(file_id in files_of(request) for request in active)
+    return {file_id for request in active for file_id in files_of(request)}
 
 
 def _file(session: Session, who: Principal, file_id: str) -> FileRow:

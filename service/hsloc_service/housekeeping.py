@@ -111,9 +111,8 @@ class Housekeeping:
         query = select(JobRow).where(JobRow.state.in_(ENDED), JobRow.ended < before, JobRow.seq > after)
         with self._database.write() as session:
             jobs = session.scalars(query.order_by(JobRow.seq).limit(BATCH)).all()
-            for job in jobs:
-                if not base_job(session, job.id):
-                    delete_job(session, job)
+            extended = base_job(session, *(job.id for job in jobs))
+            delete_job(session, *(job for job in jobs if job.id not in extended))
             return jobs[-1].seq if jobs else None
 
     def _delete_uploads(self, before: float, after: str) -> str | None:

@@ -183,20 +183,19 @@ def finish_job(session: Session, job: JobRow, state: str, reason: str | None, me
     queue_webhook(session, job, "job.ended")
 
 
-def delete_job(session: Session, job: JobRow) -> None:
-    """Remove the rows of a job, and note down that its results are to go."""
-    if job.folder is not None:
-        session.add(removal_of(job))
-    for table in (AssetRow, EventRow, DeliveryRow):
-        session.execute(delete(table).where(table.job_id == job.id))
-    session.execute(delete(IdempotencyRow).where(IdempotencyRow.job_id == job.id))
-    session.delete(job)
+def delete_job(session: Session, *jobs: JobRow) -> None:
+    """Delete jobs with all their rows, and record that their results are to be removed."""
+    session.add_all([removal_of(job) for job in jobs if job.folder is not None])
+    ids = [job.id for job in jobs]
+    for table in (AssetRow, EventRow, DeliveryRow, IdempotencyRow):
+        session.execute(delete(table).where(table.job_id.in_(ids)))
+    session.execute(delete(JobRow).where(JobRow.id.in_(ids)))
 
 
-def base_job(session: Session, job_id: str) -> bool:
-    """Whether a job that has not ended extends the map of this one."""
-    query = select(JobRow.id).where(JobRow.resume_of == job_id, JobRow.state.in_(ACTIVE)).limit(1)
-    return session.scalar(query) is not None
+def base_job(session: Session, *job_ids: str) -> set[str]:
+    """Those of the jobs whose map is extended by a job that has not ended."""
+    query = select(JobRow.resume_of).where(JobRow.resume_of.in_(job_ids), JobRow.state.in_(ACTIVE))
+    return {each for each in session.scalars(query) if each is not None}
 
 
 def _need_map(session: Session, job: JobRow) -> None:

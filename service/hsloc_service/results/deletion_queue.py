@@ -128,5 +128,6 @@ def removal_of(job: JobRow) -> RemovalRow:
 
 def delete_upload(session: Session, row: FileRow) -> None:
     """Delete the row of an upload, and record that its bytes are to be removed."""
-    session.merge(UploadDeletionRow(id=row.id, created=time.time()))
+    if session.get(UploadDeletionRow, row.id) is None:
+        session.add(UploadDeletionRow(id=row.id, created=time.time()))
     session.delete(row)

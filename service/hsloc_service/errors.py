@@ -31,5 +31,9 @@ def no_space(message: str) -> ServiceError:
     return ServiceError(507, "no_space", message, {"Retry-After": "60"})
 
 
+class BrokenAnswer(Exception):
+    """An answer that had begun cannot be sent to its end; the connection has to be broken off."""
+
+
 class StoreError(Exception):
     """The store does not answer, or not as it must; the same may work later."""

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from hsloc_service.settings import Settings
     from hsloc_service.storage import Storage
 
-EVERY_S = 60.0
 SWEEP_S = 3600.0
 BATCH = 100
 """Rows that are deleted in one transaction."""
@@ -52,7 +51,7 @@ class Housekeeping:
     def _run(self) -> None:
         pause = 0.0
         while not self._stop.wait(pause):
-            pause = EVERY_S
+            pause = self._settings.housekeeping_s
             try:
                 self.tidy(time.time())
             except Exception as error:

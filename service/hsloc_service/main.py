@@ -67,7 +67,11 @@ def serve(
         host=host,
         port=port,
         http=protocol_class(
-            settings.header_timeout_s, settings.body_timeout_s, settings.write_timeout_s, settings.max_connections
+            settings.header_timeout_s,
+            settings.body_timeout_s,
+            settings.write_timeout_s,
+            settings.max_connections,
+            settings.min_body_bytes_per_s,
         ),
         ws="none",
         loop="asyncio",

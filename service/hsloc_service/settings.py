@@ -47,6 +47,8 @@ class Settings:
     """Uploads and jobs are refused (507) when the disk has less; keeps room for the database and for deleting."""
     upload_ttl_s: float = 24 * 3600.0
     """An upload that was not finished by then is removed."""
+    housekeeping_s: float = 60.0
+    """How often expired uploads and old jobs are looked for."""
     retention_s: float | None = None
     """Finished jobs older than this are removed with their results; None keeps them."""
 
@@ -84,6 +86,8 @@ class Settings:
     """A client must send its request line and headers within this time."""
     body_timeout_s: float = 8.0
     """A client that sends nothing of its announced body for so long is cut off."""
+    min_body_bytes_per_s: int = 512
+    """A client whose body comes more slowly than this, over 2.5 times `body_timeout_s`, is cut off [B/s]."""
     write_timeout_s: float = 60.0
     """A client that takes nothing of its answer for so long is cut off."""
     max_connections: int = 4096

@@ -96,6 +96,8 @@ def main() -> int:
     output.mkdir()
     (output / "trajectory.tum").write_text(f"{job['request']['seed']} {rest}\n")
     (output / "metrics.json").write_text("{}\n")
+    if word == "large":
+        (output / "large.bin").write_bytes(os.urandom(1 << 20) * int(rest[0]))
     if word == "tricks":
         (output / "passwd").symlink_to("/etc/passwd")
         (output / "sub").mkdir()

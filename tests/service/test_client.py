@@ -11,6 +11,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from live_service import free_port
 
 from hsloc.client import Client, ClientError
 
@@ -69,11 +70,11 @@ def test_refusals_are_told_at_once(make_live: Callable[..., Live], log: Path) ->
     assert refused.value.status == 401
     with pytest.raises(ClientError, match="at most 1048576 are taken"):
         Client(live.url, "a-token-of-the-operator-0123456789").upload(log)
-    with pytest.raises(ClientError, match="cannot be reached"):
+    with pytest.raises(ClientError, match=r"cannot be reached"):
         Client("http://127.0.0.1:1", attempts=2).job("x")
     with pytest.raises(ClientError, match="begins with http"):
         Client("localhost:8000")
-    with pytest.raises(ClientError, match="cannot be read"):
+    with pytest.raises(ClientError, match=r"cannot be read"):
         Client(live.url).upload(log.parent / "not there")
 
 
@@ -132,3 +133,10 @@ def test_the_command_sends_what_replay_takes(make_live: Callable[..., Live], log
     assert refused.returncode == 1
     assert "drew no map" in refused.stderr
     assert refused.stderr.count("\n") == 1
+
+
+def test_a_dead_port_is_given_up_within_seconds(log: Path) -> None:
+    begin = time.monotonic()
+    with pytest.raises(ClientError, match=r"cannot be reached.*refused.*is the server running, and the address right"):
+        Client(f"http://127.0.0.1:{free_port()}").upload(log)
+    assert time.monotonic() - begin < 10.0

@@ -326,3 +326,22 @@ def test_a_disk_that_is_not_mounted_is_away_and_nothing_is_gone(
     assert client.get(f"/v1/jobs/{first}/results/metrics.json").status_code == 200
     assert deletions.clear() == 1
     assert sorted(path.name for path in next(mounted.iterdir()).iterdir()) == sorted([f"{first}.1", f"{waiting}.1"])
+
+
+def test_a_results_folder_that_is_not_mounted_at_the_start_is_waited_for(tmp_path: Path) -> None:
+    mounted, aside = tmp_path / "mounted", tmp_path / "aside"
+    chosen = settings(tmp_path, results_url=f"file://{mounted}", store_timeout_s=5.0)
+    with TestClient(create_app(chosen)) as client:
+        first = submit(client)
+        wait(client, first)
+    mounted.rename(aside)
+    with TestClient(create_app(chosen)) as client:
+        second = submit(client)
+        wait_for_store(client, second)
+        time.sleep(0.3)
+        assert not mounted.exists()  # it would be on the disk beneath, and hidden by the mount
+        assert client.get(f"/v1/jobs/{first}/results/metrics.json").status_code == 503
+        aside.rename(mounted)
+        assert wait(client, second)["state"] == "succeeded"
+        for job in (first, second):
+            assert client.get(f"/v1/jobs/{job}/results/metrics.json").status_code == 200

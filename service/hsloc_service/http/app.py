@@ -91,6 +91,7 @@ def open_context(settings: Settings) -> Context:
     except SettingsError:
         storage.close()
         raise
+    stores.expect(database)
     files = Files(database, storage, settings)
     deletions = DeletionQueue(database, storage, stores, settings.store_timeout_s)
     dispatcher = LocalDispatcher(

@@ -6,6 +6,7 @@ Plain ASGI, around the whole application: FastAPI reads bodies before it asks it
 from __future__ import annotations
 
 import json
+import logging
 import random
 import secrets
 import time
@@ -17,7 +18,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import Message
 
 from hsloc_service.auth import ANYBODY
-from hsloc_service.errors import ServiceError, busy
+from hsloc_service.errors import BrokenAnswer, ServiceError, busy
 from hsloc_service.http import metrics
 from hsloc_service.logs import log, request_id
 
@@ -60,7 +61,7 @@ class Guard:
             if scope["type"] == "lifespan":
                 await self._app(scope, receive, send)
             return
-        begin, status = time.perf_counter(), 0
+        begin, status, inner = time.perf_counter(), 0, scope
         ident = secrets.token_hex(8)
         request_id.set(ident)
 
@@ -81,9 +82,14 @@ class Guard:
             except ServiceError as error:
                 await refuse(error, answer)
                 return
-            await self._app(scope, self._counted(scope, receive), answer)
+            try:
+                inner, send_on = _without_head(scope, answer)
+                await self._app(inner, self._counted(scope, receive), send_on)
+            except BrokenAnswer as error:
+                # Returning before the end makes uvicorn close the connection.
+                log("answer.broken", logging.WARNING, route=scope["path"], error=str(error))
         finally:
-            route = getattr(scope.get("route"), "path", "other")
+            route = getattr(inner.get("route"), "path", "other")
             seconds = time.perf_counter() - begin
             # A method is any word that a client makes up: each would be a series of its own, kept for ever.
             method = scope["method"] if scope["method"] in METHODS else "other"
@@ -156,6 +162,23 @@ class Guard:
             return message
 
         return counted
+
+
+def _without_head(scope: Scope, send: Send) -> tuple[Scope, Send]:
+    """HEAD as a GET whose body is dropped (RFC 9110); tus has a HEAD of its own."""
+    if scope["method"] != "HEAD" or scope["path"].startswith("/v1/tus/"):
+        return scope, send
+    ended = False
+
+    async def headers_only(message: Message) -> None:
+        nonlocal ended
+        if message["type"] == "http.response.start":
+            await send(message)
+        elif not ended:
+            ended = True
+            await send({"type": "http.response.body", "body": b""})
+
+    return {**scope, "method": "GET", "hsloc_head": True}, headers_only
 
 
 class Rates:

@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import stat
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -50,8 +51,20 @@ class Asset:
     media_type: str
 
 
+class AssetReader(Protocol):
+    """Reads ranges of one asset."""
+
+    def read(self, start: int, size: int) -> bytes:
+        """`size` bytes from `start` on. Raises as `ResultStore.read`."""
+        ...
+
+    def close(self) -> None:
+        """Give the file back."""
+        ...
+
+
 class ResultStore(Protocol):
-    """See the law above. Methods may block for as long as the store likes: see `waiting`.
+    """See the law above. Methods may block for as long as the store does: see `call_timeout`.
 
     All but `publish` raise StoreError for trouble that may pass, and FileNotFoundError for what is not there.
     """
@@ -61,6 +74,10 @@ class ResultStore(Protocol):
         """What the job's row says of where its results are; None for the data folder."""
         ...
 
+    def expect(self) -> None:
+        """The store has had results; where its folder is missing, its disk is not mounted."""
+        ...
+
     def publish(self, output: Path, name: str, assets: list[Asset]) -> None:
         """Make the files of `output`, which `collect` has seen, the results `name`.
 
@@ -68,8 +85,8 @@ class ResultStore(Protocol):
         """
         ...
 
-    def path(self, name: str, asset: str) -> Path | None:
-        """The file, if it is one of this machine."""
+    def open(self, name: str, asset: str) -> AssetReader:
+        """A reader of one asset; where it is a file, it stays readable when the results are removed meanwhile."""
         ...
 
     def read(self, name: str, asset: str, start: int, size: int) -> bytes:
@@ -93,6 +110,9 @@ class FolderStore:
     def __init__(self, root: Path) -> None:
         self._root = root
 
+    def expect(self) -> None:
+        """The data folder is always there."""
+
     def publish(self, output: Path, name: str, assets: list[Asset]) -> None:
         """Rename the output to `<root>/<name>`; its files were synced when they were hashed."""
         del assets
@@ -100,18 +120,14 @@ class FolderStore:
         output.rename(self._root / checked_result(name))
         sync_folder(self._root)
 
-    def path(self, name: str, asset: str) -> Path:
-        """The path of an asset that the manifest names."""
-        return self._root / checked_result(name) / checked_asset(asset)
+    def open(self, name: str, asset: str) -> AssetReader:
+        """A reader of the file of an asset. Raises FileNotFoundError."""
+        return _FileReader(self._root / checked_result(name) / checked_asset(asset))
 
     def read(self, name: str, asset: str, start: int, size: int) -> bytes:
         """Bytes of an asset. Raises OSError if they are not there: that does not pass."""
-        with self.path(name, asset).open("rb") as file:
-            file.seek(start)
-            block = file.read(size)
-        if len(block) != size:
-            raise OSError(f"{asset} of {name} is shorter than its manifest says")
-        return block
+        with closing(self.open(name, asset)) as reader:
+            return reader.read(start, size)
 
     def remove(self, name: str) -> None:
         """Remove the results `name`."""
@@ -120,6 +136,25 @@ class FolderStore:
     def names(self) -> list[str]:
         """The folders with the names of results; anything else is somebody's, and left alone."""
         return [entry.name for entry in os.scandir(self._root) if _RESULT_NAME.match(entry.name)]
+
+
+class _FileReader:
+    """An open file. Does not follow a link."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+
+    def read(self, start: int, size: int) -> bytes:
+        block = os.pread(self._descriptor, size, start)
+        while 0 < len(block) < size and (more := os.pread(self._descriptor, size - len(block), start + len(block))):
+            block += more
+        if len(block) != size:
+            raise OSError(f"{self._path}: shorter than its manifest says")
+        return block
+
+    def close(self) -> None:
+        os.close(self._descriptor)
 
 
 def collect(output: Path) -> list[Asset]:

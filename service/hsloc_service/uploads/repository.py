@@ -93,12 +93,13 @@ class Files:
                 query = query.where(tuple_(FileRow.created, FileRow.id) < tuple_(last.created, last.id))
             return session.scalars(query.order_by(FileRow.created.desc(), FileRow.id.desc())).all()
 
-    def advance(self, file_id: str, received: int) -> None:
-        """So many bytes are on the disk."""
+    def advance(self, file_id: str, received: int | None = None) -> None:
+        """Write the number of bytes that are on the disk, if it has changed, and put off the upload's expiry."""
         with self.database.write() as session:
             row = session.get(FileRow, file_id)
             if row is not None:
-                row.received = received
+                row.received = row.received if received is None else received
+                row.expires = time.time() + self.settings.upload_ttl_s
 
     def complete(self, file_id: str, size: int, sha256: str) -> FileRow:
         """The file is whole. Raises ServiceError 404 if it was deleted meanwhile."""

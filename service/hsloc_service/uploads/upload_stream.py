@@ -6,6 +6,7 @@ import errno
 import hashlib
 import os
 import random
+import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -77,7 +78,7 @@ class UploadReceiver:
                 raise
         finally:
             self._hashes[file_id] = (append.digest, append.safe)
-        row.received = append.safe
+        row.received, row.expires = append.safe, time.time() + self._settings.upload_ttl_s
         if append.safe == row.size:
             return await self.finish(file_id)
         return row
@@ -132,6 +133,9 @@ class _Append:
         self.safe = self._at = row.received
         self.digest = digest
         self._running = None if digest is None else digest.copy()
+        self._alive_s = files.settings.upload_ttl_s / 4.0
+        """While bytes come, the expiry is put off this often: it is for uploads that were given up."""
+        self._alive_until = time.monotonic()
         self._check = None if checksum is None else hashlib.new(checksum[0])
         self._wanted = None if checksum is None else checksum[1]
 
@@ -143,6 +147,9 @@ class _Append:
             try:
                 async for block in body:
                     buffer += block
+                    if time.monotonic() > self._alive_until:
+                        await to_thread.run_sync(self._files.advance, self._row.id)
+                        self._alive_until = time.monotonic() + self._alive_s
                     if self._at + len(buffer) > self._limit:
                         raise ServiceError(413, "too_large", f"more than the {self._limit} bytes that are expected")
                     if len(buffer) >= BLOCK:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from math import pi
 from typing import TYPE_CHECKING
 
@@ -258,3 +259,18 @@ def test_an_image_of_another_format_is_refused_by_its_content(tmp_path: Path, ki
         Image.new("L", (4, 4)).save(tmp_path / "map.pgm", format=kind)
     with pytest.raises(MapError, match="no PGM, PNG or BMP image; convert it"):
         load_map(tmp_path / "map.yaml")
+
+
+def yaml_bomb(levels: int = 22) -> str:
+    """Merge keys of merge keys: each level doubles what the loader copies."""
+    lines = ["a0: &a0 {k: 1}"]
+    lines += [f"a{k}: &a{k} {{<<: [*a{k - 1}, *a{k - 1}]}}" for k in range(1, levels)]
+    return "\n".join([*lines, "image: map.pgm", ""])
+
+
+def test_a_yaml_bomb_is_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "map.yaml").write_text(yaml_bomb())
+    begin = time.monotonic()
+    with pytest.raises(MapError, match="has a YAML alias"):
+        load_map(tmp_path / "map.yaml")
+    assert time.monotonic() - begin < 2.0

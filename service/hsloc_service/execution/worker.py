@@ -134,19 +134,11 @@ def linked_map(folder: Path, name: str, image: str) -> Path:
 
     The name must be plain: a YAML that says `image: /etc/passwd` would have us read what was not uploaded.
     """
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     from hsloc.errors import MapError
+    from hsloc.maps.metadata import load_yaml
 
     path = folder / "map" / name
-    if path.stat().st_size > 1 << 20:
-        raise MapError(f"{name}: larger than 1 MiB, which no map's YAML is")
-    try:
-        values = YAML(typ="safe", pure=True).load(path)
-        wanted = values["image"]
-    except (YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise MapError(f"{name}: not a map's YAML with an `image`") from error
+    wanted = load_yaml(path).get("image")
     if not isinstance(wanted, str) or wanted in ("", ".", "..") or "/" in wanted or "\0" in wanted or len(wanted) > 200:
         raise MapError(f"{name}: image is {wanted!r:.100}; it must be the plain name of a file beside the YAML")
     target = folder / "map" / wanted

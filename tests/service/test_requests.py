@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from fastapi.testclient import TestClient
+    from live_service import Live
 
 OFFICE = Path(__file__).parents[2] / "recordings" / "office.mcap"
 REAL = Settings().worker_command
@@ -271,3 +272,19 @@ def test_every_example_of_the_api_fits_it(client: TestClient) -> None:
         JobRequest.model_validate(example)
         named |= set(example)
     assert {"log", "logs", "relations", "resume"} <= named
+
+
+def test_what_has_not_changed_is_304_and_the_rest_is_compressed(make_live: Callable[..., Live]) -> None:
+    live = make_live()
+    with live.client() as client:
+        for seed in range(20):
+            wait(client, submit(client, seed=seed, config={"hide": {"budget": 300}}))
+        full = client.get("/v1/jobs", headers={"Accept-Encoding": "identity"})
+        packed = client.get("/v1/jobs", headers={"Accept-Encoding": "gzip"})
+        assert packed.headers["content-encoding"] == "gzip"
+        assert int(packed.headers["content-length"]) < len(full.content) / 5
+        assert packed.json() == full.json()
+        again = client.get("/v1/jobs", headers={"If-None-Match": packed.headers["etag"]})
+        assert (again.status_code, again.content) == (304, b"")
+        submit(client)
+        assert client.get("/v1/jobs", headers={"If-None-Match": packed.headers["etag"]}).status_code == 200

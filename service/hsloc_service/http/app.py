@@ -26,6 +26,7 @@ from hsloc_service.http import (
     system_routes,
     tus,
 )
+from hsloc_service.http.conditional import Conditional
 from hsloc_service.http.context import Context
 from hsloc_service.http.error_handlers import add_error_handlers
 from hsloc_service.http.guard import Guard
@@ -73,6 +74,7 @@ def create_app(settings: Settings) -> FastAPI:
         generate_unique_id_function=operation_id,
     )
     app.state.context = context
+    app.add_middleware(Conditional)
     app.add_middleware(Guard, settings=settings, tokens=Tokens(context.database))
     for router in ROUTERS:
         app.include_router(router)

@@ -8,6 +8,7 @@ export const hasToken = () => token !== "";
 
 export function useToken(text) {
   token = text.trim();
+  seen.clear();
   sessionStorage.setItem(KEY, token);
 }
 
@@ -30,7 +31,18 @@ export async function request(path, options = {}) {
   throw new Refused(answer.status, problem);
 }
 
-export const get = async (path) => (await request(path)).json();
+const seen = new Map(); // what polled paths answered last, with its ETag; in memory only
+
+export async function get(path) {
+  const known = seen.get(path);
+  const answer = await request(path, known ? { headers: { "If-None-Match": known.tag } } : {});
+  if (answer.status === 304) return known.value;
+  const value = await answer.json(), tag = answer.headers.get("ETag");
+  seen.delete(path);
+  if (tag && !path.includes("/results")) seen.set(path, { tag, value });
+  if (seen.size > 50) seen.delete(seen.keys().next().value);
+  return value;
+}
 
 export async function post(path, body, headers = {}) {
   const answer = await request(path, {

@@ -8,8 +8,6 @@ names is moved out of the quarantine again.
 from __future__ import annotations
 
 import logging
-import os
-import shutil
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -17,6 +15,7 @@ from sqlalchemy import select, update
 
 from hsloc_service.db.tables import FileRow, JobRow, UploadDeletionRow
 from hsloc_service.logs import log
+from hsloc_service.storage import remove_tree
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -39,7 +38,7 @@ def reconcile(database: Database, storage: Storage, deletions: DeletionQueue) ->
     for path in storage.work.iterdir():
         log("sweep", kind="work", name=path.name)
         with suppress(OSError):
-            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else os.unlink(path)
+            remove_tree(path)
     unknown = [*_unknown_uploads(database, storage), *(storage.results / each for each in deletions.sweep_folder())]
     for path in unknown:
         target = storage.quarantine / path.parent.name / path.name

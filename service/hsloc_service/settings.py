@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 MIB, GIB = 1 << 20, 1 << 30
+WORKER = (sys.executable, "-P", "-m", "hsloc_service.execution.worker")
+SANDBOXES = ("auto", "bubblewrap", "landlock", "none")
 
 
 class SettingsError(ValueError):
@@ -73,6 +75,9 @@ class Settings:
     """RLIMIT_NOFILE of a job's process."""
     job_threads: int = 1
     """NUMBA_NUM_THREADS of a job's process."""
+    sandbox: str = "auto"
+    """What keeps a job's process from the server's files and the network: `bubblewrap`, `landlock`, `auto` for the
+    first of them that this machine has (none: the server does not start), or `none`."""
     grace_s: float = 3.0
     """Time between SIGTERM and SIGKILL when a job is cancelled."""
     max_attempts: int = 3
@@ -107,9 +112,7 @@ class Settings:
     fault_fail_jobs: float = 0.0
     """TEST ONLY: the part of jobs that fails."""
 
-    worker_command: tuple[str, ...] = field(
-        default=(sys.executable, "-P", "-m", "hsloc_service.execution.worker"), repr=False
-    )
+    worker_command: tuple[str, ...] = field(default=WORKER, repr=False)
     """The program of a job's process; gets the job's folder, a pipe and the server's process id."""
 
     def __post_init__(self) -> None:
@@ -117,6 +120,8 @@ class Settings:
             value = getattr(self, each.name)
             if isinstance(value, int | float) and not isinstance(value, bool):
                 _check_number(each.name, value)
+        if self.sandbox not in SANDBOXES:
+            raise SettingsError(f"sandbox is {self.sandbox!r}; it must be one of {', '.join(SANDBOXES)}")
         for name in ("allowed_hosts", "worker_command"):
             if not getattr(self, name):
                 raise SettingsError(f"{name} is empty; give at least one value, or leave it out")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import math
 import os
 import re
-import shutil
 import uuid
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 BALLAST = "ballast"
 """A file that is given up when the disk is full, so that the database can delete."""
 BALLAST_BYTES = 4 << 20
+MAX_DEPTH = 64
+"""Folders in folders that a job may make."""
 
 
 class Storage:
@@ -105,11 +107,11 @@ class Storage:
 
     def remove_work(self, path: Path) -> None:
         """Remove the folder of an attempt."""
-        shutil.rmtree(path, ignore_errors=True)
+        remove_tree(path)
 
 
 def hash_file(path: Path, sync: bool = False) -> tuple[int, str]:
-    """Size and SHA-256 of a file; with `sync` it is on the disk afterwards. Does not follow a link."""
+    """Size and SHA-256 of a file; with `sync` it is on the disk afterwards, and its owner's. Does not follow a link."""
     digest, size = hashlib.sha256(), 0
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     with os.fdopen(descriptor, "rb") as file:
@@ -117,6 +119,7 @@ def hash_file(path: Path, sync: bool = False) -> tuple[int, str]:
             digest.update(block)
             size += len(block)
         if sync:
+            os.fchmod(file.fileno(), 0o600)
             os.fsync(file.fileno())
     return size, digest.hexdigest()
 
@@ -130,14 +133,58 @@ def sync_folder(path: Path | str) -> None:
         os.close(descriptor)
 
 
-def folder_bytes(path: Path) -> int:
-    """What a folder takes on the disk; files that vanish meanwhile count nothing."""
-    total = 0
-    for base, _, names in os.walk(path):
-        for name in names:
-            with suppress(OSError):
-                total += os.lstat(os.path.join(base, name)).st_blocks * 512
+def folder_bytes(path: Path) -> float:
+    """What a folder takes on the disk, infinity if it is nested more than MAX_DEPTH deep.
+
+    Files that vanish meanwhile count nothing.
+    """
+    total, folders = 0, [(str(path), 0)]
+    while folders:
+        base, depth = folders.pop()
+        if depth > MAX_DEPTH:
+            return math.inf
+        with suppress(OSError), os.scandir(base) as entries:
+            for entry in entries:
+                with suppress(OSError):
+                    total += entry.stat(follow_symlinks=False).st_blocks * 512
+                    if entry.is_dir(follow_symlinks=False):
+                        folders.append((entry.path, depth + 1))
     return total
+
+
+def remove_tree(path: Path | str) -> None:
+    """Remove a file, or a folder with all that is in it, however deep it is nested; no error if it is gone.
+
+    Folders of folders are moved up first: a path of 20,000 names is too long for the kernel, and for recursion.
+    """
+    root = str(path)
+    with suppress(OSError):
+        if os.path.islink(root) or not os.path.isdir(root):
+            os.unlink(root)
+            return
+    with suppress(OSError):
+        while folders := _folders_of(root):
+            for folder in folders:
+                for inner in _folders_of(folder):
+                    os.rename(inner, os.path.join(root, uuid.uuid4().hex))
+                os.rmdir(folder)
+        os.rmdir(root)
+
+
+def _folders_of(path: str) -> list[str]:
+    """The folders in a folder, whose other entries are removed."""
+    if os.stat(path).st_mode & 0o700 != 0o700:
+        os.chmod(path, 0o700)
+    folders = []
+    with os.scandir(path) as entries:
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                if entry.stat().st_mode & 0o700 != 0o700:  # without, it cannot be moved
+                    os.chmod(entry.path, 0o700)
+                folders.append(entry.path)
+            else:
+                os.unlink(entry.path)
+    return folders
 
 
 def safe_name(label: str, default: str) -> str:

@@ -22,6 +22,7 @@ from hsloc_service.reconciliation import reconcile
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from hsloc_service.execution.sandbox import Sandbox
     from hsloc_service.jobs.leases import Leases
     from hsloc_service.results.deletion_queue import DeletionQueue
     from hsloc_service.results.stores import ResultStores
@@ -51,6 +52,11 @@ class Dispatcher(Protocol):
         """A job was cancelled, and its row says so."""
         ...
 
+    @property
+    def sandbox_kind(self) -> str:
+        """What keeps jobs from the server's files: see `Sandbox`."""
+        ...
+
     def capacity(self) -> Capacity:
         """Slots of this machine."""
         ...
@@ -75,12 +81,13 @@ class LocalDispatcher:
         settings: Settings,
         stores: ResultStores,
         deletions: DeletionQueue,
+        sandbox: Sandbox,
         *,
         ended: Callable[[str], None] = lambda state: None,
         store_failed: Callable[[], None] = lambda: None,
     ) -> None:
         self._leases, self._storage, self._settings, self._deletions = leases, storage, settings, deletions
-        self._supervisor = Supervisor(leases, storage, settings, stores, store_failed)
+        self._supervisor = Supervisor(leases, storage, settings, stores, sandbox, store_failed)
         self._ended = ended
         self._owner = uuid.uuid4().hex
         self._stop = threading.Event()
@@ -89,6 +96,11 @@ class LocalDispatcher:
         """A job is claimed and entered into `_running` in one step; else another slot would take it for abandoned."""
         self._running: dict[str, threading.Event] = {}
         self._threads: list[threading.Thread] = []
+
+    @property
+    def sandbox_kind(self) -> str:
+        """What keeps the jobs apart."""
+        return self._supervisor.sandbox.kind
 
     @property
     def owner(self) -> str:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hsloc_service.execution.heartbeat import Heartbeat
+    from hsloc_service.execution.sandbox import Sandbox
     from hsloc_service.settings import Settings
     from hsloc_service.storage import Storage
 
@@ -34,9 +35,11 @@ POLL_S = 0.5
 class JobProcess:
     """Starts the process of a job in its folder, and watches it. Used in the thread of one slot."""
 
-    def __init__(self, folder: Path, mark: str, heartbeat: Heartbeat, storage: Storage, settings: Settings) -> None:
+    def __init__(
+        self, folder: Path, mark: str, heartbeat: Heartbeat, storage: Storage, settings: Settings, sandbox: Sandbox
+    ) -> None:
         self._folder, self._mark, self._heartbeat = folder, mark, heartbeat
-        self._storage, self._settings = storage, settings
+        self._storage, self._settings, self._sandbox = storage, settings, sandbox
         self._pipe_rest = b""
         self._last_line: dict[str, Any] = {}
         """The line with `done` or `failed`, once the process has written it."""
@@ -44,7 +47,7 @@ class JobProcess:
     def run(self) -> Outcome:
         """How the process ended. When this returns, every process of the job is dead. Raises OSError at the start."""
         settings, cache = self._settings, self._storage.cache.absolute()
-        process, pipe = start_job(settings.worker_command, self._folder, self._mark, settings.job_threads, cache)
+        process, pipe = start_job(self._sandbox, self._folder, self._mark, settings.job_threads, cache)
         self._heartbeat.begin()
         try:
             outcome = self._watch(process, pipe)
@@ -54,7 +57,10 @@ class JobProcess:
                 return outcome
             while self._read(pipe):
                 pass
-            return self._exit_outcome(process.returncode)
+            code = process.returncode
+            if self._sandbox.kind == "bubblewrap" and code > 128:
+                code = 128 - code  # its word for a process that a signal ended
+            return self._exit_outcome(code)
         finally:
             end_job(process, self._mark, 0.0)
             os.close(pipe)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from hsloc_service.execution.sandbox import Sandbox
     from hsloc_service.jobs.leases import Claim, Leases
     from hsloc_service.results.stores import ResultStores
     from hsloc_service.settings import Settings
@@ -34,6 +35,7 @@ class Supervisor:
     storage: Storage
     settings: Settings
     stores: ResultStores
+    sandbox: Sandbox
     store_failed: Callable[[], None]
 
     def run(self, claim: Claim, *, stop: threading.Event, cancel: threading.Event) -> str:
@@ -50,12 +52,12 @@ class Supervisor:
     def _attempt(self, claim: Claim, folder: Path, heartbeat: Heartbeat, retry: Retry) -> Outcome:
         mark = f"{self.storage.instance}:{claim.job_id}.{claim.attempt}"
         try:
-            prepare(folder, claim, self.storage, self.settings)
+            prepare(folder, claim, self.storage, self.settings, self.sandbox)
             self._fetch_map(claim, folder, heartbeat, retry)
             log("job.start", job=claim.job_id, tenant=claim.tenant, attempt=claim.attempt)
             if random.random() < self.settings.fault_fail_jobs:
                 return Outcome("failed", "fault_injection", "this server fails jobs on purpose (fault_fail_jobs)")
-            return JobProcess(folder, mark, heartbeat, self.storage, self.settings).run()
+            return JobProcess(folder, mark, heartbeat, self.storage, self.settings, self.sandbox).run()
         except Interrupted as end:
             return interrupted(end.reason)
         except StoreError as error:

@@ -15,6 +15,8 @@ from hsloc_service.auth import Tokens
 from hsloc_service.call_timeout import BoundedExecutor
 from hsloc_service.db.database import Database
 from hsloc_service.execution.dispatcher import LocalDispatcher
+from hsloc_service.execution.sandbox import choose_sandbox
+from hsloc_service.execution.warm_up import WarmUp
 from hsloc_service.housekeeping import Housekeeping
 from hsloc_service.http import (
     events_routes,
@@ -36,7 +38,7 @@ from hsloc_service.jobs.repository import Jobs
 from hsloc_service.logs import log
 from hsloc_service.results.deletion_queue import DeletionQueue
 from hsloc_service.results.stores import ResultStores
-from hsloc_service.settings import SettingsError
+from hsloc_service.settings import WORKER, SettingsError
 from hsloc_service.storage import Storage
 from hsloc_service.uploads.repository import Files
 from hsloc_service.uploads.upload_stream import UploadReceiver
@@ -89,6 +91,7 @@ def open_context(settings: Settings) -> Context:
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     storage = Storage(settings.data, settings.min_free_bytes)
     try:
+        sandbox = choose_sandbox(settings.sandbox, settings.data, settings.worker_command)
         database, stores = Database(settings.data / "hsloc.db"), ResultStores(storage, settings)
     except SettingsError:
         storage.close()
@@ -102,6 +105,7 @@ def open_context(settings: Settings) -> Context:
         settings,
         stores,
         deletions,
+        sandbox,
         ended=lambda state: metrics.ENDED.labels(state).inc(),
         store_failed=metrics.STORE_ERRORS.inc,
     )
@@ -123,12 +127,23 @@ def open_context(settings: Settings) -> Context:
 async def running(context: Context) -> AsyncIterator[None]:
     """The lifespan: slots, webhooks and housekeeping run inside it; the data folder is closed behind it."""
     settings, database, storage = context.settings, context.database, context.storage
-    helpers = (WebhookSender(database, settings), Housekeeping(database, storage, settings, context.deletions))
+    helpers: list[WebhookSender | Housekeeping | WarmUp] = [
+        WebhookSender(database, settings),
+        Housekeeping(database, storage, settings, context.deletions),
+    ]
+    if context.dispatcher.sandbox_kind != "none" and settings.worker_command == WORKER:
+        helpers.append(WarmUp(storage.cache.absolute()))
     context.dispatcher.start()
     for helper in helpers:
         helper.start()
-    results = context.stores.current.url
-    log("start", version=__version__, slots=settings.slots, data=str(settings.data), results=results)
+    log(
+        "start",
+        version=__version__,
+        slots=settings.slots,
+        data=str(settings.data),
+        results=context.stores.current.url,
+        sandbox=context.dispatcher.sandbox_kind,
+    )
     try:
         yield
     finally:

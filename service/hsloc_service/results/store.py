@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import stat
 from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from hsloc_service.storage import hash_file, sync_folder
+from hsloc_service.storage import hash_file, remove_tree, sync_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -131,7 +130,7 @@ class FolderStore:
 
     def remove(self, name: str) -> None:
         """Remove the results `name`."""
-        shutil.rmtree(self._root / checked_result(name), ignore_errors=True)
+        remove_tree(self._root / checked_result(name))
 
     def names(self) -> list[str]:
         """The folders with the names of results; anything else is somebody's, and left alone."""
@@ -160,15 +159,16 @@ class _FileReader:
 def collect(output: Path) -> list[Asset]:
     """The manifest of a job's output: each file hashed, and on the disk.
 
-    Only regular files with plain names are taken; what else a job leaves behind is dropped.
+    Only regular files with plain names and no second one are taken; what else a job leaves behind is removed.
     """
     assets: list[Asset] = []
     for path in sorted(output.iterdir()):
-        mode = path.lstat().st_mode
-        if not stat.S_ISREG(mode) or not _ASSET_NAME.match(path.name) or len(assets) >= MAX_ASSETS:
-            _remove(path)
+        found = path.lstat()
+        # A second name of a file could be one of the server's own, such as its database.
+        plain = stat.S_ISREG(found.st_mode) and found.st_nlink == 1 and _ASSET_NAME.match(path.name) is not None
+        if not plain or len(assets) >= MAX_ASSETS:
+            remove_tree(path)
             continue
-        path.chmod(0o600)
         size, digest = hash_file(path, sync=True)
         media = MEDIA_TYPES.get(path.suffix.lower(), "application/octet-stream")
         assets.append(Asset(path.name, size, digest, media))
@@ -187,10 +187,3 @@ def checked_result(name: str) -> str:
     if not _RESULT_NAME.match(name):
         raise ValueError(f"{name!r} is not the name of results")
     return name
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)

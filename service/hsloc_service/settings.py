@@ -41,6 +41,9 @@ class Settings:
     allowed_hosts: tuple[str, ...] = ("localhost", "127.0.0.1", "[::1]", "testserver")
     """Values of the Host header that are answered; `*` for any. Keeps DNS rebinding out."""
 
+    trusted_proxies: tuple[str, ...] = ()
+    """Addresses of proxies whose `X-Forwarded-For` counts as the client's address; nobody's otherwise."""
+
     max_upload_bytes: int = 64 * GIB
     """The largest file that is taken."""
     tenant_bytes: int = 256 * GIB

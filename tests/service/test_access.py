@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import socket
+import sqlite3
 import time
 import uuid
 from typing import TYPE_CHECKING, Any
@@ -312,3 +314,65 @@ def test_a_token_made_while_an_open_server_runs_closes_it(
         token = capsys.readouterr().out.split(": ")[1].strip()
         assert client.get("/v1/jobs").status_code == 401
         assert client.get("/v1/jobs", headers={"Authorization": f"Bearer {token}"}).status_code == 200
+
+
+def test_a_misspelt_query_is_refused(client: TestClient) -> None:
+    answer = client.get("/v1/jobs", params={"sate": "failed"})
+    assert (answer.status_code, answer.json()["code"]) == (422, "invalid")
+    assert "query.sate: is unknown here; known are before, limit, state" in answer.json()["message"]
+    assert client.get("/v1/info", params={"x": "1"}).status_code == 422
+    assert client.get("/v1/jobs", params={"state": "failed", "limit": 5}).status_code == 200
+
+
+def test_the_address_that_a_client_claims_does_not_count(make_live: Callable[..., Live]) -> None:
+    """Each refused request takes a token of the address; claimed ones would be a fresh bucket each."""
+    live = make_live(HSLOC_TOKEN="a-token-of-the-operator-0123456789", HSLOC_REFUSALS_PER_S="0.1")
+    with live.client() as client:
+        statuses = [client.get("/v1/jobs", headers={"X-Forwarded-For": f"10.0.0.{k}"}).status_code for k in range(5)]
+    assert statuses == [401, 401, 429, 429, 429]
+
+
+def test_metrics_and_logs_name_what_operators_ask_for(make_live: Callable[..., Live]) -> None:
+    live = make_live()
+    with live.client() as client:
+        wait(client, submit(client))
+        text = client.get("/metrics").text
+    for name in ("hsloc_job_seconds_bucket", "hsloc_job_wait_seconds_bucket", "process_resident_memory_bytes"):
+        assert name in text, name
+    assert re.search(r'hsloc_build_info\{version="[0-9.]+[^"]*"\} 1', text)
+    assert '"tenant": "local"' in live.log.read_text()
+
+
+def test_a_busy_port_is_found_before_anything_is_recovered(
+    make_live: Callable[..., Live], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    live = make_live()
+    other = tmp_path / "other"
+    assert program(["serve", "--data", str(other), "--port", str(live.port)]) == 1
+    assert f"127.0.0.1:{live.port}: cannot be listened at: Address already in use" in capsys.readouterr().err
+    assert not other.exists()
+
+
+def test_a_damaged_database_is_an_answer_and_a_line_in_the_log(make_live: Callable[..., Live]) -> None:
+    live = make_live()
+    with live.client() as client:
+        for _ in range(30):
+            upload(client, b"x")
+    live.end()
+    path = live.data / "hsloc.db"
+    with sqlite3.connect(path) as database:
+        size = int(database.execute("PRAGMA page_size").fetchone()[0])
+        (root,) = database.execute("SELECT rootpage FROM sqlite_master WHERE name = 'file'").fetchone()
+    with path.open("r+b") as file:
+        file.seek((root - 1) * size)
+        file.write(b"\xff" * size)
+    try:
+        live.start()
+    except RuntimeError as error:
+        assert "Traceback" not in str(error)  # noqa: PT017
+        assert "cannot be used as database" in str(error)  # noqa: PT017
+        return
+    with live.client() as client:
+        answer = client.get("/v1/files")
+        assert (answer.status_code, answer.json()["code"]) == (500, "database")
+    assert "Traceback" not in live.log.read_text()

@@ -8,6 +8,7 @@ row; its workers call the same `Supervisor`; a task delivered twice finds the ro
 from __future__ import annotations
 
 import threading
+import time
 import uuid
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
@@ -83,7 +84,7 @@ class LocalDispatcher:
         deletions: DeletionQueue,
         sandbox: Sandbox,
         *,
-        ended: Callable[[str], None] = lambda state: None,
+        ended: Callable[[str, float, float], None] = lambda state, seconds, waited_s: None,
         store_failed: Callable[[], None] = lambda: None,
     ) -> None:
         self._leases, self._storage, self._settings, self._deletions = leases, storage, settings, deletions
@@ -170,7 +171,9 @@ class LocalDispatcher:
                 return False
             cancel = self._running[claim.job_id] = threading.Event()
         try:
-            self._ended(state := self._supervisor.run(claim, stop=self._stop, cancel=cancel))
+            begin = time.monotonic()
+            state = self._supervisor.run(claim, stop=self._stop, cancel=cancel)
+            self._ended(state, time.monotonic() - begin, claim.waited_s)
         finally:
             self._running.pop(claim.job_id, None)
         return state != "queued"  # a job that could not be started is not tried again before IDLE_S

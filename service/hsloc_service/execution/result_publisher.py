@@ -52,8 +52,13 @@ class ResultPublisher:
             self._leases.release(claim, outcome.message, counts=outcome.reason != "shutdown")
             return "queued"
         if outcome.kind != "lost":
-            self._leases.fail(claim, outcome.kind, outcome.reason, outcome.message)
+            self._leases.fail(claim, outcome.kind, outcome.reason, self._without_paths(outcome.message, output.parent))
         return outcome.kind
+
+    @staticmethod
+    def _without_paths(message: str, folder: Path) -> str:
+        """A message without the folders of the server, which are not the tenant's business."""
+        return message.replace(f"{folder.absolute()}/", "").replace(f"{folder.absolute().parent.parent}/", "")
 
     def _publish(self, outcome: Outcome, output: Path) -> str:
         """Store the output, then commit. A crash between the two leaves results that the sweep removes."""

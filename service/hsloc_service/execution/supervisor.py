@@ -61,7 +61,9 @@ class Supervisor:
         except Interrupted as end:
             return interrupted(end.reason)
         except StoreError as error:
-            return Outcome("failed", "store", str(error))
+            log("store.error", job=claim.job_id, what="fetch", error=str(error))
+            message = "the map to extend is in a store that this server is not set to; ask its operator"
+            return Outcome("failed", "store", message)
         except OSError as error:
             return Outcome("again", "start", f"the job could not be started: {error.strerror or error}")
 

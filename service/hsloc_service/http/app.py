@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from fastapi.responses import FileResponse
 from fastapi.staticfiles import StaticFiles
 
@@ -29,7 +29,7 @@ from hsloc_service.http import (
     tus,
 )
 from hsloc_service.http.conditional import Conditional
-from hsloc_service.http.context import Context
+from hsloc_service.http.context import Context, known_query
 from hsloc_service.http.error_handlers import add_error_handlers
 from hsloc_service.http.guard import Guard
 from hsloc_service.http.openapi import add_openapi
@@ -79,7 +79,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(Conditional)
     app.add_middleware(Guard, settings=settings, tokens=Tokens(context.database))
     for router in ROUTERS:
-        app.include_router(router)
+        app.include_router(router, dependencies=[Depends(known_query)])
     _add_page(app)
     add_error_handlers(app, context.storage, [route for router in ROUTERS for route in router.routes])
     add_openapi(app)
@@ -106,7 +106,7 @@ def open_context(settings: Settings) -> Context:
         stores,
         deletions,
         sandbox,
-        ended=lambda state: metrics.ENDED.labels(state).inc(),
+        ended=metrics.attempt_ended,
         store_failed=metrics.STORE_ERRORS.inc,
     )
     return Context(

@@ -11,6 +11,7 @@ from fastapi import Depends, Request
 
 from hsloc_service.auth import Principal
 from hsloc_service.call_timeout import BoundedExecutor
+from hsloc_service.errors import ServiceError
 from hsloc_service.execution.dispatcher import Dispatcher
 from hsloc_service.http.schemas import Problem
 from hsloc_service.jobs.repository import Jobs
@@ -64,6 +65,20 @@ Ctx = Annotated[Context, Depends(_context)]
 Reader = Annotated[Principal, Depends(_principal("read"))]
 Writer = Annotated[Principal, Depends(_principal("write"))]
 Admin = Annotated[Principal, Depends(_principal("admin"))]
+
+
+def known_query(request: Request) -> None:
+    """Refuse a misspelt parameter of the query, which would be ignored."""
+    known, left = set[str](), [request.scope["route"].dependant]
+    while left:
+        dependant = left.pop()
+        known |= {each.alias for each in dependant.query_params}
+        left += dependant.dependencies
+    unknown = sorted(set(request.query_params) - known)
+    if unknown:
+        names = f"known are {', '.join(sorted(known))}" if known else "it takes none"
+        raise ServiceError(422, "invalid", f"query.{unknown[0][:60]}: is unknown here; {names}")
+
 
 _MEANINGS = {
     400: "the request cannot be understood",

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Any
 
 from fastapi import Request, Response
 from fastapi.exceptions import RequestValidationError
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DatabaseError, OperationalError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match
@@ -58,6 +59,11 @@ def add_error_handlers(app: FastAPI, storage: Storage, routes: Sequence[BaseRout
         log("store.error", error=str(error))
         headers = _closing(request, {"Retry-After": "5"})
         return _answer(503, "store", "the results cannot be reached just now; try again", headers)
+
+    @app.exception_handler(DatabaseError)
+    async def damaged(_request: Request, error: DatabaseError) -> Response:
+        log("database.damaged", logging.ERROR, error=str(error.orig), remedy="restore a backup: hsloc serve --backup")
+        return _answer(500, "database", "the server's database is damaged; tell its operator", {"connection": "close"})
 
     @app.exception_handler(OperationalError)
     async def database(_request: Request, error: OperationalError) -> Response:

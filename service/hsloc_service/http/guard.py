@@ -97,7 +97,15 @@ class Guard:
             if not route.endswith("/events"):
                 metrics.LATENCY.labels(route).observe(seconds)
             if status >= 400 or not route.startswith(("/healthz", "/readyz", "/metrics")):
-                log("request", method=scope["method"], route=route, status=status, ms=round(seconds * 1000, 1))
+                who = scope.get("state", {}).get("principal")
+                log(
+                    "request",
+                    method=scope["method"],
+                    route=route,
+                    status=status,
+                    ms=round(seconds * 1000, 1),
+                    tenant=None if who is None else who.tenant,
+                )
 
     async def _admit(self, scope: Scope) -> Principal | None:
         headers = Headers(scope=scope)

@@ -48,6 +48,8 @@ class Claim(NamedTuple):
     names: dict[str, str]
     """Labels of the files of the request."""
     source: Source | None = None
+    waited_s: float = 0.0
+    """Time since the job was submitted [s]."""
 
 
 class HeartbeatReply(NamedTuple):
@@ -78,7 +80,8 @@ class Leases:
             job.phase = job.done = job.total = job.scans = job.speed = job.progressed = None
             record(session, job, "state", {"state": "running", "attempt": job.attempt})
             names, source = _names(session, job.request), _source(session, job)
-            return Claim(job.id, job.tenant, owner, job.attempt, job.log_name, job.request, names, source)
+            waited_s = max(now - job.created, 0.0)
+            return Claim(job.id, job.tenant, owner, job.attempt, job.log_name, job.request, names, source, waited_s)
 
     def beat(self, claim: Claim, progress: dict[str, Any] | None) -> HeartbeatReply:
         """Renew the lease, and write the progress."""

@@ -1,15 +1,17 @@
-"""All parts of the benchmark in one call."""
+"""All parts of the benchmark in one call, and the machine that they ran on."""
 
 from __future__ import annotations
 
+import os
+import platform
 import tempfile
 from dataclasses import dataclass, replace
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.benchmark.cases import read_cases, run_method
 from hsloc.benchmark.kernel import time_kernel, time_matches
-from hsloc.benchmark.machine import load, machine
 from hsloc.benchmark.memory import measure_memory
 from hsloc.benchmark.methods import our_methods, peers
 from hsloc.benchmark.replaying import fixture, time_replay
@@ -18,6 +20,7 @@ from hsloc.benchmark.sub_cell import measure_sub_cell
 from hsloc.benchmark.targets import Bench
 from hsloc.simulation.presets import OFFICE
 from hsloc.simulation.recorder import record
+from hsloc.version import __version__
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -69,7 +72,7 @@ def run_bench(
     """
     sizes = QUICK if quick else Sizes()
     bench = Bench(machine=machine(), load_after=None, quick=quick)
-    # First of all: a wrong file is told before minutes of work.
+    # First of all: a wrong file is reported before minutes of work.
     given = None if cases is None or "cases" not in parts else read_cases(cases).first(sizes.cases)
     if "kernel" in parts or "match" in parts:
         progress("kernel", 0.0)
@@ -94,19 +97,56 @@ def run_bench(
         rows: list[CaseResult] = []
         for index, method in enumerate(methods):
 
-            def tell(share: float, index: int = index) -> None:
+            def report(share: float, index: int = index) -> None:
                 progress("cases", (index + share) / len(methods))
 
-            rows += run_method(method, given, tell)
+            rows += run_method(method, given, report)
         bench = replace(bench, cases_name=given.name, cases=tuple(rows), notes=tuple(notes))
     return replace(bench, load_after=load())
 
 
 def _log(folder: Path, sizes: Sizes) -> Path:
-    """The fixture where there is one, else the same recorded anew; or a short one."""
+    """The fixture where there is one, else the same, recorded again; or a short one."""
     found = fixture()
     if found is not None and sizes.replay_seconds is None:
         return found
     path = folder / "office.mcap"
     record(replace(OFFICE, seed=1, duration_s=sizes.replay_seconds), path)
     return path
+
+
+PACKAGES = ("numpy", "numba", "scipy", "mealpy", "small-gicp")
+
+
+def machine() -> dict[str, object]:
+    """Processor, cores, load and versions; a package that is missing is None."""
+    return {
+        "cpu": _cpu(),
+        "cores": os.cpu_count(),
+        "load_average": load(),
+        "platform": platform.platform(),
+        "python": platform.python_version(),
+        "hsloc": __version__,
+        **{name: _version(name) for name in PACKAGES},
+    }
+
+
+def load() -> tuple[float, ...] | None:
+    """Load over 1, 5 and 15 minutes: above 0 before a benchmark somebody else is at work."""
+    return tuple(round(value, 2) for value in os.getloadavg()) if hasattr(os, "getloadavg") else None
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None

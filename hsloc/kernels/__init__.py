@@ -1,1 +1,5 @@
-"""COMPILED: the only package that imports numba. Arrays in, arrays out."""
+"""Compiled kernels on arrays, the only code that numba compiles; each has a naive twin in the tests."""
+
+from hsloc.kernels.cache import choose_cache
+
+choose_cache()

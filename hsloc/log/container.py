@@ -7,10 +7,14 @@ from itertools import islice
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from hsloc.log.summary import Losses, TopicStatistics
+    from hsloc.warnings import RunWarning
 
 RawMessage = tuple[int, int, int, "memoryview | bytes"]
 """(log time in ns, position in the file, id of the channel, payload). Positions are unique in a file."""
@@ -38,6 +42,21 @@ def in_runs(messages: Iterator[RawMessage], size: int) -> Iterator[list[RawMessa
         yield run
 
 
+_HOUR_NS = 3600 * 1_000_000_000
+
+
+def plausible_times(ordered: Sequence[int] | NDArray[np.uint64]) -> tuple[int, int]:
+    """Between which log times (ns) sorted log times of one part of a log are believed.
+
+    The inner nine tenths say how long the part is. A few times that are farther outside than twice that length and an
+    hour are wrong: a counter that overflowed, or a clock that was not set.
+    """
+    cut = len(ordered) // 20
+    low, high = int(ordered[cut]), int(ordered[-1 - cut])
+    margin = 2 * (high - low) + _HOUR_NS
+    return low - margin, min(high + margin, (1 << 63) - 1)
+
+
 class Container(Protocol):
     """A file, or a folder that is one recording.
 
@@ -61,7 +80,7 @@ class Container(Protocol):
     @property
     def losses_at_opening(self) -> Losses: ...  # noqa: D102
     @property
-    def warnings(self) -> list[str]: ...  # noqa: D102
+    def warnings(self) -> list[RunWarning]: ...  # noqa: D102
 
     def runs(self, wanted: Collection[int], losses: Losses) -> Iterator[list[RawMessage]]:
         """Messages of the wanted channels, in lists as they come out of the file."""

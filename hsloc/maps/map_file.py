@@ -15,6 +15,7 @@ from hsloc.errors import MapError, OutputError
 from hsloc.maps.metadata import MapMetadata, metadata_text, read_metadata
 from hsloc.model import OccupancyGrid
 from hsloc.model.occupancy_grid import FREE, OCCUPIED, UNKNOWN
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
 
 FREE_PIXEL, UNKNOWN_PIXEL, OCCUPIED_PIXEL = 254, 205, 0
 UNKNOWN_PROBABILITY = (255 - UNKNOWN_PIXEL) / 255
-"""0.19608: what pixel 205 says. A free_thresh at or above makes the unknown free."""
+"""Occupancy of pixel 205, 0.19608. A free_thresh at or above makes the unknown free."""
 MAX_CELLS = 100_000_000
+"""Maximum number of cells of a map that is read. Internal: guards the memory against a damaged file."""
 IMAGES = (".pgm", ".png", ".bmp", ".pnm")
 FORMATS = ("PPM", "PNG", "BMP")
 """Pillow's decoders that a map's image may reach, by its content: PGM belongs to PPM. Among the other 40 are programs
@@ -37,13 +39,13 @@ class LoadedMap:
     """A map, and what its user should know about it."""
 
     grid: OccupancyGrid
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[RunWarning, ...] = ()
 
 
 class _Pixels(NamedTuple):
     """Brightness 0 .. 1 and opacity, first row on top.
 
-    For grey images they stand for each level of grey once, and `level` says which level each pixel has.
+    For grey images there is one for each level of grey, and `level` is the level of each pixel.
     """
 
     shade: Plane
@@ -92,7 +94,9 @@ def _read_image(path: Path, metadata: MapMetadata) -> _Pixels:
                 opened.load()
                 return _planes(opened, metadata.mode)
     except FileNotFoundError as error:
-        raise MapError(f"{path}: its image {image} does not exist") from error
+        raise MapError(
+            f"{path}: its image {image} does not exist; put {image.name} beside the YAML, or name it under `image:`"
+        ) from error
     except UnidentifiedImageError as error:
         raise MapError(f"{image}: is no PGM, PNG or BMP image; convert it to one of them") from error
     except MapError:
@@ -144,7 +148,7 @@ def _cells(metadata: MapMetadata, shade: Plane, opaque: NDArray[np.bool_]) -> ND
     return cells.astype(np.int8)
 
 
-def _warnings(path: Path, metadata: MapMetadata, pixels: _Pixels, grid: OccupancyGrid) -> tuple[str, ...]:
+def _warnings(path: Path, metadata: MapMetadata, pixels: _Pixels, grid: OccupancyGrid) -> tuple[RunWarning, ...]:
     found = []
     probability = pixels.shade if metadata.negate else 1.0 - pixels.shade
     unknown = np.abs(probability - UNKNOWN_PROBABILITY) < 1e-6
@@ -152,11 +156,19 @@ def _warnings(path: Path, metadata: MapMetadata, pixels: _Pixels, grid: Occupanc
         unknown = unknown[pixels.level]
     if metadata.mode == "trinary" and metadata.free_thresh >= UNKNOWN_PROBABILITY and unknown.any():
         found.append(
-            f"{path}: free_thresh {metadata.free_thresh} makes free of {int(unknown.sum())} pixels of value 205, "
-            "which mean unknown; write free_thresh: 0.196 if they do"
+            RunWarning(
+                WarningCode.MAP_UNKNOWN_READ_AS_FREE,
+                f"{path}: free_thresh {metadata.free_thresh} makes {int(unknown.sum())} pixels of value 205 free, "
+                "which usually mean unknown",
+                "write free_thresh: 0.196 if they do",
+            )
         )
     if not grid.occupied().any():
-        found.append(f"{path}: the map has no occupied cell; check negate and occupied_thresh")
+        found.append(
+            RunWarning(
+                WarningCode.MAP_EMPTY, f"{path}: the map has no occupied cell", "check negate and occupied_thresh"
+            )
+        )
     return tuple(found)
 
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.model import OccupancyGrid
+    from hsloc.warnings import RunWarning
 
     Array = NDArray[np.float64]
 
@@ -25,10 +26,10 @@ class World:
     """Walls and a way through them, in metres in the map frame.
 
     `segments` (n, 4) are x0 y0 x1 y1. `waypoints` (m, 2) are corners of the path that the robot follows; where
-    `closed`, it goes on from the last to the first, lap after lap. `points` (k, 2) are what the report's sensor
+    `closed`, it goes on from the last to the first, lap after lap. `points` (k, 2) are what the course report's sensor
     sees, whatever stands between, or None where the world has walls. `start_heading` is the robot's heading at the
     first waypoint in radians, or None: towards the second. `grid` is the map that the world was made from, if any,
-    and `notes` are what the user should know about it.
+    and `warnings` are those of its map.
     """
 
     name: str
@@ -38,7 +39,7 @@ class World:
     points: Array | None = None
     start_heading: float | None = None
     grid: OccupancyGrid | None = None
-    notes: tuple[str, ...] = ()
+    warnings: tuple[RunWarning, ...] = ()
 
     def path(self, laps: float = 1.0) -> Array:
         """The waypoints of `laps` laps, shape (k, 2); of a broken lap, its first part.

@@ -106,7 +106,8 @@ def listen(host: str, port: int) -> socket.socket:
         family, _, _, _, address = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)[0]
         return socket.create_server(address, family=family, backlog=BACKLOG)
     except OSError as error:
-        cause = os.strerror(error.errno) if (error.errno or 0) > 0 else error.strerror
+        number = error.errno or 0
+        cause = os.strerror(number) if number > 0 else error.strerror
         raise SettingsError(f"{host}:{port}: cannot be listened at: {cause}; give another --host or --port") from error
 
 

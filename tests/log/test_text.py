@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_builders import DATA, SECOND
+from log_builders import SECOND
+from paths import DATA
 
 from hsloc.errors import HslocError, LogFormatError, TopicError
 from hsloc.log.reader import open_log
@@ -78,7 +79,7 @@ def test_each_line_is_an_event_in_the_order_of_the_file(tmp_path: Path, name: st
     summary = log.summary
     assert (summary.format, summary.scan_topic, summary.odom_topic) == ("CARMEN", "FLASER", "ODOM")
     assert (summary.order, summary.extrinsics) == ("log", "identity")
-    assert "--laser-pose" in summary.warnings[0]
+    assert "--laser-pose" in summary.warnings[0].remedy
 
 
 def test_the_laser_pose_may_be_given(tmp_path: Path) -> None:

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 import time
 import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pytest
 from live_service import settings, submit, wait
 from sqlalchemy import insert
+from sqlalchemy.exc import OperationalError
 
 from hsloc_service.db.tables import EventRow, FileRow, IdempotencyRow, JobRow
 from hsloc_service.housekeeping import Housekeeping
 from hsloc_service.settings import SettingsError, from_environment, parse_size
+from hsloc_service.storage import Storage
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from fastapi.testclient import TestClient
-
-import pytest
 
 
 def test_old_jobs_go_with_results_and_uploads_but_active_ones_stay(make_client: Callable[..., TestClient]) -> None:
@@ -123,3 +125,36 @@ def test_retention_of_many_jobs_holds_up_nobody(make_client: Callable[..., TestC
     assert client.get("/v1/jobs").json()["jobs"] == []
     assert client.get("/v1/files").json()["files"] == []
     assert max(waits) < 2.0  # 60 batches; one takes 0.1 s on an idle machine
+
+
+@pytest.mark.parametrize(
+    ("code", "words", "full"),
+    [
+        (sqlite3.SQLITE_FULL, "in other words", True),
+        (sqlite3.SQLITE_ERROR, "no such table: full", False),
+        (None, "database or disk is full", False),
+    ],
+)
+def test_a_full_disk_is_known_by_its_code_and_not_by_words(
+    tmp_path: Path, code: int | None, words: str, full: bool
+) -> None:
+    storage = Storage(tmp_path, 0)
+    storage.restore_ballast()
+    (tmp_path / "ballast").touch()
+    cause = sqlite3.OperationalError(words)
+    if code is not None:
+        cause.sqlite_errorcode = code
+    tries = []
+
+    def work() -> None:
+        tries.append((tmp_path / "ballast").exists())
+        if len(tries) == 1:
+            raise OperationalError("delete", {}, cause)
+
+    if full:
+        storage.with_room(work)
+        assert tries == [True, False]
+    else:
+        with pytest.raises(OperationalError):
+            storage.with_room(work)
+    storage.close()

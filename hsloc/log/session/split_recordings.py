@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, NamedTuple
 from hsloc.errors import LogError
 from hsloc.log.messages.decode import OdometryMessage, PoseMessage
 from hsloc.log.messages.decoders import Undecodable, decoder_for, is_decodable
-from hsloc.log.session.topic_selection import carries
 from hsloc.log.summary import NANOSECONDS, Losses, PartSummary
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
-    from hsloc.log.container import Container, RawMessage
+    from hsloc.log.container import Channel, Container, RawMessage
     from hsloc.log.messages.decoders import Decoder
     from hsloc.model import Pose2
 
@@ -41,6 +41,8 @@ _RESET, _AWAY = 0.01, 0.5
 _ENDS = 200
 """Messages looked at on either end of a part."""
 
+_ANOTHER_RUN = "if that is another run, replay each file by itself"
+
 
 class _Edge(NamedTuple):
     """Odometry at one end of a part."""
@@ -52,14 +54,15 @@ class _Edge(NamedTuple):
 def check_parts(
     containers: Sequence[Container],
     scan_topics: Iterable[str],
-    odom_topic: str | None,
+    odometry: Collection[str],
     tf_frames: tuple[str, str] | None,
-) -> tuple[tuple[PartSummary, ...], list[str]]:
-    """The files in the order of time, and what is doubtful about their being parts of one run.
+) -> tuple[tuple[PartSummary, ...], list[RunWarning]]:
+    """The files in the order of time, and warnings where they may not be parts of one run.
 
-    `tf_frames` are the frames of the odometry where `odom_topic` is /tf. Raises LogError for files that are not.
+    `odometry` are the topics that carry it, `tf_frames` its frames where these are transforms. Raises LogError for
+    files that are not parts of one run.
     """
-    topics = [*([] if odom_topic is None else [odom_topic]), *scan_topics]
+    topics = [*odometry, *scan_topics]
     found = [(part, container) for container in containers if (part := _span(container, topics)) is not None]
     found.sort(key=lambda entry: (entry[0].start_ns, entry[0].end_ns))
     parts = tuple(part for part, _ in found)
@@ -69,7 +72,7 @@ def check_parts(
         spans = [span for _, container in found if (span := _span(container, [topic])) is not None]
         for a, b in combinations(spans, 2):
             _refuse_same_time(a, b, topic)
-    return parts, _gaps(parts) + ([] if odom_topic is None else _jumps(found, odom_topic, tf_frames))
+    return parts, _gaps(parts) + _jumps(found, odometry, tf_frames)
 
 
 def _span(container: Container, topics: Sequence[str]) -> PartSummary | None:
@@ -80,11 +83,16 @@ def _span(container: Container, topics: Sequence[str]) -> PartSummary | None:
     statistics = [
         container.statistics[channel.id]
         for channel in container.channels.values()
-        if channel.id in container.statistics and any(carries(channel, topic) for topic in topics)
+        if channel.id in container.statistics and _is_one_of(channel, topics)
     ]
     firsts = [item.first_ns for item in statistics if item.count and item.first_ns is not None]
     lasts = [item.last_ns for item in statistics if item.count and item.last_ns is not None]
     return PartSummary(container.path, min(firsts), max(lasts)) if firsts and lasts else None
+
+
+def _is_one_of(channel: Channel, topics: Collection[str]) -> bool:
+    """Whether a channel's topic is one of these, with or without the leading slash that ROS 1 leaves out."""
+    return channel.topic.lstrip("/") in {topic.lstrip("/") for topic in topics}
 
 
 def _refuse_same_time(a: PartSummary, b: PartSummary, topic: str) -> None:
@@ -97,15 +105,16 @@ def _refuse_same_time(a: PartSummary, b: PartSummary, topic: str) -> None:
         )
 
 
-def _gaps(parts: Sequence[PartSummary]) -> list[str]:
+def _gaps(parts: Sequence[PartSummary]) -> list[RunWarning]:
     warnings = []
     last = parts[0]
     for part in parts[1:]:
         gap = part.start_ns - last.end_ns
         if gap > GAP_NS:
             warnings.append(
-                f"{part.path} begins {_duration(gap)} after {last.path} ends: if that is another drive, run each by "
-                "itself"
+                RunWarning(
+                    WarningCode.PARTS_GAP, f"{part.path} begins {_duration(gap)} after {last.path} ends", _ANOTHER_RUN
+                )
             )
         last = max(last, part, key=lambda item: item.end_ns)
     return warnings
@@ -119,39 +128,47 @@ def _duration(nanoseconds: int) -> str:
     return f"{hours} h {minutes:02d} min" if hours < 48 else f"{hours // 24} days"
 
 
-def _jumps(found: Sequence[tuple[PartSummary, Container]], topic: str, tf_frames: tuple[str, str] | None) -> list[str]:
-    ends = [(part, *_edges(container, topic, tf_frames)) for part, container in found]
+def _jumps(
+    found: Sequence[tuple[PartSummary, Container]], odometry: Collection[str], tf_frames: tuple[str, str] | None
+) -> list[RunWarning]:
+    ends = [(part, *_edges(container, odometry, tf_frames)) for part, container in found]
     told = [(part, first, last) for part, first, last in ends if first is not None and last is not None]
     return [
-        doubt
+        warning
         for (before, _, end), (after, begin, _) in pairwise(sorted(told, key=lambda entry: entry[1].log_time_ns))
-        for doubt in _jump(before, end, after, begin)
+        for warning in _jump(before, end, after, begin)
     ]
 
 
-def _jump(a: PartSummary, end: _Edge, b: PartSummary, begin: _Edge) -> list[str]:
+def _jump(a: PartSummary, end: _Edge, b: PartSummary, begin: _Edge) -> list[RunWarning]:
     """What the odometry says to one part following the other."""
     # Where the edges overlap, too, the robot was at either end of so much time.
     seconds = abs(begin.log_time_ns - end.log_time_ns) / NANOSECONDS
     way = hypot(begin.pose.x - end.pose.x, begin.pose.y - end.pose.y)
     if hypot(begin.pose.x, begin.pose.y) < _RESET and hypot(end.pose.x, end.pose.y) > _AWAY:
-        return [f"the odometry begins anew with {b.path}: if that is another drive, run each by itself"]
+        return [
+            RunWarning(
+                WarningCode.PARTS_ODOMETRY_RESET, f"the odometry starts again from zero with {b.path}", _ANOTHER_RUN
+            )
+        ]
     what = f"the odometry is {way:.1f} m away when {b.path} goes on, {seconds:.1f} s from the end of {a.path}"
     if way > POSSIBLE_JUMP + POSSIBLE_SPEED * seconds:
         raise LogError(
             f"{what}, so they are not parts of one run; run each by itself, or all with `hsloc sweep {a.path} {b.path}`"
         )
     if way > LIKELY_JUMP + LIKELY_SPEED * seconds:
-        return [f"{what}: if that is another drive, run each by itself"]
+        return [RunWarning(WarningCode.PARTS_ODOMETRY_JUMP, what, _ANOTHER_RUN)]
     return []
 
 
-def _edges(container: Container, topic: str, tf_frames: tuple[str, str] | None) -> tuple[_Edge | None, _Edge | None]:
+def _edges(
+    container: Container, odometry: Collection[str], tf_frames: tuple[str, str] | None
+) -> tuple[_Edge | None, _Edge | None]:
     """The first and the last odometry of a file. All of the topic is read, but little of it decoded."""
     decoders = {
         channel.id: decoder_for(channel)
         for channel in container.channels.values()
-        if carries(channel, topic) and is_decodable(channel)
+        if _is_one_of(channel, odometry) and is_decodable(channel)
     }
     messages = container.messages(decoders.keys(), Losses())
     # Copies: a view would hold on to the chunk that it is part of.

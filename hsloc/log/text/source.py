@@ -15,6 +15,7 @@ from hsloc.log.text.carmen import Carmen
 from hsloc.log.text.max_range_inference import RANGE_MIN, RangeRule
 from hsloc.log.text.wean import Wean
 from hsloc.model import IDENTITY, Odometry, Scan
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -81,8 +82,10 @@ def find_format(path: Path) -> LineFormat | None:
 class TextSource:
     """A text log as events in the order of its lines: there the order is right even where the stamps are not."""
 
-    def __init__(self, path: Path, line_format: LineFormat, options: ReadOptions) -> None:
+    def __init__(self, path: Path, line_format: LineFormat, options: ReadOptions, shown: Path | None = None) -> None:
+        """`shown` is the name for messages to people, where the file is a copy of another."""
         self._path = path
+        self._shown = shown or path
         self._format = line_format
         self._options = options
         self._rule = RangeRule()
@@ -99,7 +102,7 @@ class TextSource:
                 line = parse(words)
             except (ValueError, IndexError, OverflowError) as error:
                 losses.undecodable_messages[words[0]] += 1
-                losses.note(f"{self._path}: a line {words[0]} cannot be read ({str(error)[:80]})")
+                losses.note(f"{self._shown}: a line {words[0]} cannot be read ({str(error)[:80]})")
                 continue
             yield words[0], line
 
@@ -168,22 +171,26 @@ class TextSource:
         scan: Scan | None,
         scan_keyword: str,
     ) -> LogSummary:
-        extrinsics, warnings = "identity", []
+        extrinsics, warnings = "identity", list[RunWarning]()
         if self._options.laser_pose is not None:
             extrinsics = "option"
         elif scan_keyword in self._format.states_mounting:
             extrinsics = "file format"
         elif scan is not None:
             warnings.append(
-                f"{scan_keyword} lines do not say where the laser stands: it is taken to stand in the base's "
-                "place; give --laser-pose x,y,yaw"
+                RunWarning(
+                    WarningCode.EXTRINSICS_ASSUMED,
+                    f"{scan_keyword} lines do not state where the laser is mounted: it is assumed to be at the origin "
+                    "of the base",
+                    "give --laser-pose x,y,yaw",
+                )
             )
         mounting = self._options.laser_pose or (scan.T_base_laser if scan else IDENTITY)
         odometry = kinds["odometry"]
         if self._has_odometry_lines and not self._format.laser_odometry:
             odometry = {keyword: None for keyword in odometry if keyword not in kinds["scan"]}
         return LogSummary(
-            paths=(self._path,),
+            paths=(self._shown,),
             format=self._format.name,
             start_ns=first_ns,
             end_ns=last_ns,
@@ -207,11 +214,11 @@ class TextSource:
     def _check(self, has_scans: bool, has_odometry: bool) -> None:
         for flag, name in (("scan", self._options.scan_topic), ("odom", self._options.odom_topic)):
             if name is not None:
-                raise TopicError(f"{self._path}: a text log has no topics; leave out --{flag}-topic {name}")
+                raise TopicError(f"{self._shown}: a text log has no topics; leave out --{flag}-topic {name}")
         if self._options.require_scan and not has_scans:
-            raise TopicError(f"{self._path}: no laser lines in this {self._format.name} log")
+            raise TopicError(f"{self._shown}: no laser lines in this {self._format.name} log")
         if self._options.require_odometry and not has_odometry:
-            raise TopicError(f"{self._path}: no odometry lines in this {self._format.name} log")
+            raise TopicError(f"{self._shown}: no odometry lines in this {self._format.name} log")
 
     def events(self, losses: Losses) -> Iterator[tuple[int, Event]]:
         """As `Source.events`: in the order of the lines; effective stamps are the running maximum."""

@@ -25,6 +25,7 @@ from hsloc_service.http import (
     metrics,
     results_routes,
     run_routes,
+    schema_routes,
     system_routes,
     tus,
 )
@@ -53,7 +54,16 @@ if TYPE_CHECKING:
 
 ROUTERS = tuple(
     module.router
-    for module in (files_routes, tus, jobs_routes, events_routes, results_routes, run_routes, system_routes)
+    for module in (
+        files_routes,
+        tus,
+        jobs_routes,
+        events_routes,
+        results_routes,
+        run_routes,
+        schema_routes,
+        system_routes,
+    )
 )
 WEB = Path(__file__).parent.parent / "web"
 

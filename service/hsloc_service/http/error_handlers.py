@@ -12,7 +12,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match
 
-from hsloc_service.errors import ServiceError, StoreError
+from hsloc_service.errors import ServiceError, StoreError, is_disk_full
 from hsloc_service.http import metrics
 from hsloc_service.http.guard import problem
 from hsloc_service.logs import log
@@ -68,7 +68,7 @@ def add_error_handlers(app: FastAPI, storage: Storage, routes: Sequence[BaseRout
     @app.exception_handler(OperationalError)
     async def database(_request: Request, error: OperationalError) -> Response:
         log("database.error", error=str(error.orig))
-        if "full" in str(error.orig):
+        if is_disk_full(error):
             storage.drop_ballast()
             return _answer(507, "no_space", "the server's disk is full; try again", {"Retry-After": "1"})
         return _answer(503, "database", "the database is busy", {"Retry-After": "1"})

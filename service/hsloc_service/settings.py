@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 MIB, GIB = 1 << 20, 1 << 30
 WORKER = (sys.executable, "-P", "-m", "hsloc_service.execution.worker")
-SANDBOXES = ("auto", "bubblewrap", "landlock", "none")
+SANDBOXES = ("auto", "bubblewrap", "landlock", "if-possible", "none")
 
 
 class SettingsError(ValueError):
@@ -80,7 +80,8 @@ class Settings:
     """NUMBA_NUM_THREADS of a job's process."""
     sandbox: str = "auto"
     """What keeps a job's process from the server's files and the network: `bubblewrap`, `landlock`, `auto` for the
-    first of them that this machine has (none: the server does not start), or `none`."""
+    first of them that this machine has (none: the server does not start), `if-possible` for the same with a warning
+    instead of a refusal, or `none`."""
     grace_s: float = 3.0
     """Time between SIGTERM and SIGKILL when a job is cancelled."""
     max_attempts: int = 3

@@ -6,6 +6,7 @@ in the namespaces of the server.
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import subprocess
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc_service.execution import landlock
+from hsloc_service.logs import log
 from hsloc_service.settings import SettingsError
 
 if TYPE_CHECKING:
@@ -106,17 +108,20 @@ def choose_sandbox(wanted: str, data: Path, command: tuple[str, ...]) -> Sandbox
     if wanted == "none":
         return Sandbox("none", hidden, command)
     reasons = []
-    if wanted in ("auto", "bubblewrap"):
+    if wanted in ("auto", "if-possible", "bubblewrap"):
         if (reason := bubblewrap_problem()) is None:
             return Sandbox("bubblewrap", hidden, command)
         reasons.append(f"bubblewrap: {reason}")
-    if wanted in ("auto", "landlock"):
+    if wanted in ("auto", "if-possible", "landlock"):
         if (version := landlock.abi()) >= landlock.MIN_ABI:
             return Sandbox("landlock", hidden, command)
         reasons.append(f"Landlock: the kernel has version {version}, {landlock.MIN_ABI} is needed")
+    problem = f"jobs cannot be kept apart on this machine ({'; '.join(reasons)})"
+    if wanted == "if-possible":
+        log("sandbox.none", logging.WARNING, problem=problem)
+        return Sandbox("none", hidden, command)
     raise SettingsError(
-        f"jobs cannot be kept apart on this machine ({'; '.join(reasons)}); install bubblewrap, or, where all who may "
-        "upload trust each other, set HSLOC_SANDBOX=none"
+        f"{problem}; install bubblewrap, or, where all who may upload trust each other, set HSLOC_SANDBOX=none"
     )
 
 

@@ -1,4 +1,4 @@
-"""Everything that an operator can set, with the defaults of a server for one person on one machine."""
+"""The settings of the service; the defaults are those of a server for one person on one machine."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class Settings:
     results_url: str = ""
     """Where results go instead of the data folder, as fsspec knows it: `s3://bucket/prefix`, `file:///mnt/results`."""
     store_timeout_s: float = 30.0
-    """A store that takes longer for one call is taken for dead (503); a job's results are tried again."""
+    """Time limit for one call to a store of results [s]; then it counts as dead (503), and a job's results are retried."""
     slots: int = 1
-    """Jobs that run at the same time."""
+    """Number of jobs that run at the same time."""
 
     require_token: bool = False
     """Refuse requests without a bearer token. `hsloc serve` sets it unless it listens on loopback without tokens."""
@@ -45,35 +45,35 @@ class Settings:
     """Addresses of proxies whose `X-Forwarded-For` counts as the client's address; nobody's otherwise."""
 
     max_upload_bytes: int = 64 * GIB
-    """The largest file that is taken."""
+    """Maximum size of an upload [B]."""
     tenant_bytes: int = 256 * GIB
-    """What the uploads and results of one tenant may take together; more are refused (507)."""
+    """Maximum size of the uploads and results of one tenant together [B]; more are refused (507)."""
     min_free_bytes: int = 256 * MIB
-    """Uploads and jobs are refused (507) when the disk has less; keeps room for the database and for deleting."""
+    """Free space of the disk below which uploads and jobs are refused (507) [B]: room for the database and for deleting."""
     upload_ttl_s: float = 24 * 3600.0
-    """An upload that was not finished by then is removed."""
+    """Time after the last byte at which an unfinished upload is deleted [s]."""
     housekeeping_s: float = 60.0
-    """How often expired uploads and old jobs are looked for."""
+    """Time between two searches for expired uploads and old jobs [s]."""
     retention_s: float | None = None
-    """Finished jobs older than this are removed with their results; None keeps them."""
+    """Age at which finished jobs are deleted with their results [s]; None keeps them."""
 
     max_queued: int = 100
-    """Jobs of one tenant that may wait; more are refused (429)."""
+    """Maximum number of waiting jobs of one tenant; more are refused (429)."""
     max_streams: int = 64
-    """Event streams of one tenant at the same time."""
+    """Maximum number of event streams of one tenant at the same time."""
     requests_per_s: float = 200.0
-    """Requests of one tenant, on average; a burst of twice as many passes."""
+    """Maximum rate of requests of one tenant [1/s]; a burst of twice as many passes."""
     refusals_per_s: float = 1.0
-    """Requests of one address without a valid token, on average; a burst of twenty times as many passes."""
+    """Maximum rate of requests of one address without a valid token [1/s]; a burst of 20 times as many passes."""
 
     job_memory_bytes: int = 4 * GIB
     """Address space of a job's process (RLIMIT_AS)."""
     job_cpu_s: float = 4 * 3600.0
     """Processor time of a job's process (RLIMIT_CPU)."""
     job_wall_s: float = 6 * 3600.0
-    """A job that takes longer is killed."""
+    """Wall time after which a job is killed [s]."""
     job_output_bytes: int = 8 * GIB
-    """What a job may write, together (and RLIMIT_FSIZE, for one file)."""
+    """Maximum size of all that a job writes, and of one file (RLIMIT_FSIZE) [B]."""
     job_open_files: int = 256
     """RLIMIT_NOFILE of a job's process."""
     job_threads: int = 1
@@ -83,41 +83,41 @@ class Settings:
     first of them that this machine has (none: the server does not start), `if-possible` for the same with a warning
     instead of a refusal, or `none`."""
     grace_s: float = 3.0
-    """Time between SIGTERM and SIGKILL when a job is cancelled."""
+    """Time between SIGTERM and SIGKILL when a job is cancelled [s]."""
     max_attempts: int = 3
-    """A job whose process or server died so often is given up as crashed."""
+    """Number of attempts after which a job whose process or server was killed ends as crashed."""
     lease_s: float = 30.0
-    """A job whose server has not said for so long that it lives goes back into the queue."""
+    """Time without a heartbeat after which a job goes back into the queue [s]."""
     heartbeat_s: float = 5.0
-    """How often it says so."""
+    """Time between two heartbeats of a running job [s]."""
 
     header_timeout_s: float = 5.0
-    """A client must send its request line and headers within this time."""
+    """Time within which a client must send its request line and headers [s]."""
     body_timeout_s: float = 8.0
-    """A client that sends nothing of its announced body for so long is cut off."""
+    """Time without a byte of an announced body after which the connection is closed [s]."""
     min_body_bytes_per_s: int = 512
-    """A client whose body comes more slowly than this, over 2.5 times `body_timeout_s`, is cut off [B/s]."""
+    """Minimum rate of a body, averaged over 2.5 times `body_timeout_s` [B/s]; a slower connection is closed."""
     write_timeout_s: float = 60.0
-    """A client that takes nothing of its answer for so long is cut off."""
+    """Time without progress of an answer after which the connection is closed [s]."""
     max_connections: int = 4096
-    """Connections at the same time; more are closed at once."""
+    """Maximum number of connections at the same time; more are closed at once."""
 
     webhook_private: bool = False
     """Deliver webhooks to private and loopback addresses, too."""
     webhook_attempts: int = 8
-    """A webhook is given up after so many attempts."""
+    """Number of attempts after which a webhook is given up."""
     webhook_backoff_s: float = 2.0
-    """Wait after the first failed attempt; doubled after each more, up to an hour."""
+    """Wait after the first failed attempt [s]; doubled after each further one, up to an hour."""
 
     fault_drop_uploads: float = 0.0
-    """TEST ONLY: the part of upload requests that is cut off in the middle."""
+    """TEST ONLY: share of upload requests that are cut off in the middle, 0 to 1."""
     fault_fail_requests: float = 0.0
-    """TEST ONLY: the part of API requests that is answered with 503."""
+    """TEST ONLY: share of API requests that are answered with 503, 0 to 1."""
     fault_fail_jobs: float = 0.0
-    """TEST ONLY: the part of jobs that fails."""
+    """TEST ONLY: share of jobs that fail, 0 to 1."""
 
     worker_command: tuple[str, ...] = field(default=WORKER, repr=False)
-    """The program of a job's process; gets the job's folder, a pipe and the server's process id."""
+    """Program of a job's process; its arguments are the job's folder, a pipe and the server's process id."""
 
     def __post_init__(self) -> None:
         for each in dataclasses.fields(self):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 BALLAST = "ballast"
-"""A file that is given up when the disk is full, so that the database can delete."""
+"""A file that is deleted when the disk is full, so that the database has room to delete."""
 BALLAST_BYTES = 4 << 20
 MAX_DEPTH = 64
 """Folders in folders that a job may make."""
@@ -50,7 +50,7 @@ class Storage:
         self.restore_ballast()
 
     def close(self) -> None:
-        """Let another server have the folder."""
+        """Release the lock of the folder."""
         os.close(self._lock)
 
     def _instance(self) -> str:
@@ -65,7 +65,7 @@ class Storage:
         return text
 
     def free_bytes(self) -> int:
-        """What the disk has left for us."""
+        """Free bytes of the disk."""
         found = os.statvfs(self.root)
         return found.f_bavail * found.f_frsize
 

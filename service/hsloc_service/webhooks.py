@@ -1,7 +1,7 @@
-"""Webhooks: an outbox in the database, signed, retried, and kept away from what is not public.
+"""Webhooks: their bodies, an outbox in the database, signed and retried delivery to public addresses.
 
 A receiver checks `Hsloc-Signature: t=<seconds>,v1=<hex>`: the HMAC-SHA256 of `<seconds>.<body>` with the tenant's key,
-and drops an `event_id` that it has seen: a delivery whose answer was lost comes again.
+and ignores an `event_id` that it has seen: a delivery whose answer was lost is repeated.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 TIMEOUT_S = 5.0
 WITHIN_S = 15.0
-"""One delivery takes no longer, however slowly the receiver answers."""
+"""Time limit for one delivery, however slowly the receiver answers [s]."""
 LONGEST_WAIT_S = 3600.0
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 _RESERVED = [ipaddress.ip_network(text) for text in ("192.0.0.0/24", "64:ff9b:1::/48", "::ffff:0:0:0/96", "fec0::/10")]
@@ -46,7 +46,7 @@ _EMBEDDING = [ipaddress.IPv6Network(text) for text in ("64:ff9b::/96", "::/96")]
 
 
 class ForbiddenAddress(OSError):
-    """The name leads to a private address."""
+    """The host name resolves to an address that is not public."""
 
 
 def queue_webhook(session: Session, job: JobRow, event: str) -> None:
@@ -88,13 +88,13 @@ def sign(secret: str, stamp: int, body: bytes) -> str:
 
 
 class WebhookSender:
-    """A thread that empties the outbox."""
+    """A thread that delivers what is in the outbox."""
 
     def __init__(self, database: Database, settings: Settings) -> None:
         self._database, self._settings = database, settings
         self._stop = threading.Event()
         self._last = ""
-        """The tenant that had its turn."""
+        """The tenant of the last delivery."""
         self._thread = threading.Thread(target=self._run, name="webhooks", daemon=True)
 
     def start(self) -> None:
@@ -102,7 +102,7 @@ class WebhookSender:
         self._thread.start()
 
     def stop(self) -> None:
-        """End; what is in the outbox stays there."""
+        """End; what is in the outbox is kept."""
         self._stop.set()
         self._thread.join(TIMEOUT_S + 1.0)
 

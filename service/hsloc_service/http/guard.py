@@ -1,4 +1,4 @@
-"""What every request passes before a byte of its body is read: host, origin, token, rate, size.
+"""Checks of every request before a byte of its body is read: host, origin, token, rate, size.
 
 Plain ASGI, around the whole application: FastAPI reads bodies before it asks its dependencies.
 """
@@ -131,7 +131,7 @@ class Guard:
         return who
 
     def _need_host(self, scope: Scope, headers: Headers) -> None:
-        """A page of another site must not speak to us: not by rebinding its name, not by a form or a script."""
+        """Refuse requests that a page of another site makes: by rebinding its name, by a form or by a script."""
         host = headers.get("host", "")
         allowed = self._settings.allowed_hosts
         name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
@@ -209,7 +209,7 @@ class Rates:
 
 
 async def refuse(error: ServiceError, send: Send) -> None:
-    """Answer without reading the body; the connection ends, so that nobody has to read the rest of it."""
+    """Answer without reading the body; the connection ends, so that the rest of it need not be read."""
     body = problem(error.code, error.message)
     headers = {"content-type": "application/json", "content-length": str(len(body)), "connection": "close"}
     headers |= {name.lower(): value for name, value in error.headers.items()}

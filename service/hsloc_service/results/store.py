@@ -1,8 +1,8 @@
 """What a store of results must do, and the data folder as one.
 
 Law of a store: `publish` puts files under a name that was never used, which the job's row names in the commit that ends
-the job. Until then nobody can ask for them; so there is the whole result or none, whatever breaks in between, and what
-a broken attempt left behind is found by `names` and removed.
+the job. Until then they cannot be requested: there is the whole result or none, whatever fails in between, and what an
+abandoned attempt left behind is found by `names` and removed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Uploads: rows with an offset that is true, bytes that are on the disk before the offset says so."""
+"""Uploads: their rows, whose offset counts only bytes that are on the disk."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class Files:
             return row
 
     def restart(self, who: Principal, file_id: str, size: int | None) -> None:
-        """Begin an unfinished upload anew, of `size` bytes, for which the same holds as for a new one."""
+        """Start an unfinished upload again, of `size` bytes; the same checks as for a new one."""
         if size is not None:
             self.need_size(size)
         with self.database.write() as session:

@@ -1,4 +1,4 @@
-"""Bytes from a client onto the disk: bounded memory, one writer an upload, no byte counted that is not safe."""
+"""Writes the body of an upload to the disk: bounded memory, one writer for each upload, offsets only of synced bytes."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class UploadReceiver:
         return row
 
     def forget(self, file_id: str) -> None:
-        """The upload is gone or begins anew."""
+        """Forget the running hash: the upload was deleted or starts again."""
         self._hashes.pop(file_id, None)
 
     def _hash(self, file_id: str, offset: int) -> Any:
@@ -122,7 +122,7 @@ class _Append:
     """One body being appended. `safe` is the offset that is on the disk and in the database.
 
     The offset of the last byte comes into the database by `Files.complete` alone: an upload that says that it has all
-    bytes, and is not complete, would be finished to its client, and to nobody else.
+    bytes, and is not complete, would look finished to its client, and to no job.
     """
 
     def __init__(

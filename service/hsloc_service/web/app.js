@@ -221,7 +221,7 @@ function render(job) {
     $("job-bar").value = progress.fraction;
     const speed = progress.phase === "replay" && progress.speed ? `, ${progress.speed.toFixed(0)} times real time` : "";
     const amount = progress.phase === "replay" ? `${progress.done.toFixed(0)} of ${progress.total.toFixed(0)} s` : `${Math.round(100 * progress.fraction)} %`;
-    state.append(`: ${progress.phase}, ${amount}${speed}, told ${progress.age_s.toFixed(0)} s ago`);
+    state.append(`: ${progress.phase}, ${amount}${speed}, ${progress.age_s.toFixed(0)} s ago`);
   } else {
     $("job-bar").removeAttribute("value");
   }
@@ -372,6 +372,6 @@ guarded(refresh).then(() => {
 });
 setInterval(async () => {
   if (!document.hidden && $("token-form").hidden) {
-    try { await refresh(); } catch { /* the next round will tell */ }
+    try { await refresh(); } catch { /* the next round tries again */ }
   }
 }, 3000);

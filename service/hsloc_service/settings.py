@@ -32,7 +32,7 @@ class Settings:
     results_url: str = ""
     """Where results go instead of the data folder, as fsspec knows it: `s3://bucket/prefix`, `file:///mnt/results`."""
     store_timeout_s: float = 30.0
-    """Time limit for one call to a store of results [s]; then it counts as dead (503), and a job's results are retried."""
+    """Time limit for one call to a store of results [s]; then it counts as dead (503)."""
     slots: int = 1
     """Number of jobs that run at the same time."""
 
@@ -49,7 +49,7 @@ class Settings:
     tenant_bytes: int = 256 * GIB
     """Maximum size of the uploads and results of one tenant together [B]; more are refused (507)."""
     min_free_bytes: int = 256 * MIB
-    """Free space of the disk below which uploads and jobs are refused (507) [B]: room for the database and for deleting."""
+    """Free space of the disk below which uploads and jobs are refused (507) [B]; the database needs it."""
     upload_ttl_s: float = 24 * 3600.0
     """Time after the last byte at which an unfinished upload is deleted [s]."""
     housekeeping_s: float = 60.0

@@ -63,9 +63,7 @@ def add_error_handlers(app: FastAPI, storage: Storage, routes: Sequence[BaseRout
     @app.exception_handler(DatabaseError)
     async def damaged(_request: Request, error: DatabaseError) -> Response:
         log("database.damaged", logging.ERROR, error=str(error.orig), remedy="restore a backup: hsloc serve --backup")
-        return _answer(
-            500, "database", "the server's database is damaged; its operator has to restore it", {"connection": "close"}
-        )
+        return _answer(500, "database", "the server's database is damaged; report it", {"connection": "close"})
 
     @app.exception_handler(OperationalError)
     async def database(_request: Request, error: OperationalError) -> Response:

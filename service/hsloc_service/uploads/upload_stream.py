@@ -1,4 +1,4 @@
-"""Writes the body of an upload to the disk: bounded memory, one writer for each upload, offsets only of synced bytes."""
+"""Writes the body of an upload to the disk: bounded memory, one writer for each upload, only synced bytes count."""
 
 from __future__ import annotations
 

@@ -133,6 +133,14 @@ class UploadDeletionRow(Base):
     created: Mapped[float]
 
 
+class CounterRow(Base):
+    """The last number that was given out under a name."""
+
+    __tablename__ = "counter"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    value: Mapped[int]
+
+
 class EventRow(Base):
     """What happened to a job; the id is the cursor of the event stream."""
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sqlalchemy import delete, func, select
 
-from hsloc_service.db.tables import ACTIVE, AssetRow, DeliveryRow, EventRow, FileRow, IdempotencyRow, JobRow
+from hsloc_service.db.tables import ACTIVE, AssetRow, CounterRow, DeliveryRow, EventRow, FileRow, IdempotencyRow, JobRow
 from hsloc_service.errors import ServiceError, busy, conflict, not_found
 from hsloc_service.jobs.events import record
 from hsloc_service.results.deletion_queue import removal_of
@@ -156,6 +156,7 @@ class Jobs:
         if request.get("resume") is not None:
             _need_map(session, _job(session, who, request["resume"]))
         job = JobRow(
+            seq=_next_seq(session),
             id=str(uuid.uuid4()),
             tenant=who.tenant,
             file_id=logs[0].id,
@@ -173,6 +174,16 @@ class Jobs:
         session.flush()
         record(session, job, "state", {"state": "queued"})
         return job
+
+
+def _next_seq(session: Session) -> int:
+    """A number that no job had, also none that was deleted: it is a cursor of clients. Needs a writing session."""
+    counter = session.get(CounterRow, "job.seq")
+    if counter is None:
+        counter = CounterRow(name="job.seq", value=0)
+        session.add(counter)
+    counter.value = max(counter.value, session.scalar(select(func.max(JobRow.seq))) or 0) + 1
+    return counter.value
 
 
 def finish_job(session: Session, job: JobRow, state: str, reason: str | None, message: str | None) -> None:

@@ -59,7 +59,7 @@ def largest_score(pyramid: Pyramid, u_low: float, u_high: float, v_low: float, v
     u1 = (int(floor(u_high)) + 1) >> shift
     v0 = int(floor(v_low)) >> shift
     v1 = (int(floor(v_high)) + 1) >> shift
-    if u1 < 0 or v1 < 0 or u0 >= pyramid.tables.shape[2] - border or v0 >= pyramid.tables.shape[1] - border:
+    if u1 < 0 or v1 < 0 or u0 >= pyramid.tables.shape[2] - 2 * border or v0 >= pyramid.tables.shape[1] - 2 * border:
         return 0
     size = max(u1 - u0, v1 - v0) + 1
     if size >= len(pyramid.smallest):

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 SIZES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64)
 """Of the squares, in entries; each but the first at most twice the one before."""
+BORDER = 128
 _ENTRIES = 4e6
 """Of a table, at most, with every node an entry; larger fields are halved in both directions until they fit."""
 
@@ -38,9 +39,10 @@ def score_pyramid(field: LikelihoodField) -> Pyramid:
 def make_pyramid(packed: NDArray[np.float32], shift: int) -> Pyramid:
     """Tables of the maxima over squares of the nodes of a packed field; an entry covers 2^shift x 2^shift nodes."""
     entries = _entries(packed, shift)
-    border = SIZES[-1]
-    tables = np.zeros((len(SIZES), entries.shape[0] + border, entries.shape[1] + border), dtype=np.uint8)
-    tables[0, border:, border:] = entries
+    border = max(SIZES[-1], BORDER >> shift)
+    shape = (len(SIZES), entries.shape[0] + 2 * border, entries.shape[1] + 2 * border)
+    tables = np.zeros(shape, dtype=np.uint8)
+    tables[0, border:-border, border:-border] = entries
     for k in range(1, len(SIZES)):
         before, more = tables[k - 1], SIZES[k] - SIZES[k - 1]
         rows = before.copy()

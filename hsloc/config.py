@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from hsloc.errors import ConfigError
 from hsloc.localisation.localiser import LocaliserParameters
+from hsloc.matching.exact import Exact
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.hide import Hide
 from hsloc.matching.icp import Icp
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MATCHERS = ("hide", "harmony_search", "icp")
+MATCHERS = ("hide", "harmony_search", "icp", "exact")
 MAPPERS = ("graph", "point")
 _SMALLEST, _LARGEST = 1e-9, 1e9
 """No length, angle, part or count of use is smaller or larger; squares and quotients of these fit a float."""
@@ -51,10 +52,11 @@ class Config:
     """Everything that decides a run beside its input and its seed."""
 
     matcher: str = "hide"
-    """One of hide, harmony_search, icp."""
+    """One of hide, harmony_search, icp, exact."""
     hide: Hide = field(default_factory=Hide)
     harmony_search: HarmonySearch = field(default_factory=HarmonySearch)
     icp: Icp = field(default_factory=Icp)
+    exact: Exact = field(default_factory=Exact)
     likelihood_field: FieldParameters = field(default_factory=FieldParameters)
     localiser: LocaliserParameters = field(default_factory=LocaliserParameters)
     mapper: str = "graph"

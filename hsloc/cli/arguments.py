@@ -83,7 +83,10 @@ def read_options(arguments: argparse.Namespace) -> ReadOptions:
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Which algorithms, with which parameters."""
     group = parser.add_argument_group("algorithms")
-    group.add_argument("--matcher", choices=("hide", "harmony_search", "hs", "icp"), help="default: hide")
+    group.add_argument("--matcher", choices=("hide", "harmony_search", "hs", "icp", "exact"), help="default: hide")
+    group.add_argument(
+        "--certify", action="store_true", help="prove of each match on a map that no pose of its window is fitter"
+    )
     group.add_argument("--mapper", choices=("graph", "point"), help="default: graph; point is the report's SLAM")
     group.add_argument("--preset", choices=("default", "paper", "paper-literal"), default="default", help="parameters")
     group.add_argument(
@@ -113,6 +116,8 @@ def config(arguments: argparse.Namespace) -> Config:
             print(f"hsloc: warning: {line}", file=sys.stderr)
     if arguments.matcher is not None:
         chosen = replace(chosen, matcher="harmony_search" if arguments.matcher == "hs" else arguments.matcher)
+    if arguments.certify:
+        chosen = replace(chosen, localiser=replace(chosen.localiser, certify=True))
     if arguments.mapper is not None:
         chosen = replace(chosen, mapper=arguments.mapper)
     return chosen

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--resume", metavar="JOB", help="extend the map of an earlier mapping job of this service: its id"
     )
     parser.add_argument("--mode", choices=("auto", "localise", "slam"), default="auto")
-    parser.add_argument("--matcher", choices=("hide", "harmony_search", "icp"))
+    parser.add_argument("--matcher", choices=("hide", "harmony_search", "icp", "exact"))
     parser.add_argument("--mapper", choices=("graph", "point"))
     parser.add_argument("--preset", choices=("default", "paper", "paper-literal"), default="default")
     parser.add_argument("--seed", type=seed, default=0, metavar="N")

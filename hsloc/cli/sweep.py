@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 HELP = "replay many logs, configurations and seeds"
 PRESETS = ("default", "paper", "paper-literal")
-MATCHERS = ("hide", "harmony_search", "hs", "icp")
+MATCHERS = ("hide", "harmony_search", "hs", "icp", "exact")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     U8 = NDArray[np.uint8]
     I64 = NDArray[np.int64]
 
+SMALL = 1.5
+"""A box moves a typical point by at most so many cells either way: the slopes are looked at."""
+MAX_SQUARES = 4
+"""In a row, under one point: beyond that one look-up of the maxima is nearly as good."""
 _LOOK = 8
 """Points summed between two looks at whether the box is ruled out already."""
 _ROUNDING = 2.0**-21
@@ -108,11 +112,11 @@ def pooled_bound(pyramid: Pyramid, points: F32, box: F64, needed: float) -> floa
 
 @njit(cache=True, nogil=True)
 def slope_bound(
-    pyramid: Pyramid, packed: F32, points: F32, box: F64, needed: float, most_squares: int
+    pyramid: Pyramid, packed: F32, points: F32, box: F64, needed: float
 ) -> tuple[float, float]:
     """As `pooled_bound`, for a small box; and the sum of the scores at its centre (0 where the bound is -1).
 
-    A point whose rectangle touches more than `most_squares` squares in a row counts as in `pooled_bound`.
+    A point whose rectangle touches more than `MAX_SQUARES` squares in a row counts as in `pooled_bound`.
     """
     n = len(points)
     height = packed.shape[0]
@@ -156,7 +160,7 @@ def slope_bound(
                 fv = v - iv
                 score = packed[iv, iu, 0] + fu * packed[iv, iu, 1] + fv * (packed[iv, iu, 2] + fu * packed[iv, iu, 3])
                 centre_total += score
-            if not is_inside or u1 - u0 >= most_squares or v1 - v0 >= most_squares:
+            if not is_inside or u1 - u0 >= MAX_SQUARES or v1 - v0 >= MAX_SQUARES:
                 top = largest_score(pyramid, u - reach_u, u + reach_u, v - reach_v, v + reach_v) / 255.0
                 flat_total += top
                 total += top
@@ -210,7 +214,7 @@ def slope_bound(
 def bound(
     pyramid: Pyramid, packed: F32, points: F32, box: F64, needed: float, radius: float
 ) -> tuple[float, float]:
-    """The bound that pays for the size of the box, and the sum at its centre, -1 where it was not computed.
+    """The bound that is worth its time for the size of the box, and the sum at its centre, -1 where it was not computed.
 
     `radius` is that of a typical point, in cells.
     """
@@ -218,10 +222,4 @@ def bound(
         return np.float64(len(points)), -1.0
     if max(box[3], box[4]) + radius * sin(box[5]) > SMALL:
         return pooled_bound(pyramid, points, box, needed), -1.0
-    return slope_bound(pyramid, packed, points, box, needed, MOST_SQUARES)
-
-
-SMALL = 1.5
-"""A box moves a typical point by at most so many cells either way: the slopes are looked at."""
-MOST_SQUARES = 4
-"""In a row, under one point: beyond that one look-up of the maxima is nearly as good."""
+    return slope_bound(pyramid, packed, points, box, needed)

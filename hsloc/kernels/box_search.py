@@ -14,7 +14,7 @@ from numba import njit
 
 from hsloc.kernels.box_bounds import Pyramid, bound
 from hsloc.kernels.fitness import score_sum
-from hsloc.kernels.polish import polish
+from hsloc.kernels.levenberg_marquardt import polish
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,7 +36,7 @@ class BoxSearch(NamedTuple):
     """Radius in cells of a typical point: turns angles into lengths when a box is split."""
     smallest: float
     """A box that moves points by less, in cells, is not split: it stays undecided."""
-    most_boxes: int
+    max_boxes: int
     """Boxes that may be bounded; what is left then stays undecided."""
 
 
@@ -137,7 +137,7 @@ def maximise(
                 continue
             box = stack[depth, :6].copy()
             reach = max(box[3], box[4]) + p.lever * box[5]
-            if reach < p.smallest or boxes >= p.most_boxes or depth > _DEPTH - 8:
+            if reach < p.smallest or boxes >= p.max_boxes or depth > _DEPTH - 8:
                 undecided = max(undecided, stack[depth, 6])
                 continue
             count = _split(box, p.lever, children)

@@ -91,7 +91,7 @@ class RunRequest(Strict):
     mode: Literal["auto", "localise", "slam"] = Field(
         default="auto", description="auto: localise if there is a map, else draw one"
     )
-    matcher: Literal["hide", "harmony_search", "icp"] | None = None
+    matcher: Literal["hide", "harmony_search", "icp", "exact"] | None = None
     mapper: Literal["graph", "point"] | None = None
     preset: Literal["default", "paper", "paper-literal"] = "default"
     seed: Seed = Field(default=0, description="at most what a browser counts exactly")
@@ -169,7 +169,7 @@ class RerunRequest(Strict):
     """What to change in a job that is run again; the rest, and the seed, stay."""
 
     mode: Literal["auto", "localise", "slam"] | None = None
-    matcher: Literal["hide", "harmony_search", "icp"] | None = None
+    matcher: Literal["hide", "harmony_search", "icp", "exact"] | None = None
     mapper: Literal["graph", "point"] | None = None
     preset: Literal["default", "paper", "paper-literal"] | None = None
     seed: Seed | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import exp, log, pi, sqrt, tau
+from math import ceil, exp, log, pi, sqrt, tau
 from random import Random
 from typing import TYPE_CHECKING
 
@@ -102,11 +102,14 @@ def _touches(door: Box, room: Box, is_upright: bool) -> bool:
 
 def random_pose(grid: OccupancyGrid, rng: np.random.Generator, clearance: float = 0.3) -> Pose2:
     """A pose in free space, at least `clearance` metres from what is not, with any heading."""
-    from scipy.ndimage import binary_erosion
-
-    steps = max(round(clearance / grid.resolution), 1)
-    open_cells = np.argwhere(binary_erosion(grid.free(), np.ones((3, 3)), iterations=steps))
-    row, column = open_cells[rng.integers(len(open_cells))]
+    cells = max(ceil(clearance / grid.resolution), 0)
+    height, width = grid.cells.shape
+    while True:
+        row, column = int(rng.integers(height)), int(rng.integers(width))
+        around = grid.cells[max(row - cells, 0) : row + cells + 1, max(column - cells, 0) : column + cells + 1]
+        # Free as in OccupancyGrid.free: known, and below 20.
+        if ((around >= 0) & (around < 20)).all():
+            break
     offset = rng.random(2)
     place = grid.origin @ (np.array(((column + offset[0], row + offset[1]),)) * grid.resolution)
     return Pose2(float(place[0, 0]), float(place[0, 1]), float(rng.uniform(-pi, pi)))

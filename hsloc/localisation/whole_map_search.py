@@ -8,7 +8,7 @@ the radius and angle of one of the modes. Coarse squares of places and intervals
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil, log2, pi, radians
+from math import ceil, floor, log2, pi, radians
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -134,10 +134,7 @@ class WholeMapSearch:
         self._is_open, self._open_starts, self._open_widths = _open_squares(
             open_nodes, self._pyramid.shift, self._coarsest
         )
-        generator = np.random.default_rng(0)
-        free = np.flatnonzero(open_nodes)
-        sample = free[generator.integers(len(free), size=_SAMPLE)] if len(free) else free
-        self._sample = np.column_stack(np.unravel_index(sample, open_nodes.shape)).astype(np.int64)
+        self._sample = _places(open_nodes, _SAMPLE)
 
     def search(self, points: F64) -> WholeMapResult:
         """The modes of a scan, points (n, 2) in metres seen from the base; of several scans see `join_scans`."""
@@ -270,18 +267,46 @@ def _open_nodes(grid: OccupancyGrid, field: LikelihoodField) -> NDArray[np.bool_
     is_open = np.zeros(field.packed.shape[:2], dtype=np.bool_)
     free = grid.free()
     corner = field.T_map_field.between(grid.origin)
+    # A cell may touch four squares, and in a field of this grid it is not larger than one: its corners tell which.
+    steps = ceil(grid.resolution / field.resolution)
+    corners = [(dx, dy) for dx in _corners(steps) for dy in _corners(steps)]
+    if corner.theta == 0.0 and grid.resolution == field.resolution:
+        for dx, dy in corners:
+            _join(is_open, free, floor(corner.y / field.resolution + dy), floor(corner.x / field.resolution + dx))
+        return is_open
     rows = max(_PLACES // max(free.shape[1], 1), 1)
     for row in range(0, free.shape[0], rows):
         cells = np.argwhere(free[row : row + rows])[:, ::-1] + (0, row)
-        # A cell may touch four squares, and is not larger than one in the fields of a grid: its corners tell which.
-        steps = ceil(grid.resolution / field.resolution)
-        for dx in np.linspace(_INSIDE, 1.0 - _INSIDE, steps + 1):
-            for dy in np.linspace(_INSIDE, 1.0 - _INSIDE, steps + 1):
-                local = corner @ ((cells + (dx, dy)) * grid.resolution) / field.resolution
-                u, v = np.floor(local).astype(np.int64).T
-                inside = (v >= 0) & (u >= 0) & (v < is_open.shape[0]) & (u < is_open.shape[1])
-                is_open[v[inside], u[inside]] = True
+        for offset in corners:
+            local = corner @ ((cells + offset) * grid.resolution) / field.resolution
+            u, v = np.floor(local).astype(np.int64).T
+            inside = (v >= 0) & (u >= 0) & (v < is_open.shape[0]) & (u < is_open.shape[1])
+            is_open[v[inside], u[inside]] = True
     return is_open
+
+
+def _corners(steps: int) -> list[float]:
+    return [float(at) for at in np.linspace(_INSIDE, 1.0 - _INSIDE, steps + 1)]
+
+
+def _join(target: NDArray[np.bool_], source: NDArray[np.bool_], row: int, column: int) -> None:
+    """Set in `target` what is set in `source`, whose element [0, 0] lies at [row, column] of it."""
+    top, left = max(row, 0), max(column, 0)
+    part = source[top - row : target.shape[0] - row, left - column : target.shape[1] - column]
+    target[top : top + part.shape[0], left : left + part.shape[1]] |= part
+
+
+def _places(is_open: NDArray[np.bool_], count: int) -> I64:
+    """`count` places (v, u) among those that are open, spread over them; none if none is."""
+    ends = np.cumsum(is_open.sum(axis=1))
+    if ends[-1] == 0:
+        return np.empty((0, 2), dtype=np.int64)
+    chosen = np.random.default_rng(0).integers(ends[-1], size=count)
+    rows = np.searchsorted(ends, chosen, side="right")
+    columns = [
+        np.flatnonzero(is_open[row])[index - ends[row]] for row, index in zip(rows, chosen, strict=True)
+    ]
+    return np.column_stack((rows, columns)).astype(np.int64)
 
 
 def _open_squares(is_open: NDArray[np.bool_], shift: int, coarsest: int) -> tuple[NDArray[np.bool_], I64, I64]:

@@ -285,7 +285,7 @@ def fit_boxes(
 
 @njit(cache=True, nogil=True)
 def expected_loss(pyramid: Pyramid, rows: F64, places: I64, level: int, half_theta: float) -> F64:
-    """For each cluster by how much it lowers the bound of a box on the average, from boxes at `places` (k, 2; v, u).
+    """For each cluster by how much it lowers the bound of a box on the average, from boxes at the entries `places` (k, 2; v, u).
 
     Those that lower it most are looked up first, so that most boxes are ruled out after a few look-ups.
     """
@@ -299,8 +299,8 @@ def expected_loss(pyramid: Pyramid, rows: F64, places: I64, level: int, half_the
     offsets = np.empty((n, 3), dtype=np.int32)
     for k in range(len(places)):
         theta = 2.0 * pi * ((k * 0.6180339887498949) % 1.0)
-        y = (places[k, 0] // int(extent)) << level
-        x = (places[k, 1] // int(extent)) << level
+        y = places[k, 0] >> level << level
+        x = places[k, 1] >> level << level
         for i in range(n):
             kept, _, _, _, _ = _turned(
                 rows[i : i + 1], theta, half_theta, extent, pyramid, entries, weights, rest, offsets

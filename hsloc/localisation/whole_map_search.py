@@ -20,6 +20,7 @@ from hsloc.kernels.map_search import Clusters, expected_loss, fit_boxes
 from hsloc.matching.certificate import lever
 from hsloc.matching.harmony_search import low_discrepancy_order
 from hsloc.matching.score_pyramid import score_pyramid
+from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import Pose2
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.matching.likelihood_field import LikelihoodField
-    from hsloc.model.occupancy_grid import OccupancyGrid
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
@@ -130,11 +130,9 @@ class WholeMapSearch:
         self._pyramid = score_pyramid(field)
         self._coarsest = max(round(log2(_SQUARE / field.resolution)) - self._pyramid.shift, 1)
         self._by_phase = _by_phase(self._pyramid.tables, 1 << self._coarsest)
-        open_nodes = _open_nodes(grid, field)
-        self._is_open, self._open_starts, self._open_widths = _open_squares(
-            open_nodes, self._pyramid.shift, self._coarsest
-        )
-        self._sample = _places(open_nodes, _SAMPLE)
+        is_open = _open_entries(grid, field, self._pyramid.shift)
+        self._is_open, self._open_starts, self._open_widths = _open_squares(is_open, self._coarsest)
+        self._sample = _places(is_open, _SAMPLE)
 
     def search(self, points: F64) -> WholeMapResult:
         """The modes of a scan, points (n, 2) in metres seen from the base; of several scans see `join_scans`."""
@@ -262,23 +260,28 @@ def join_scans(scans: Sequence[F64], T_odom_base: Sequence[Pose2]) -> F64:
     return np.concatenate([last.between(pose) @ scan for scan, pose in zip(scans, T_odom_base, strict=True)])
 
 
-def _open_nodes(grid: OccupancyGrid, field: LikelihoodField) -> NDArray[np.bool_]:
-    """Whether the square of the field between nodes [v, u] and [v + 1, u + 1] holds free ground of the grid."""
-    is_open = np.zeros(field.packed.shape[:2], dtype=np.bool_)
-    free = grid.free()
+def _open_entries(grid: OccupancyGrid, field: LikelihoodField, shift: int) -> NDArray[np.bool_]:
+    """Which squares of 2^shift nodes a side, from node [0, 0] of the field on, hold free ground of the grid."""
+    step = 1 << shift
+    height, width = field.packed.shape[:2]
+    is_open = np.zeros((-(-height // step), -(-width // step)), dtype=np.bool_)
     corner = field.T_map_field.between(grid.origin)
-    # A cell may touch four squares, and in a field of this grid it is not larger than one: its corners tell which.
+    # A cell may touch four squares of nodes, and in a field of this grid it is not larger than one: its corners tell.
     steps = ceil(grid.resolution / field.resolution)
     corners = [(dx, dy) for dx in _corners(steps) for dy in _corners(steps)]
-    if corner.theta == 0.0 and grid.resolution == field.resolution:
-        for dx, dy in corners:
-            _join(is_open, free, floor(corner.y / field.resolution + dy), floor(corner.x / field.resolution + dx))
-        return is_open
-    rows = max(_PLACES // max(free.shape[1], 1), 1)
-    for row in range(0, free.shape[0], rows):
-        cells = np.argwhere(free[row : row + rows])[:, ::-1] + (0, row)
+    rows = max(_PLACES // max(grid.cells.shape[1], 1), 1)
+    for first in range(0, grid.cells.shape[0], rows):
+        free = OccupancyGrid(grid.cells[first : first + rows], grid.resolution).free()
+        if corner.theta == 0.0 and grid.resolution == field.resolution:
+            for dx, dy in corners:
+                row = floor(corner.y / field.resolution + dy) + first
+                column = floor(corner.x / field.resolution + dx)
+                moved = np.pad(free, ((row % step, 0), (column % step, 0)))
+                _join(is_open, _halved(moved, step), row // step, column // step)
+            continue
+        cells = np.argwhere(free)[:, ::-1] + (0, first)
         for offset in corners:
-            local = corner @ ((cells + offset) * grid.resolution) / field.resolution
+            local = corner @ ((cells + offset) * grid.resolution) / (field.resolution * step)
             u, v = np.floor(local).astype(np.int64).T
             inside = (v >= 0) & (u >= 0) & (v < is_open.shape[0]) & (u < is_open.shape[1])
             is_open[v[inside], u[inside]] = True
@@ -297,7 +300,7 @@ def _join(target: NDArray[np.bool_], source: NDArray[np.bool_], row: int, column
 
 
 def _places(is_open: NDArray[np.bool_], count: int) -> I64:
-    """`count` places (v, u) among those that are open, spread over them; none if none is."""
+    """`count` entries (v, u) among those that are open, spread over them; none if none is."""
     ends = np.cumsum(is_open.sum(axis=1))
     if ends[-1] == 0:
         return np.empty((0, 2), dtype=np.int64)
@@ -309,9 +312,9 @@ def _places(is_open: NDArray[np.bool_], count: int) -> I64:
     return np.column_stack((rows, columns)).astype(np.int64)
 
 
-def _open_squares(is_open: NDArray[np.bool_], shift: int, coarsest: int) -> tuple[NDArray[np.bool_], I64, I64]:
+def _open_squares(is_open: NDArray[np.bool_], coarsest: int) -> tuple[NDArray[np.bool_], I64, I64]:
     """For each level which squares hold open ground, the coarsest first: flat, where each begins, and their widths."""
-    levels = [_halved(is_open, 1 << shift)]
+    levels = [is_open]
     for _ in range(coarsest):
         levels.append(_halved(levels[-1], 2))
     starts = np.zeros(coarsest + 1, dtype=np.int64)

@@ -99,9 +99,9 @@ def certify(
     )
     fitness = best / n
     certificate = Certificate(
-        gap=max(bound / n - fitness, 0.0),
+        gap=max(min(bound / n, 1.0) - fitness, 0.0),
         # What bounds the whole window bounds the rest of it.
-        rival_bound=min(rival_bound, bound) / n,
+        rival_bound=min(rival_bound / n, bound / n, 1.0),
         rival=field.from_cells(rival) if is_found else None,
         boxes=boxes + more,
         # Sums of n terms are compared: a billionth more is not a gap.

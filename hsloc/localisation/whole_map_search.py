@@ -285,6 +285,12 @@ def _open_entries(grid: OccupancyGrid, field: LikelihoodField, shift: int) -> ND
             u, v = np.floor(local).astype(np.int64).T
             inside = (v >= 0) & (u >= 0) & (v < is_open.shape[0]) & (u < is_open.shape[1])
             is_open[v[inside], u[inside]] = True
+    # A cell that is turned may cut across a square that holds none of its corners: the neighbours count as well.
+    if corner.theta != 0.0:
+        grown = is_open.copy()
+        for row, column in ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1)):
+            _join(grown, is_open, row, column)
+        return grown
     return is_open
 
 

@@ -111,9 +111,7 @@ def pooled_bound(pyramid: Pyramid, points: F32, box: F64, needed: float) -> floa
 
 
 @njit(cache=True, nogil=True)
-def slope_bound(
-    pyramid: Pyramid, packed: F32, points: F32, box: F64, needed: float
-) -> tuple[float, float]:
+def slope_bound(pyramid: Pyramid, packed: F32, points: F32, box: F64, needed: float) -> tuple[float, float]:
     """As `pooled_bound`, for a small box; and the sum of the scores at its centre (0 where the bound is -1).
 
     A point whose rectangle touches more than `MAX_SQUARES` squares in a row counts as in `pooled_bound`.
@@ -211,9 +209,7 @@ def slope_bound(
 
 
 @njit(cache=True, nogil=True)
-def bound(
-    pyramid: Pyramid, packed: F32, points: F32, box: F64, needed: float, radius: float
-) -> tuple[float, float]:
+def bound(pyramid: Pyramid, packed: F32, points: F32, box: F64, needed: float, radius: float) -> tuple[float, float]:
     """The bound that is worth its time for the size of the box, and the sum at its centre, -1 where it was not computed.
 
     `radius` is that of a typical point, in cells.

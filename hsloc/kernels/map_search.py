@@ -41,7 +41,15 @@ class Clusters(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _turned(
-    rows: F64, theta: float, half_theta: float, extent: float, pyramid: Pyramid, entries: I64, weights: I64, rest: I64, offsets: I32
+    rows: F64,
+    theta: float,
+    half_theta: float,
+    extent: float,
+    pyramid: Pyramid,
+    entries: I64,
+    weights: I64,
+    rest: I64,
+    offsets: I32,
 ) -> tuple[int, int, int, int, int]:
     """Look-ups for boxes of places of side `extent` (cells), by their first entry (y, x).
 

@@ -312,9 +312,7 @@ def _places(is_open: NDArray[np.bool_], count: int) -> I64:
         return np.empty((0, 2), dtype=np.int64)
     chosen = np.random.default_rng(0).integers(ends[-1], size=count)
     rows = np.searchsorted(ends, chosen, side="right")
-    columns = [
-        np.flatnonzero(is_open[row])[index - ends[row]] for row, index in zip(rows, chosen, strict=True)
-    ]
+    columns = [np.flatnonzero(is_open[row])[index - ends[row]] for row, index in zip(rows, chosen, strict=True)]
     return np.column_stack((rows, columns)).astype(np.int64)
 
 

@@ -31,9 +31,7 @@ class Exact:
     certificate: CertificateParameters = field(default_factory=CertificateParameters)
     """What is to be proven."""
 
-    def match(
-        self, points: NDArray[np.float64], field: LikelihoodField, window: Window, rng: Generator
-    ) -> Match:
+    def match(self, points: NDArray[np.float64], field: LikelihoodField, window: Window, rng: Generator) -> Match:
         """See `Matcher`; the Match has a certificate, and its evaluations count the boxes bounded too."""
         found = certify(self.seed.match(points, field, window, rng), points, field, window, self.certificate)
         if found.certificate is None:

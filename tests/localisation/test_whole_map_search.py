@@ -154,7 +154,9 @@ def test_a_map_that_is_turned_is_searched_alike(building):
     wanted = search.search(points)
     turned = OccupancyGrid(grid.cells, grid.resolution, Pose2(3.0, -2.0, 0.7))
     # The field in the frame of the map and not along the cells, as that of a set of points is.
-    again = LikelihoodField(field.packed, field.resolution, turned.origin @ grid.origin.inverse() @ field.T_map_field, 0.2)
+    again = LikelihoodField(
+        field.packed, field.resolution, turned.origin @ grid.origin.inverse() @ field.T_map_field, 0.2
+    )
     found = WholeMapSearch(turned, again).search(points)
     assert len(found.modes) == len(wanted.modes)
     move = turned.origin @ grid.origin.inverse()

@@ -10,7 +10,17 @@ import pytest
 
 from hsloc.benchmark.cases import LEVELS, read_cases
 from hsloc.errors import ConfigError
-from hsloc.matching import CertificateParameters, Exact, Hide, Icp, LikelihoodField, StopReason, Window, certify, summarise
+from hsloc.matching import (
+    CertificateParameters,
+    Exact,
+    Hide,
+    Icp,
+    LikelihoodField,
+    StopReason,
+    Window,
+    certify,
+    summarise,
+)
 from hsloc.matching.exact import heuristic
 from hsloc.model import OccupancyGrid, Pose2
 

@@ -1,4 +1,4 @@
-"""Floors of a given size with known walls: rooms and halls of all sizes, doors, furniture, pillars; and scans in them."""
+"""Floors of a given size: rooms and halls of all sizes with doors, furniture and pillars; and scans in them."""
 
 from __future__ import annotations
 

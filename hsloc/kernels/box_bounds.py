@@ -59,10 +59,10 @@ def largest_score(pyramid: Pyramid, u_low: float, u_high: float, v_low: float, v
     """At least 255 times the greatest interpolated score in a rectangle; outside the field the score is 0."""
     shift = pyramid.shift
     border = pyramid.border
-    u0 = int(floor(u_low)) >> shift
-    u1 = (int(floor(u_high)) + 1) >> shift
-    v0 = int(floor(v_low)) >> shift
-    v1 = (int(floor(v_high)) + 1) >> shift
+    u0 = floor(u_low) >> shift
+    u1 = (floor(u_high) + 1) >> shift
+    v0 = floor(v_low) >> shift
+    v1 = (floor(v_high) + 1) >> shift
     if u1 < 0 or v1 < 0 or u0 >= pyramid.tables.shape[2] - 2 * border or v0 >= pyramid.tables.shape[1] - 2 * border:
         return 0
     size = max(u1 - u0, v1 - v0) + 1
@@ -145,10 +145,10 @@ def slope_bound(pyramid: Pyramid, packed: F32, points: F32, box: F64, needed: fl
             reach_v = half_y + abs(rx) * across + abs(ry) * inwards + rounding
             u = x + rx
             v = y + ry
-            u0 = int(floor(u - reach_u))
-            u1 = int(floor(u + reach_u))
-            v0 = int(floor(v - reach_v))
-            v1 = int(floor(v + reach_v))
+            u0 = floor(u - reach_u)
+            u1 = floor(u + reach_u)
+            v0 = floor(v - reach_v)
+            v1 = floor(v + reach_v)
             is_inside = u0 >= 0 and v0 >= 0 and u1 < width and v1 < height
             score = 0.0
             if u >= 0.0 and v >= 0.0 and u < width and v < height:
@@ -210,7 +210,7 @@ def slope_bound(pyramid: Pyramid, packed: F32, points: F32, box: F64, needed: fl
 
 @njit(cache=True, nogil=True)
 def bound(pyramid: Pyramid, packed: F32, points: F32, box: F64, needed: float, radius: float) -> tuple[float, float]:
-    """The bound that is worth its time for the size of the box, and the sum at its centre, -1 where it was not computed.
+    """The bound that is worth its time for the size of the box, and the sum at its centre (-1: not computed).
 
     `radius` is that of a typical point, in cells.
     """

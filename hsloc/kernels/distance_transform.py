@@ -1,6 +1,7 @@
 """Exact Euclidean distances to the occupied cells of a grid, in two passes (Meijster, Roerdink, Hesselink 2000).
 
-First along the columns, then row by row: only the column distances of the whole map are kept in memory, 2 bytes a cell where they fit.
+First along the columns, then row by row: of the whole map only the column distances are kept in memory, 2 bytes a
+cell where they fit.
 """
 
 from __future__ import annotations

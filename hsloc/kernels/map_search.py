@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit
 
-from hsloc.kernels.box_bounds import Pyramid
-
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from hsloc.kernels.box_bounds import Pyramid
 
     F32 = NDArray[np.float32]
     F64 = NDArray[np.float64]
@@ -75,10 +75,10 @@ def _turned(
         reach_v = abs(rx) * across + abs(ry) * inwards + rows[i, 2] + _MARGIN
         u = rx - rx * inwards
         v = ry - ry * inwards
-        u0 = int(floor((u - reach_u) / step))
-        v0 = int(floor((v - reach_v) / step))
-        u1 = int(floor((floor(u + reach_u + extent) + 1.0) / step))
-        v1 = int(floor((floor(v + reach_v + extent) + 1.0) / step))
+        u0 = floor((u - reach_u) / step)
+        v0 = floor((v - reach_v) / step)
+        u1 = floor((floor(u + reach_u + extent) + 1.0) / step)
+        v1 = floor((floor(v + reach_v + extent) + 1.0) / step)
         size = max(u1 - u0, v1 - v0) + 1
         weight = int(rows[i, 3])
         if size >= len(pyramid.smallest):
@@ -192,7 +192,7 @@ def fit_boxes(
     """
     coarsest = len(half_thetas) - 1
     step = 1 << pyramid.shift
-    limit = int(floor(255.0 * needed))
+    limit = floor(255.0 * needed)
     largest = 0
     for k in range(coarsest + 1):
         largest = max(largest, clusters.starts[k + 1] - clusters.starts[k])
@@ -211,7 +211,7 @@ def fit_boxes(
     turn = np.zeros(coarsest + 1, dtype=np.int64)
     totals = np.empty(open_widths[coarsest], dtype=np.int32)
     coarsest_height = (open_starts[coarsest - 1] - open_starts[coarsest]) // open_widths[coarsest]
-    turns = int(round(pi / half_thetas[coarsest]))
+    turns = round(pi / half_thetas[coarsest])
     for top in range(turns):
         level = coarsest
         turn[level] = top
@@ -293,7 +293,9 @@ def fit_boxes(
 
 @njit(cache=True, nogil=True)
 def expected_loss(pyramid: Pyramid, rows: F64, places: I64, level: int, half_theta: float) -> F64:
-    """For each cluster by how much it lowers the bound of a box on the average, from boxes at the entries `places` (k, 2; v, u).
+    """For each cluster by how much it lowers the bound of a box on the average.
+
+    The average is over boxes that hold the entries `places` (k, 2; v, u), with all headings.
 
     Those that lower it most are looked up first, so that most boxes are ruled out after a few look-ups.
     """

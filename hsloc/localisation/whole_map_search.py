@@ -21,7 +21,6 @@ from hsloc.matching.certificate import lever
 from hsloc.matching.harmony_search import low_discrepancy_order
 from hsloc.matching.score_pyramid import score_pyramid
 from hsloc.model.occupancy_grid import OccupancyGrid
-from hsloc.model.pose2 import Pose2
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.matching.likelihood_field import LikelihoodField
+    from hsloc.model.pose2 import Pose2
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]

@@ -94,7 +94,7 @@ def certify(
     )
     floor = best - (p.margin + p.epsilon) * n
     rival = np.empty(3)
-    rival_best, rival_bound, more, is_found = maximise(
+    _, rival_bound, more, is_found = maximise(
         pyramid, field.packed, scaled, window_box, pose[None, :], search, floor, rival
     )
     fitness = best / n

@@ -1,4 +1,4 @@
-"""The search of a whole map finds every place where a scan fits, and its proof holds for the poses it never looked at."""
+"""The search of a whole map finds every place where a scan fits; its proof holds for poses it never looked at."""
 
 from __future__ import annotations
 

@@ -50,11 +50,15 @@ def floor(area: float, seed: int) -> World:
                 loose.append(box_at(x, y, length, width, random.uniform(0.0, 90.0)))
             else:
                 loose.append(pillar(x, y, random.uniform(0.1, 0.35)))
-    rounded = [[(*(round(value, 3) for value in box),) for box in boxes] for boxes in (rooms + doors, blocks)]
-    segments = np.concatenate((floor_plan(rounded[0], rounded[1]), *loose))
+    segments = np.concatenate((floor_plan(_rounded(rooms + doors), _rounded(blocks)), *loose))
     x0, y0, x1, y1 = rooms[0]
     inside = np.array(((x0 + 0.1, y0 + 0.1), (x1 - 0.1, y1 - 0.1)))
     return World(f"floor of {area:g} square metres", segments, inside)
+
+
+def _rounded(boxes: list[Box]) -> list[Box]:
+    """To the millimetre, so that sides that should meet do."""
+    return [(round(x0, 3), round(y0, 3), round(x1, 3), round(y1, 3)) for x0, y0, x1, y1 in boxes]
 
 
 def _cut(box: Box, random: Random, rooms: list[Box], walls: list[Box]) -> None:
@@ -138,4 +142,5 @@ def scan_at(
     short = rng.random(beams) < blocked
     ranges = np.where(short, ranges * rng.random(beams), ranges)
     seen = np.isfinite(ranges) & (ranges < range_max) & (ranges > 0.05)
-    return (ranges[:, None] * np.column_stack((np.cos(angles), np.sin(angles))))[seen]
+    points: F64 = (ranges[:, None] * np.column_stack((np.cos(angles), np.sin(angles))))[seen]
+    return points

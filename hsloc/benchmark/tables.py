@@ -244,7 +244,7 @@ def _whole_map(bench: Bench) -> list[str]:
         "## One scan on a whole floor",
         "",
         (
-            f"{bench.whole_map[0].scans} scans of 360 beams (1 cm noise, 25 m) from random poses, cells of 5 cm. Right: "
+            f"{bench.whole_map[0].scans} scans of 360 beams (1 cm noise, 25 m) from random poses, 5 cm cells. Right: "
             "the true pose is among the modes within 0.05 of the best, to 0.3 m and 3 deg. s: median / 95th percentile "
             "/ worst."
         ),

@@ -34,7 +34,6 @@ def column_distances(occupied: B, far: int, distances: Integers) -> None:
     for v in range(height - 2, -1, -1):
         for u in range(width):
             distances[v, u] = min(distances[v, u], distances[v + 1, u] + 1)
-    return distances
 
 
 @njit(cache=True, nogil=True)

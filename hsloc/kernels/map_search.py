@@ -114,7 +114,7 @@ def _steps(flat: U8, entries: I64, weights: I64, rest: I64, n: int, at: int, lim
         start = end
         if total + rest[start] <= limit:
             return -1
-    return total + rest[n]
+    return int(total + rest[n])
 
 
 @njit(cache=True, nogil=True)

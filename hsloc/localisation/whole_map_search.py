@@ -145,8 +145,7 @@ class WholeMapSearch:
         candidates, more, is_complete = self._candidates(scaled, needed)
         boxes += more
         if not is_complete:
-            modes = () if best is None else (best,)
-            return WholeMapResult(modes, 1.0, False, boxes)
+            return WholeMapResult(() if best is None else (best,), 1.0, False, boxes)
         modes, bound, more, is_complete = self._modes(scaled, candidates, best, needed)
         return WholeMapResult(modes, bound, is_complete, boxes + more)
 
@@ -178,7 +177,7 @@ class WholeMapSearch:
         p = self._parameters
         half_square = 0.5 * (1 << self._pyramid.shift << self._coarsest)
         turns = ceil(pi * lever(scaled) / half_square)
-        half_thetas = pi / turns / 2.0 ** np.arange(self._coarsest, -1, -1)
+        half_thetas: F64 = pi / turns / np.exp2(np.arange(self._coarsest, -1, -1, dtype=np.float64))
         rows, boxes, is_complete = fit_boxes(
             self._pyramid,
             self._by_phase,
@@ -281,7 +280,8 @@ def _open_entries(grid: OccupancyGrid, field: LikelihoodField, shift: int) -> ND
             continue
         cells = np.argwhere(free)[:, ::-1] + (0, first)
         for offset in corners:
-            local = corner @ ((cells + offset) * grid.resolution) / (field.resolution * step)
+            places = np.asarray((cells + offset) * grid.resolution, dtype=np.float64)
+            local = corner @ places / (field.resolution * step)
             u, v = np.floor(local).astype(np.int64).T
             inside = (v >= 0) & (u >= 0) & (v < is_open.shape[0]) & (u < is_open.shape[1])
             is_open[v[inside], u[inside]] = True
@@ -334,7 +334,7 @@ def _halved(values: NDArray[np.bool_], step: int) -> NDArray[np.bool_]:
     height, width = -(-values.shape[0] // step), -(-values.shape[1] // step)
     padded = np.zeros((height * step, width * step), dtype=np.bool_)
     padded[: values.shape[0], : values.shape[1]] = values
-    return padded.reshape(height, step, width, step).any(axis=(1, 3))
+    return np.asarray(padded.reshape(height, step, width, step).any(axis=(1, 3)))
 
 
 def _by_phase(tables: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:

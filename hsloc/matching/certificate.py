@@ -128,24 +128,24 @@ def lever(scaled: NDArray[np.float32]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class CertificateSummary:
-    """The certificates of a run: how many, the shares proven, the largest gain, the median gap (None: none)."""
+    """The certificates of a run: how many, the shares proven, the median gap, the largest gain."""
 
-    certificates: int
-    share_optimal: float | None
-    share_distinct: float | None
-    largest_gain: float | None
-    median_gap: float | None
+    scans: int
+    optimal: float
+    distinct: float
+    median_gap: float
+    max_gain: float
 
 
-def summarise(certificates: Iterable[Certificate]) -> CertificateSummary:
-    """Of the scans that were certified."""
+def summarise(certificates: Iterable[Certificate]) -> CertificateSummary | None:
+    """Of the scans that were certified; None without any."""
     given = list(certificates)
     if not given:
-        return CertificateSummary(0, None, None, None, None)
+        return None
     return CertificateSummary(
-        certificates=len(given),
-        share_optimal=float(np.mean([one.is_optimal for one in given])),
-        share_distinct=float(np.mean([one.is_distinct for one in given])),
-        largest_gain=max(one.gain for one in given),
+        scans=len(given),
+        optimal=float(np.mean([one.is_optimal for one in given])),
+        distinct=float(np.mean([one.is_distinct for one in given])),
         median_gap=float(np.median([one.gap for one in given])),
+        max_gain=max(one.gain for one in given),
     )

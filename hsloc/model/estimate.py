@@ -73,6 +73,8 @@ class ScanDiagnostics:
     sigma: NDArray[np.float64]
     evaluations: NDArray[np.int64]
     reason: tuple[str, ...]
+    certificates: tuple[Certificate, ...] = ()
+    """Of those scans that have one, in their order."""
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -13,6 +13,7 @@ from hsloc.model.pose2 import compose_poses
 from hsloc.model.trajectory import Trajectory
 
 if TYPE_CHECKING:
+    from hsloc.model.certificate import Certificate
     from hsloc.model.estimate import Estimate
     from hsloc.model.pose2 import Pose2
 
@@ -33,6 +34,7 @@ class RunHistory:
         self._fitness = array("d")
         self._sigma = array("d")
         self._evaluations = array("q")
+        self._certificates: list[Certificate] = []
         self._believed = 0
         self._searching = False
         self._revisions: list[tuple[int, tuple[tuple[int, Pose2], ...]]] = []
@@ -66,6 +68,8 @@ class RunHistory:
         else:
             self._sigma.extend(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
         self._evaluations.append(estimate.evaluations)
+        if estimate.certificate is not None:
+            self._certificates.append(estimate.certificate)
         if estimate.revision:
             self._revisions.append((len(self._odometry_stamps), estimate.revision))
 
@@ -115,6 +119,7 @@ class RunHistory:
             sigma=np.array(self._sigma, dtype=np.float64).reshape(-1, 3),
             evaluations=np.array(self._evaluations, dtype=np.int64),
             reason=tuple(self._reason),
+            certificates=tuple(self._certificates),
         )
 
 

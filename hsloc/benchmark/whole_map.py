@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from time import perf_counter
+from time import process_time
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +26,8 @@ _RIGHT = (0.3, np.radians(3.0))
 
 @dataclass(frozen=True, slots=True)
 class WholeMapTiming:
-    """Searches from random places on one floor, one scan each, the preparation of the map not counted.
+    """Searches from random places on one floor, one scan each, in processor time; the preparation of the map
+    is not counted.
 
     `right`: the share in which the true place is among the modes; `unique`: in which it was proven to be the only one;
     `wrong`: in which one place was proven to be the only one and is another; `complete`: in which the work sufficed.
@@ -58,9 +59,9 @@ def measure_whole_map(
         world = floor(area, SEED)
         grid = world.occupancy_grid(0.05)
         field = LikelihoodField.from_grid(grid)
-        begin = perf_counter()
+        begin = process_time()
         search = WholeMapSearch(grid, field)
-        prepared = perf_counter() - begin
+        prepared = process_time() - begin
         for blocked in BLOCKED:
             rows = []
             for index in range(scans):
@@ -69,9 +70,9 @@ def measure_whole_map(
                 points = scan_at(world, true, rng, blocked=blocked)
                 if index == 0:
                     search.search(points)
-                begin = perf_counter()
+                begin = process_time()
                 result = search.search(points)
-                seconds = perf_counter() - begin
+                seconds = process_time() - begin
                 right = any(
                     mode.pose.distance(true) <= _RIGHT[0] and abs(wrap_angle(mode.pose.theta - true.theta)) <= _RIGHT[1]
                     for mode in result.modes

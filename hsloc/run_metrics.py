@@ -151,9 +151,9 @@ class CertificateMetrics:
     distinct: float
     """Fraction of them for which every other place in the window is worse by the margin, from 0 to 1."""
     median_gap: float
-    """Median of the fitness by which another pose of the window may be fitter at most."""
+    """Median of the fitness by which another pose of the window may be fitter at most, from 0 to 1."""
     max_gain: float
-    """Largest fitness by which a proof improved on the pose that the search found."""
+    """Largest fitness by which a proof improved on the pose that the search found, from 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -216,7 +216,7 @@ def _certificates(bench: Bench) -> list[str]:
         (
             f"{bench.certificates[0].cases} cases a level. Gap closed: no pose of the window is fitter than the one "
             "returned by more than 0.01. No other place: every pose farther than 0.3 m or 3 deg from it is worse by "
-            "0.05. Corrected: the start was worse than the best by more than 0.01. ms: processor time of the two proofs, "
+            "0.05. Corrected: the start was worse than the best by more than 0.01. ms: processor time of both proofs, "
             "median / 95th percentile; the search before them is not counted."
         ),
         "",

@@ -27,7 +27,7 @@ WHOLE_MAP = {2_000.0: 0.3, 10_000.0: 1.0, 40_000.0: 4.0}
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A figure, its limit, and whether it is kept; `at_least` says on which side."""
+    """A figure, its limit, and whether it is kept; `at_least`: the limit is a minimum."""
 
     text: str
     measured: float

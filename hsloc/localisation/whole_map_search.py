@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import ceil, floor, log2, pi, radians
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from hsloc.errors import ConfigError
 from hsloc.kernels.box_search import BoxSearch, maximise
 from hsloc.kernels.fitness import fitness_many
 from hsloc.kernels.map_search import Clusters, expected_loss, fit_boxes
@@ -21,6 +20,7 @@ from hsloc.matching.certificate import lever
 from hsloc.matching.harmony_search import low_discrepancy_order
 from hsloc.matching.score_pyramid import score_pyramid
 from hsloc.model.occupancy_grid import OccupancyGrid
+from hsloc.parameters import Angle, Count, Parameters, Positive, Range, Ratio
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -56,39 +56,25 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WholeMapParameters:
+class WholeMapParameters(Parameters):
     """What counts as a place where a scan fits, and how much work may be spent."""
 
-    margin: float = 0.05
-    """Fitness below the best within which a pose is another mode, in [0, 1]."""
-    min_fitness: float = 0.6
-    """Fitness below which no place is looked for: below it the scan is not on this map."""
-    radius: float = 0.3
+    margin: Ratio = 0.05
+    """Fitness below the best within which a pose is another mode."""
+    min_fitness: Ratio = 0.6
+    """Minimum fitness of a place; where there is none, the scan is not on this map."""
+    radius: Positive = 0.3
     """Distance within which poses belong to one mode [m]."""
-    angle: float = radians(3.0)
+    angle: Angle = radians(3.0)
     """Rotation within which poses belong to one mode [rad]."""
-    epsilon: float = 0.005
-    """Fitness up to which a mode is worked out, positive."""
-    max_modes: int = 64
-    """Modes that are told apart; where there are more, the result is not complete."""
-    max_boxes: int = 200_000_000
-    """Boxes of poses that one search may bound."""
-    max_candidates: int = 500_000
-    """Boxes that may be left after the coarse levels, 56 bytes each."""
-
-    def __post_init__(self) -> None:
-        for name, ok, rule in (
-            ("margin", 0.0 <= self.margin <= 1.0, "in [0, 1]"),
-            ("min_fitness", 0.0 < self.min_fitness <= 1.0, "in (0, 1]"),
-            ("radius", self.radius > 0.0, "positive"),
-            ("angle", self.angle > 0.0, "positive"),
-            ("epsilon", self.epsilon > 0.0, "positive"),
-            ("max_modes", self.max_modes >= 1, "at least 1"),
-            ("max_boxes", self.max_boxes >= 1, "at least 1"),
-            ("max_candidates", self.max_candidates >= 1, "at least 1"),
-        ):
-            if not ok:
-                raise ConfigError(f"whole map search: {name} is {getattr(self, name)}; it must be {rule}")
+    epsilon: Annotated[float, Range(1e-6, 1.0)] = 0.005
+    """Fitness by which a pose may be fitter than the mode that is returned for it."""
+    max_modes: Count = 64
+    """Maximum number of modes; where there are more, the result is not complete."""
+    max_boxes: Count = 200_000_000
+    """Maximum number of boxes of poses that are bounded."""
+    max_candidates: Count = 500_000
+    """Maximum number of boxes that remain after the coarse levels; each takes 56 bytes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""POSE SEARCH: find the pose in a box that fits a scan best."""
+"""Scan matching: the pose in a window that fits a scan best."""
 
 from hsloc.matching.certificate import CertificateParameters, CertificateSummary, certify, summarise
 from hsloc.matching.exact import Exact

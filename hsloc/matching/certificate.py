@@ -9,16 +9,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import radians
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from hsloc.errors import ConfigError
 from hsloc.kernels.box_search import BoxSearch, maximise
 from hsloc.matching.covariance import match_covariance
 from hsloc.matching.harmony_search import half_widths_in, information_at, low_discrepancy_order
 from hsloc.matching.score_pyramid import score_pyramid
 from hsloc.model.certificate import Certificate
+from hsloc.parameters import Angle, Count, Parameters, Positive, Range, Ratio
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -36,30 +36,19 @@ _SMALLEST = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CertificateParameters:
-    """What is to be proven about a match."""
+class CertificateParameters(Parameters):
+    """What is to be proven about a match, and how much work may be spent on it."""
 
-    epsilon: float = 0.01
-    """Fitness by which another pose may be fitter without being looked for, in (0, 1]: the gap that is proven."""
-    margin: float = 0.05
-    """Fitness by which every pose outside `radius` and `angle` is to be worse than the match, in [0, 1]."""
-    radius: float = 0.3
+    epsilon: Annotated[float, Range(1e-6, 1.0)] = 0.01
+    """Fitness by which another pose of the window may be fitter than the match: the gap that is proven."""
+    margin: Ratio = 0.05
+    """Fitness by which every pose farther away than radius or angle is to be worse than the match."""
+    radius: Positive = 0.3
     """Distance from the match within which another pose counts as the same place [m]."""
-    angle: float = radians(3.0)
+    angle: Angle = radians(3.0)
     """Rotation from the match within which another pose counts as the same place [rad]."""
-    max_boxes: int = 50_000
-    """Boxes of poses that each of the two proofs may bound; beyond that the bound stays where it is."""
-
-    def __post_init__(self) -> None:
-        for name, ok, rule in (
-            ("epsilon", 0.0 < self.epsilon <= 1.0, "in (0, 1]"),
-            ("margin", 0.0 <= self.margin <= 1.0, "in [0, 1]"),
-            ("radius", self.radius > 0.0, "positive"),
-            ("angle", self.angle > 0.0, "positive"),
-            ("max_boxes", self.max_boxes >= 1, "at least 1"),
-        ):
-            if not ok:
-                raise ConfigError(f"certificate: {name} is {getattr(self, name)}; it must be {rule}")
+    max_boxes: Count = 50_000
+    """Maximum number of boxes of poses that each of the two proofs bounds; beyond that a gap stays open."""
 
 
 def certify(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from hsloc.matching.certificate import CertificateParameters, certify
 from hsloc.matching.hide import Hide
 from hsloc.matching.match import Match, Matcher, StopReason
+from hsloc.parameters import Parameters
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Exact:
+class Exact(Parameters):
     """Branch and bound over the continuous window, from the pose that HIDE finds.
 
     The pose that HIDE finds makes the proof shorter (benchmarks/README.md) and decides nothing else: a fitter pose by
@@ -27,9 +28,7 @@ class Exact:
     """
 
     seed: Hide = field(default_factory=Hide)
-    """The search whose pose the proof starts from."""
     certificate: CertificateParameters = field(default_factory=CertificateParameters)
-    """What is to be proven."""
 
     def match(self, points: NDArray[np.float64], field: LikelihoodField, window: Window, rng: Generator) -> Match:
         """See `Matcher`; the Match has a certificate, and its evaluations count the boxes bounded too."""

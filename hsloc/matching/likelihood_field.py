@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
 
 _MOST_CELLS = 2e8
-"""A field needs about 22 bytes a cell while it is made: 4.4 GB."""
+"""Maximum number of cells of a field. Internal: 22 bytes a cell while it is made, 4.4 GB."""
 _ROWS = 64
-"""Rows of a map whose distances are worked out in one go."""
+"""Rows of a map whose distances are worked out in one go. Internal: bounds the memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
@@ -144,7 +144,7 @@ class LikelihoodField:
         return float(fitness_many(self.packed, self.scale(points), self.to_cells(pose)[None, :])[0])
 
     def distances(self, points: F64, pose: Pose2 = IDENTITY) -> F64:
-        """Distance in metres from each point, seen from `pose`, to the nearest wall, as the field tells it.
+        """Distance in metres from each point, seen from `pose`, to the nearest wall, from the field's score.
 
         Infinite outside the field.
         """

@@ -16,7 +16,7 @@ from hsloc.slam.loop_closer import Loop, LoopCloser
 from hsloc.slam.map_extension import connect, unconnected
 from hsloc.slam.map_session import from_front_end
 from hsloc.slam.map_state import MapState, fingerprint
-from hsloc.slam.occupancy_mapper import draw_grid
+from hsloc.slam.occupancy_mapper import build_grid
 from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
 from hsloc.slam.result import MappingQuality, MappingResult
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from hsloc.slam.front_end import LocalMatch
     from hsloc.slam.keyscans import KeyScan, KeyScans
+    from hsloc.slam.loop_closer import LoopParameters
     from hsloc.slam.map_session import MapSession
     from hsloc.slam.parameters import GraphMapperParameters, Resume
     from hsloc.slam.submaps import Submaps
@@ -36,12 +37,10 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
-MAX_EDGE_CHI = 6.0
-"""A loop whose chi is larger than this once the graph is solved was wrong."""
 _MOST_TORN = 5
-"""So often at most the loops are looked for anew, each time without the worst wrong one."""
+"""Maximum number of repeated loop searches, each without the worst wrong loop. Internal: bounds the time."""
 _RESIDUAL_SCANS = 400
-"""Scans whose residuals are measured."""
+"""Scans whose residuals are measured. Internal: a sample for the metrics, no pose depends on it."""
 
 
 def finish(
@@ -54,11 +53,11 @@ def finish(
     progress: Callable[[float], None] | None = None,
     resume: Resume | None = None,
 ) -> MappingResult:
-    """Close loops, refine, draw; with `resume`, in and with a saved map.
+    """Close loops, refine, build the map; with `resume`, in and with a saved map.
 
     Raises MapError if the log cannot be connected with the saved map.
     """
-    tell = progress if progress is not None else _silent
+    report = progress if progress is not None else _silent
     if not scans:
         if resume is not None:
             raise MapError(unconnected(resume.state))
@@ -66,13 +65,13 @@ def finish(
     gathered = from_front_end(scans, stamps_ns, local, track, parameters)
     if resume is not None:
         gathered = connect(resume, gathered, parameters, rng)
-    poses, loops, loop_edges = _close_loops(gathered, parameters, rng, lambda part: tell(0.5 * part))
+    poses, loops, loop_edges = _close_loops(gathered, parameters, rng, lambda part: report(0.5 * part))
     if resume is not None and not any(loop.accepted and _connects(loop, gathered) for loop in loops):
         raise MapError(unconnected(resume.state))
     edges = Edges.concatenate([gathered.steps, loop_edges])
-    refined, passes = _refine(poses, gathered.scans, edges, parameters, lambda part: tell(0.5 + 0.4 * part))
-    grid = draw_grid(refined.poses, gathered.scans, parameters.occupancy)
-    tell(1.0)
+    refined, passes = _refine(poses, gathered.scans, edges, parameters, lambda part: report(0.5 + 0.4 * part))
+    grid = build_grid(refined.poses, gathered.scans, parameters.occupancy)
+    report(1.0)
     of_log = refined.poses[gathered.first :]
     calibration = track.calibrated(of_log) if parameters.use_odometry else OdometryCalibration()
     odometry_poses, scan_poses = track.corrected(of_log, calibration)
@@ -121,7 +120,7 @@ def _close_loops(
         banned = frozenset((loop.first, loop.second) for loop in torn)
         closer = LoopCloser(places, gathered.scans, p, rng, banned, gathered.known, gathered.first_place)
         closer.close(progress)
-        solved, edges, worst = _solved(closer, places, chain, p.robust)
+        solved, edges, worst = _solved(closer, places, chain, p)
         if worst is None or len(torn) >= _MOST_TORN:
             break
         # What was searched for after a wrong loop was searched for in wrong places: all of it once more, without it.
@@ -130,16 +129,18 @@ def _close_loops(
     while worst is not None:
         loops = [loop if loop.first != worst.first or loop.second != worst.second else worst for loop in loops]
         closer.loops = loops
-        solved, edges, worst = _solved(closer, places, chain, p.robust)
+        solved, edges, worst = _solved(closer, places, chain, p)
     return solved, [*loops, *torn], edges
 
 
-def _solved(closer: LoopCloser, places: Submaps, chain: Edges, robust: float) -> tuple[F64, Edges, Loop | None]:
+def _solved(
+    closer: LoopCloser, places: Submaps, chain: Edges, parameters: LoopParameters
+) -> tuple[F64, Edges, Loop | None]:
     """The graph of keyscans solved with the loops, and the loop that tears worst, if any does, as refused."""
-    edges = _between_keyscans(closer.loops, places, robust)
+    edges = _between_keyscans(closer.loops, places, parameters.robust)
     solved = solve_edges(places.expand(closer.poses), Edges.concatenate([chain, edges]))
     _, _, chi = edge_errors(solved, edges)
-    if not (chi > MAX_EDGE_CHI).any():
+    if not (chi > parameters.max_edge_chi).any():
         return solved, edges, None
     loop = closer.accepted[int(np.argmax(chi))]
     return solved, edges, replace(loop, accepted=False, reason=f"torn: {chi.max():.0f} sigma off, the graph solved")
@@ -161,7 +162,7 @@ def _between_keyscans(loops: list[Loop], places: Submaps, robust: float) -> Edge
 def _refine(
     poses: F64, scans: KeyScans, edges: Edges, parameters: GraphMapperParameters, progress: Callable[[float], None]
 ) -> tuple[Registration, int]:
-    """Passes over the whole log, each with partners chosen anew, until nothing moves."""
+    """Passes over the whole log, each with partners chosen again, until nothing moves."""
     most, p = parameters.passes, parameters.joint_registration
     # Later passes begin near their end: no wide gates, and fewer rounds.
     later = replace(p, gates=p.gates[-1:], rounds=max(p.rounds // 2, 1))
@@ -245,4 +246,4 @@ def _empty(track: EventLog) -> MappingResult:
 
 
 def _silent(_: float) -> None:
-    """Nobody is told."""
+    """Progress without a listener."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import pi
+from typing import Any
 
 import naive
 import numpy as np
@@ -22,14 +23,14 @@ TOLERANCE = 1e-6
 """Of the fitness: the rounding of float32."""
 
 
-def poses_in(box, rng, count):
+def poses_in(box: Any, rng: Any, count: Any) -> Any:
     """The corners and the centre of a box, and poses within it."""
     signs = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
     inner = rng.uniform(-1.0, 1.0, (count, 3))
     return box[:3] + np.concatenate((np.zeros((1, 3)), signs, inner)) * box[3:]
 
 
-def fittest_in(field, scaled, box, rng):
+def fittest_in(field: Any, scaled: Any, box: Any, rng: Any) -> Any:
     """The greatest fitness that dense sampling and a climb from the best sample find in a box."""
     poses = poses_in(box, rng, 60)
     fitness = fitness_many(field.packed, scaled, poses)
@@ -38,7 +39,7 @@ def fittest_in(field, scaled, box, rng):
     return max(fitness.max(), fitness_many(field.packed, scaled, pose[None, :])[0])
 
 
-def excess_of_the_fittest(field, scans, count, seed):
+def excess_of_the_fittest(field: Any, scans: Any, count: Any, seed: Any) -> Any:
     """By how much the fittest pose found exceeds the lower of the bounds, for `count` random boxes."""
     rng = np.random.default_rng(seed)
     pyramid = score_pyramid(field)
@@ -63,7 +64,7 @@ def excess_of_the_fittest(field, scans, count, seed):
     return worst
 
 
-def test_no_pose_of_5000_boxes_in_a_room_is_fitter_than_the_bound():
+def test_no_pose_of_5000_boxes_in_a_room_is_fitter_than_the_bound() -> None:
     grid, walls = naive.room()
     field = LikelihoodField.from_grid(grid)
     scans = [naive.scan_points(walls, pose) for pose in (Pose2(1.3, 0.4, 0.7), Pose2(5.0, 2.0, -2.0))]
@@ -71,7 +72,7 @@ def test_no_pose_of_5000_boxes_in_a_room_is_fitter_than_the_bound():
 
 
 @pytest.mark.data
-def test_no_pose_of_5000_boxes_in_a_real_building_is_fitter_than_the_bound(data):
+def test_no_pose_of_5000_boxes_in_a_real_building_is_fitter_than_the_bound(data: Any) -> None:
     cases = read_cases(data / "match-cases" / "intel.npz")
     field = LikelihoodField.from_grid(cases.grid)
     assert excess_of_the_fittest(field, cases.scans, 5000, 2) <= TOLERANCE
@@ -81,7 +82,7 @@ numbers = st.floats(-12.0, 12.0, width=32)
 
 
 @st.composite
-def small_fields(draw):
+def small_fields(draw: Any) -> Any:
     """A field of random scores, zeros and ones among them, a few points, and a box."""
     height, width = draw(st.integers(2, 9)), draw(st.integers(2, 9))
     scores = draw(st.lists(st.sampled_from((0.0, 0.3, 0.9, 1.0)), min_size=height * width, max_size=height * width))
@@ -93,7 +94,7 @@ def small_fields(draw):
 
 @settings(max_examples=300, deadline=None)
 @given(small_fields(), st.integers(0, 2))
-def test_no_pose_is_fitter_than_the_bound_on_any_field(drawn, shift):
+def test_no_pose_is_fitter_than_the_bound_on_any_field(drawn: Any, shift: Any) -> None:
     scores, points, box = drawn
     field = LikelihoodField.from_scores(scores.astype(np.float32), 1.0, Pose2(), 1.0)
     pyramid = make_pyramid(field.packed, shift)
@@ -103,7 +104,7 @@ def test_no_pose_is_fitter_than_the_bound_on_any_field(drawn, shift):
 
 
 @pytest.mark.parametrize("shift", [0, 1, 2])
-def test_the_tables_hold_the_greatest_node_under_a_rectangle(shift, rng):
+def test_the_tables_hold_the_greatest_node_under_a_rectangle(shift: Any, rng: Any) -> None:
     scores = rng.random((23, 31)).astype(np.float32)
     pyramid = make_pyramid(LikelihoodField.from_scores(scores, 1.0, Pose2(), 1.0).packed, shift)
     for _ in range(300):
@@ -113,7 +114,7 @@ def test_the_tables_hold_the_greatest_node_under_a_rectangle(shift, rng):
         assert found == naive.largest_score(scores, u, u + width, v, v + height, SIZES, 1 << shift)
 
 
-def test_the_score_at_the_centre_comes_with_the_bound(rng):
+def test_the_score_at_the_centre_comes_with_the_bound(rng: Any) -> None:
     grid, walls = naive.room()
     field = LikelihoodField.from_grid(grid)
     scaled = field.scale(naive.scan_points(walls, Pose2(1.3, 0.4, 0.7)))
@@ -124,7 +125,7 @@ def test_the_score_at_the_centre_comes_with_the_bound(rng):
     assert bound >= centre
 
 
-def test_the_bound_of_slopes_converges_with_the_square_of_the_box(rng):
+def test_the_bound_of_slopes_converges_with_the_square_of_the_box(rng: Any) -> None:
     """Halving a small box where slopes cancel halves the excess of the maxima, and quarters that of the slopes."""
     slope = np.abs(np.linspace(-1.0, 1.0, 101))
     field = LikelihoodField.from_scores(np.tile(1.0 - slope, (40, 1)).astype(np.float32), 1.0, Pose2(), 1.0)
@@ -139,7 +140,7 @@ def test_the_bound_of_slopes_converges_with_the_square_of_the_box(rng):
     assert slopes[1] < 1e-5 < pooled[1]
 
 
-def test_a_bound_that_cannot_exceed_what_is_needed_is_given_up(rng):
+def test_a_bound_that_cannot_exceed_what_is_needed_is_given_up(rng: Any) -> None:
     grid, walls = naive.room()
     field = LikelihoodField.from_grid(grid)
     scaled = field.scale(naive.scan_points(walls, Pose2(1.3, 0.4, 0.7)))

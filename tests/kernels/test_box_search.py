@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import pi
+from typing import Any
 
 import naive
 import numpy as np
@@ -18,25 +19,34 @@ NOWHERE = np.empty((0, 3))
 
 
 @pytest.fixture(scope="module")
-def scene():
+def scene() -> Any:
     grid, walls = naive.room()
     return LikelihoodField.from_grid(grid), walls
 
 
-def search(epsilon, n, max_boxes=200_000):
+def search(epsilon: Any, n: Any, max_boxes: Any = 200_000) -> Any:
     return BoxSearch(epsilon * n, 6.0, 0.05, 40.0, 0.01, max_boxes)
 
 
-def run(field, scaled, box, places=NOWHERE, *, epsilon=0.01, best=0.0, max_boxes=200_000):
+def run(
+    field: Any,
+    scaled: Any,
+    box: Any,
+    places: Any = NOWHERE,
+    *,
+    epsilon: Any = 0.01,
+    best: Any = 0.0,
+    max_boxes: Any = 200_000,
+) -> Any:
     pose = np.full(3, np.nan)
     found = maximise(
-        score_pyramid(field), field.packed, scaled, box, places, search(epsilon, len(scaled), max_boxes), best, pose
+        score_pyramid(field), field.packed, scaled, box, places, search(epsilon, len(scaled), most), best, pose
     )
     return pose, *found
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_no_pose_of_a_dense_search_is_fitter_than_the_bound(scene, seed):
+def test_no_pose_of_a_dense_search_is_fitter_than_the_bound(scene: Any, seed: Any) -> None:
     field, walls = scene
     rng = np.random.default_rng(seed)
     true = Pose2(rng.uniform(0.0, 5.0), rng.uniform(0.0, 2.5), rng.uniform(-pi, pi))
@@ -55,7 +65,7 @@ def test_no_pose_of_a_dense_search_is_fitter_than_the_bound(scene, seed):
     assert (np.abs(pose - centre) <= half + 1e-9).all()
 
 
-def test_what_is_left_out_does_not_count_and_the_next_place_is_found(scene):
+def test_what_is_left_out_does_not_count_and_the_next_place_is_found(scene: Any) -> None:
     """A square room looks the same from four headings: each is found once those before are left out."""
     cells = np.zeros((80, 80), dtype=np.int8)
     cells[10, 10:70] = cells[69, 10:70] = cells[10:70, 10] = cells[10:70, 69] = 100
@@ -79,19 +89,19 @@ def test_what_is_left_out_does_not_count_and_the_next_place_is_found(scene):
     assert bound <= 0.9100001 * len(points)
 
 
-def test_too_little_work_leaves_a_bound_that_still_holds(scene, rng):
+def test_too_little_work_leaves_a_bound_that_still_holds(scene: Any, rng: Any) -> None:
     field, walls = scene
     true = Pose2(1.3, 0.4, 0.7)
     scaled = field.scale(naive.scan_points(walls, true) + rng.normal(0.0, 0.05, (180, 2)))
     box = np.array([[*field.to_cells(true), 20.0, 20.0, 0.5]])
-    _, best, bound, boxes, _ = run(field, scaled, box, max_boxes=50)
+    _, best, bound, boxes, _ = run(field, scaled, box, most=50)
     assert boxes < 60
     assert bound > best + 0.01 * len(scaled)
     at_truth = fitness_many(field.packed, scaled, field.to_cells(true)[None, :])[0]
     assert bound >= at_truth * len(scaled)
 
 
-def test_the_same_search_gives_the_same_bytes(scene):
+def test_the_same_search_gives_the_same_bytes(scene: Any) -> None:
     field, walls = scene
     true = Pose2(1.3, 0.4, 0.7)
     scaled = field.scale(naive.scan_points(walls, true))
@@ -101,7 +111,7 @@ def test_the_same_search_gives_the_same_bytes(scene):
     assert first[1:] == second[1:]
 
 
-def test_a_box_is_left_out_only_where_all_of_it_is_near():
+def test_a_box_is_left_out_only_where_all_of_it_is_near() -> None:
     places = np.array([[10.0, 10.0, 3.1]])
     assert is_left_out(places, np.array((11.0, 10.0, -3.12, 1.0, 1.0, 0.02)), 6.0, 0.1)
     assert not is_left_out(places, np.array((11.0, 10.0, -3.12, 5.5, 1.0, 0.02)), 6.0, 0.1)

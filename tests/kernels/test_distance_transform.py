@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import naive
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from scipy.ndimage import distance_transform_edt
 from hsloc.kernels.distance_transform import column_distances, squared_distances
 
 
-def columns_of(occupied, kind):
+def columns_of(occupied: Any, kind: Any) -> Any:
     columns = np.empty(occupied.shape, dtype=kind)
     column_distances(occupied, sum(occupied.shape), columns)
     return columns
@@ -20,7 +22,7 @@ def columns_of(occupied, kind):
 
 @settings(max_examples=200, deadline=None)
 @given(st.integers(1, 14), st.integers(1, 14), st.integers(0, 2**32 - 1), st.floats(0.01, 0.9))
-def test_distances_are_those_to_the_nearest_occupied_cell(height, width, seed, share):
+def test_distances_are_those_to_the_nearest_occupied_cell(height: Any, width: Any, seed: Any, share: Any) -> None:
     rng = np.random.default_rng(seed)
     occupied = rng.random((height, width)) < share
     occupied[rng.integers(height), rng.integers(width)] = True
@@ -33,7 +35,7 @@ def test_distances_are_those_to_the_nearest_occupied_cell(height, width, seed, s
 
 @pytest.mark.parametrize("kind", [np.uint16, np.int32])
 @pytest.mark.parametrize("share", [1e-4, 0.01, 0.3])
-def test_a_map_gets_the_bits_of_scipy_whether_in_one_go_or_in_rows(rng, share, kind):
+def test_a_map_gets_the_bits_of_scipy_whether_in_one_go_or_in_rows(rng: Any, share: Any, kind: Any) -> None:
     occupied = rng.random((200, 313)) < share
     occupied[17, 5] = True
     columns = columns_of(occupied, kind)

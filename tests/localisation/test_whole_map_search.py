@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import pi
+from typing import Any
 
 import naive
 import numpy as np
@@ -18,19 +19,19 @@ from hsloc.model import OccupancyGrid, Pose2, wrap_angle
 
 
 @pytest.fixture(scope="module")
-def building():
+def building() -> Any:
     world = floor(300.0, 3)
     grid = world.occupancy_grid(0.05)
     field = LikelihoodField.from_grid(grid)
     return world, grid, field, WholeMapSearch(grid, field)
 
 
-def is_near(mode, pose, metres=0.1, angle=0.05):
+def is_near(mode: Any, pose: Any, metres: Any = 0.1, angle: Any = 0.05) -> Any:
     return mode.pose.distance(pose) < metres and abs(wrap_angle(mode.pose.theta - pose.theta)) < angle
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_scan_from_anywhere_is_found_and_nothing_else_within_the_margin(building, seed):
+def test_a_scan_from_anywhere_is_found_and_nothing_else_within_the_margin(building: Any, seed: Any) -> None:
     world, grid, field, search = building
     rng = np.random.default_rng(seed)
     true = random_pose(grid, rng)
@@ -45,7 +46,7 @@ def test_a_scan_from_anywhere_is_found_and_nothing_else_within_the_margin(buildi
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_no_pose_of_a_dense_search_contradicts_the_proof(building, seed):
+def test_no_pose_of_a_dense_search_contradicts_the_proof(building: Any, seed: Any) -> None:
     """Random poses all over the floor, and around the modes: above the bound only in the radius of a mode."""
     world, grid, field, search = building
     rng = np.random.default_rng(10 + seed)
@@ -75,7 +76,7 @@ def test_no_pose_of_a_dense_search_contradicts_the_proof(building, seed):
 
 
 @pytest.mark.parametrize("shift", [1, 2])
-def test_coarser_tables_give_the_same_places(building, monkeypatch, shift):
+def test_coarser_tables_give_the_same_places(building: Any, monkeypatch: Any, shift: Any) -> None:
     world, grid, field, search = building
     rng = np.random.default_rng(5)
     points = scan_at(world, random_pose(grid, rng), rng)
@@ -91,7 +92,7 @@ def test_coarser_tables_give_the_same_places(building, monkeypatch, shift):
         assert one.fitness == pytest.approx(other.fitness, abs=0.006)
 
 
-def two_rooms():
+def two_rooms() -> Any:
     """Two rooms that look the same, side by side, seen from a third of the way into one of them."""
     cells = np.zeros((120, 250), dtype=np.int8)
     for left in (10, 130):
@@ -101,7 +102,7 @@ def two_rooms():
     return OccupancyGrid(cells, 0.05, Pose2())
 
 
-def test_rooms_that_look_alike_are_both_named():
+def test_rooms_that_look_alike_are_both_named() -> None:
     grid = two_rooms()
     field = LikelihoodField.from_grid(grid)
     # Walls of the left room as segments through the centres of its cells, in metres.
@@ -118,7 +119,7 @@ def test_rooms_that_look_alike_are_both_named():
         assert any(is_near(mode, pose) for mode in result.modes)
 
 
-def test_a_scan_of_another_building_is_nowhere(building):
+def test_a_scan_of_another_building_is_nowhere(building: Any) -> None:
     _, grid, field, _ = building
     rng = np.random.default_rng(2)
     other = floor(300.0, 77)
@@ -130,7 +131,7 @@ def test_a_scan_of_another_building_is_nowhere(building):
     assert result.bound <= 0.8 + 1e-6
 
 
-def test_too_little_work_is_admitted(building):
+def test_too_little_work_is_admitted(building: Any) -> None:
     world, grid, field, _ = building
     rng = np.random.default_rng(0)
     points = scan_at(world, random_pose(grid, rng), rng)
@@ -140,14 +141,14 @@ def test_too_little_work_is_admitted(building):
     assert result.bound == 1.0
 
 
-def test_a_map_without_ground_or_a_scan_without_points_proves_nothing(building):
+def test_a_map_without_ground_or_a_scan_without_points_proves_nothing(building: Any) -> None:
     _, grid, field, search = building
     assert not search.search(np.empty((0, 2))).is_complete
     walls_only = OccupancyGrid(np.where(grid.free(), -1, grid.cells).astype(np.int8), 0.05, grid.origin)
     assert not WholeMapSearch(walls_only, field).search(np.ones((5, 2))).is_complete
 
 
-def test_a_map_that_is_turned_is_searched_alike(building):
+def test_a_map_that_is_turned_is_searched_alike(building: Any) -> None:
     world, grid, field, search = building
     rng = np.random.default_rng(1)
     points = scan_at(world, random_pose(grid, rng), rng)
@@ -164,20 +165,20 @@ def test_a_map_that_is_turned_is_searched_alike(building):
         assert one.pose.distance(move @ other.pose) < 0.02
 
 
-def test_the_same_search_gives_the_same_result(building):
+def test_the_same_search_gives_the_same_result(building: Any) -> None:
     world, grid, field, search = building
     rng = np.random.default_rng(4)
     points = scan_at(world, random_pose(grid, rng), rng)
     assert search.search(points) == WholeMapSearch(grid, field).search(points)
 
 
-def test_scans_are_joined_at_the_last_pose():
+def test_scans_are_joined_at_the_last_pose() -> None:
     poses = [Pose2(1.0, 0.0, 0.0), Pose2(3.0, 0.0, 0.5 * pi)]
     joined = join_scans([np.array([[1.0, 0.0]]), np.array([[0.0, 2.0]])], poses)
     assert np.allclose(joined, [[0.0, 1.0], [0.0, 2.0]])
 
 
-def test_parameters_out_of_range_are_refused_by_name():
+def test_parameters_out_of_range_are_refused_by_name() -> None:
     with pytest.raises(ConfigError, match="margin"):
         WholeMapParameters(margin=-1.0)
     with pytest.raises(ConfigError, match="max_modes"):

@@ -34,9 +34,7 @@ def score_sum(scores: Any, points: Any, x: Any, y: Any, theta: Any) -> Any:
     return total
 
 
-def largest_score(
-    scores: Any, u_low: float, u_high: float, v_low: float, v_high: float, sizes: Any, step: int
-) -> int:
+def largest_score(scores: Any, u_low: float, u_high: float, v_low: float, v_high: float, sizes: Any, step: int) -> int:
     """The greatest node, in steps of 1 / 255 rounded up, of the square of whole entries that covers a rectangle.
 
     An entry is step x step nodes; the square begins at the entry of the rectangle's corner, has the smallest of `sizes`

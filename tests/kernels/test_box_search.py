@@ -40,7 +40,7 @@ def run(
 ) -> Any:
     pose = np.full(3, np.nan)
     found = maximise(
-        score_pyramid(field), field.packed, scaled, box, places, search(epsilon, len(scaled), most), best, pose
+        score_pyramid(field), field.packed, scaled, box, places, search(epsilon, len(scaled), max_boxes), best, pose
     )
     return pose, *found
 
@@ -94,7 +94,7 @@ def test_too_little_work_leaves_a_bound_that_still_holds(scene: Any, rng: Any) -
     true = Pose2(1.3, 0.4, 0.7)
     scaled = field.scale(naive.scan_points(walls, true) + rng.normal(0.0, 0.05, (180, 2)))
     box = np.array([[*field.to_cells(true), 20.0, 20.0, 0.5]])
-    _, best, bound, boxes, _ = run(field, scaled, box, most=50)
+    _, best, bound, boxes, _ = run(field, scaled, box, max_boxes=50)
     assert boxes < 60
     assert bound > best + 0.01 * len(scaled)
     at_truth = fitness_many(field.packed, scaled, field.to_cells(true)[None, :])[0]

@@ -28,12 +28,14 @@ EVERYWHERE: frozenset[Door] = COMMANDS | {"http"}
 ONE_RUN: frozenset[Door] = EVERYWHERE - {"sweep"}
 
 MODES = ("auto", "localise", "slam")
-MATCHERS = ("hide", "harmony_search", "icp")
+MATCHERS = ("hide", "harmony_search", "icp", "exact")
 MATCHER_ALIASES = {"hs": "harmony_search"}
 MAPPERS = ("graph", "point")
 PRESETS = ("default", "paper", "paper-literal")
 ALIGNMENTS = ("none", "origin", "se2")
 STAMPS = ("header", "log")
+AUTO = "auto"
+"""Value of `time_offset` that has it estimated."""
 VERDICTS = ("check", "failed")
 
 
@@ -156,7 +158,7 @@ OPTIONS: tuple[Option, ...] = (
     ),
     Option(
         name="time_offset", flag="--time-offset", kind="topics", metavar="TOPIC=S", place="read", group=_READING,
-        help="Add seconds to the stamps of a topic [s]; several, or with commas.",
+        help="Add seconds to the stamps of a topic [s]; several, or with commas; auto estimates them from the data.",
     ),
     Option(
         name="stamps", flag="--stamps", kind="choice", choices=STAMPS, default="header", place="read", group=_READING,
@@ -188,6 +190,10 @@ OPTIONS: tuple[Option, ...] = (
         name="matcher", flag="--matcher", kind="choice", choices=(*MATCHERS, *MATCHER_ALIASES), place="config",
         group=_ALGORITHMS, varied=True,
         help="Scan matcher; hs is short for harmony_search (default: hide).",
+    ),
+    Option(
+        name="certify", flag="--certify", kind="switch", default=False, place="config", group=_ALGORITHMS,
+        help="Prove of each match on a map that no pose of its window is fitter: localiser.certify.",
     ),
     Option(
         name="mapper", flag="--mapper", kind="choice", choices=MAPPERS, place="config", group=_ALGORITHMS, varied=True,

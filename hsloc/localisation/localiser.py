@@ -19,6 +19,8 @@ from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, Odom
 from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
 from hsloc.localisation.track_monitor import TrackMonitor
+from hsloc.matching.certificate import CertificateParameters, certify
+from hsloc.matching.exact import heuristic
 from hsloc.matching.local_refinement import refine
 from hsloc.matching.observability import match_information
 from hsloc.matching.window import Window
@@ -76,6 +78,9 @@ class LocaliserParameters(Parameters):
     """Standard deviation of a given initial pose in x and y [m]."""
     initial_sigma_angle: Positive = radians(15.0)
     """Standard deviation of a given initial pose in heading [rad]."""
+    certify: bool = False
+    """Whether each match is followed by a proof that no pose of its window is fitter."""
+    certificate: CertificateParameters = field(default_factory=CertificateParameters)
     motion_model: Annotated[str, OneOf(MOTION_MODELS)] = "differential"
     """How the base moves, which chooses its odometry noise: differential drive, car-like, or in any direction."""
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
@@ -146,6 +151,9 @@ class Localiser:
             (parameters.initial_sigma**2, parameters.initial_sigma**2, parameters.initial_sigma_angle**2)
         )
         self._excess = 1.0
+        # Where a proof is asked for, the optimum next to the prediction has none.
+        proves = parameters.certify or heuristic(matcher) is not matcher
+        self._refines = parameters.refine_first and not proves
         self._motion_gate = MotionGate(parameters.update_min_d, parameters.update_min_a)
         self._match_gate = MatchGate(parameters.match_limits())
         self._searching = initial_pose is None
@@ -164,7 +172,9 @@ class Localiser:
         noise = parameters.noise()
         p = parameters.place_check
         check = PlaceCheck(grid, likelihood, p) if p.interval > 0.0 else None
-        search = Relocaliser(grid, likelihood, matcher, parameters.relocaliser, noise, rng, place_check=check)
+        search = Relocaliser(
+            grid, likelihood, heuristic(matcher), parameters.relocaliser, noise, rng, place_check=check
+        )
         return cls(likelihood, matcher, search, noise, parameters, rng, initial_pose, place_check=check)
 
     @property
@@ -229,8 +239,17 @@ class Localiser:
             status = Status.SEARCHING
             reason = f"lost: the map explains {evidence.explained:.2f}, another place fits {evidence.rival:.2f} times"
             self._lose()
-        covariance = self._reported(covariance)
-        return Estimate(scan.stamp_ns, pose, status, covariance, match.fitness, evaluations, reason, evidence=evidence)
+        return Estimate(
+            scan.stamp_ns,
+            pose,
+            status,
+            self._reported(covariance),
+            match.fitness,
+            evaluations,
+            reason,
+            evidence=evidence,
+            certificate=match.certificate,
+        )
 
     def _lose(self) -> None:
         """The pose is unknown from now on: search."""
@@ -259,12 +278,12 @@ class Localiser:
         window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
         usual = self._match_gate.usual
         evaluations = 0
-        if p.refine_first and usual is not None:
+        if self._refines and usual is not None:
             refined = refine(points, self._field, window)
             if refined.fitness >= _AS_USUAL * usual and self._match_gate.refusals == 0:
                 return refined, refined.evaluations
             evaluations = refined.evaluations
-        best = self._matcher.match(points, self._field, window, self._rng)
+        best = self._match_in(points, window)
         evaluations += best.evaluations
         if usual is not None and self._match_gate.refusal(best.fitness):
             wide = Window(
@@ -273,11 +292,17 @@ class Localiser:
                 max(window.half_y, p.wide_window),
                 max(window.half_theta, p.wide_window_angle),
             )
-            match = self._matcher.match(points, self._field, wide, self._rng)
+            match = self._match_in(points, wide)
             evaluations += match.evaluations
             if self._match_gate.is_recovered(best.fitness, match.fitness):
                 best = match
         return best, evaluations
+
+    def _match_in(self, points: F64, window: Window) -> Match:
+        match = self._matcher.match(points, self._field, window, self._rng)
+        if self._parameters.certify and match.certificate is None:
+            return certify(match, points, self._field, window, self._parameters.certificate)
+        return match
 
     def _refuse(
         self,

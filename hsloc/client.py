@@ -20,13 +20,14 @@ import time
 import urllib.error
 import urllib.request
 import uuid
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hsloc.errors import HslocError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
+    from os import PathLike
 
 TUS = {"Tus-Resumable": "1.0.0"}
 MIN_BLOCK = 64 << 10
@@ -69,11 +70,12 @@ class Client:
         self._token, self._attempts, self._timeout_s, self._block = token, attempts, timeout_s, block
         self._has_answered = False
 
-    def upload(self, path: Path, progress: Callable[[int, int], None] | None = None) -> str:
+    def upload(self, path: str | PathLike[str], progress: Callable[[int, int], None] | None = None) -> str:
         """Upload a file in blocks and check its SHA-256; the id that the server gave it.
 
         `progress` gets bytes done and bytes in all.
         """
+        path = Path(path)
         try:
             with path.open("rb") as file:
                 size = file.seek(0, 2)
@@ -150,8 +152,9 @@ class Client:
                 return job
             time.sleep(every_s)
 
-    def download(self, job_id: str, folder: Path) -> list[Path]:
+    def download(self, job_id: str, folder: str | PathLike[str]) -> list[Path]:
         """All files of the results into a folder, each checked against the manifest."""
+        folder = Path(folder)
         manifest = self.request("GET", f"/v1/jobs/{job_id}/results").json()
         paths = []
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,9 @@ from hsloc.errors import EvaluationError
 from hsloc.evaluation.map_quality import compare_maps, crispness
 from hsloc.evaluation.metrics import compare_run
 from hsloc.log import LaserSummary
+from hsloc.matching import summarise
 from hsloc.run_metrics import (
+    CertificateMetrics,
     EvaluationCounts,
     FitnessMetrics,
     LaserMetrics,
@@ -37,23 +40,23 @@ if TYPE_CHECKING:
 
 def run_identity(result: Result) -> RunIdentity:
     """What was run."""
-    spec = result.spec
+    request = result.request
     return RunIdentity(
         hsloc=__version__,
         mode=result.mode,
-        inputs=spec.names(),
+        inputs=request.names(),
         input_sha256=result.input_sha256,
         map=_map_name(result),
-        seed=spec.seed,
-        preset=spec.preset,
+        seed=request.seed,
+        preset=request.preset,
         matcher=result.matcher_name,
     )
 
 
 def _map_name(result: Result) -> str:
     if result.mode == "slam":
-        return "built" if result.spec.resume is None else f"{result.spec.resume.name}, extended"
-    return "log" if result.spec.map_path is None else result.spec.map_path.name
+        return "built" if result.request.resume is None else f"{result.request.resume.name}, extended"
+    return "log" if result.request.map_path is None else result.request.map_path.name
 
 
 def log_metrics(result: Result) -> LogMetrics:
@@ -63,7 +66,7 @@ def log_metrics(result: Result) -> LogMetrics:
         LaserSummary(summary.scan_topic or "", summary.laser_frame or "", summary.T_base_laser, summary.laser_flipped,
                      summary.extrinsics),
     )  # fmt: skip
-    reference = summary.truth_topic if result.spec.reference is None else result.spec.reference
+    reference = result.request.reference_name or summary.truth_topic
     return LogMetrics(
         duration_s=duration(result),
         odometry_messages=len(result.odometry),
@@ -99,6 +102,12 @@ def fitness_metrics(result: Result) -> FitnessMetrics:
     """Fitness of the matches."""
     fitness = result.diagnostics.fitness[np.isfinite(result.diagnostics.fitness)]
     return FitnessMetrics(median=_median(fitness), p05=float(np.percentile(fitness, 5)) if len(fitness) else None)
+
+
+def certificate_metrics(result: Result) -> CertificateMetrics | None:
+    """What was proven about the matches; None where none was certified."""
+    summary = summarise(result.diagnostics.certificates)
+    return None if summary is None else CertificateMetrics(**asdict(summary))
 
 
 def map_metrics(result: Result, residuals: ResidualMetrics, comparison: Comparison | None) -> MapMetrics:

@@ -13,7 +13,7 @@ EXAMPLES = """
   hsloc bench kernel --json
 """
 
-_PARTS = ("kernel", "match", "replay", "memory", "sub-cell", "cases")
+_PARTS = ("kernel", "match", "replay", "memory", "sub-cell", "cases", "certificates", "whole-map")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,11 +22,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "parts", nargs="*", type=_part, metavar="PART", help=f"of {', '.join(_PARTS)} (default: all)"
     )  # fmt: skip
     parser.add_argument(
-        "--cases", type=Path, metavar="FILE.npz", help="matching cases: real scans, a map, starts that are off"
+        "--cases", type=Path, metavar="FILE.npz", help="Matching cases: real scans, a map, and starts with an error."
     )
-    parser.add_argument("--quick", action="store_true", help="small inputs, few repeats: does it work at all")
-    parser.add_argument("--json", action="store_true", help="print the results as JSON on stdout")
-    parser.add_argument("-q", "--quiet", action="store_true", help="show no progress")
+    parser.add_argument(
+        "--quick", action="store_true", help="Use small inputs and few repetitions, to see that it works."
+    )
+    parser.add_argument("--json", action="store_true", help="Print the results as JSON on stdout.")
+    parser.add_argument("-q", "--quiet", action="store_true", help="Show no progress.")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -37,8 +39,9 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.evaluation.metrics import format_json
 
     parts = arguments.parts or list(_PARTS)
-    if "cases" in arguments.parts and arguments.cases is None:
-        raise ConfigError("the part cases needs a file; name an .npz with --cases")
+    for part in ("cases", "certificates"):
+        if part in arguments.parts and arguments.cases is None:
+            raise ConfigError(f"the part {part} needs a file; name an .npz with --cases")
     with ProgressLine(arguments.quiet) as line:
         bench = run_bench(parts, arguments.cases, quick=arguments.quick, progress=line.show)
     if arguments.json:
@@ -46,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     print(markdown(bench))
     if arguments.cases is None:
-        print("No --cases FILE.npz: the matching table was left out.")
+        print("No --cases FILE.npz: the tables of matching and of certificates were left out.")
     return 0
 
 

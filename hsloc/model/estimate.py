@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from hsloc.model.certificate import Certificate
     from hsloc.model.pose2 import Pose2
 
 
@@ -53,6 +54,8 @@ class Estimate:
     evaluations: int = 0
     reason: str = ""
     revision: tuple[tuple[int, Pose2], ...] = ()
+    certificate: Certificate | None = None
+    """What was proven about the match, where it was asked for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,8 +63,8 @@ class ScanDiagnostics:
     """One row for each scan of a run, as columns of length n.
 
     `status` holds values of `Status`; `fitness` is NaN where nothing was matched; `sigma` (n, 3) are the standard
-    deviations of x, y (m) and theta (rad), NaN where unknown; `evaluations` counts fitness evaluations;
-    `reason` is empty where there is no reason to state.
+    deviations of x, y (m) and theta (rad), and `covariance` (n, 3, 3) is over them in the map frame, NaN where unknown;
+    `evaluations` counts fitness evaluations; `reason` is empty where there is no reason to state.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -70,6 +73,9 @@ class ScanDiagnostics:
     sigma: NDArray[np.float64]
     evaluations: NDArray[np.int64]
     reason: tuple[str, ...]
+    covariance: NDArray[np.float64]
+    certificates: tuple[Certificate, ...] = ()
+    """Of those scans that have one, in their order."""
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

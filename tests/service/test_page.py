@@ -295,6 +295,32 @@ def test_an_upload_goes_on_after_a_broken_line_and_after_a_reload(
     context.close()
 
 
+def test_the_form_offers_what_the_server_does(make_live: Callable[..., Live], open_page: Callable[..., Any]) -> None:
+    live = make_live()
+    page = open_page(live.url)
+    page.wait_for_selector("[data-option=seed]", state="attached")
+    with live.client() as client:
+        offered = {each["name"] for each in client.get("/v1/options", timeout=60.0).json()["run"]}
+    built = set(page.evaluate("() => [...document.querySelectorAll('[data-option]')].map((e) => e.dataset.option)"))
+    assert built == offered - {"relations", "reference", "resume"}
+    page.click("summary >> text=Map and options")
+    for group in ("reading the log", "algorithms"):
+        page.click(f"summary >> text={group}")
+    page.fill("[data-option=initial_pose]", "-1, 2, 0.5")
+    page.fill("[data-option='read.start_s']", "1.5")
+    page.fill("[data-option=seed]", "7")
+    page.select_option("[data-option=matcher]", "icp")
+    page.fill("[data-option=config]", '{"icp": {"iterations": 9}}')
+    page.set_input_files("#log", str(RECORDINGS / "slip.mcap"))
+    page.click("#go")
+    page.wait_for_selector("#jobs [data-job]")
+    with live.client() as client:
+        (job,) = client.get("/v1/jobs").json()["jobs"]
+    request = job["request"]
+    assert (request["initial_pose"], request["read"]["start_s"], request["seed"]) == ([-1.0, 2.0, 0.5], 1.5, 7)
+    assert (request["matcher"], request["config"]) == ("icp", {"icp": {"iterations": 9}})
+
+
 def test_a_page_goes_on_when_the_server_was_restarted(make_live: Callable[..., Live], browser: Any) -> None:
     live = make_live()
     with live.client() as client:

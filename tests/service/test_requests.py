@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 import subprocess
 import sys
 import time
 import uuid
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from live_service import submit, upload, wait
+from live_service import submit, upload, wait, without_command
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from paths import RECORDINGS
@@ -75,15 +73,6 @@ def same_bytes(client: TestClient, job: str, folder: Path) -> None:
     for name in sorted(theirs - {"timings.json"}):
         found = client.get(f"/v1/jobs/{job}/results/{name}").content
         assert without_command(name, found) == without_command(name, (folder / name).read_bytes()), name
-
-
-def without_command(name: str, content: bytes) -> Any:
-    """A file of the results without the line "run it again with": the service names no folders in it."""
-    if name != "run.mcap":
-        return re.sub(rb"hsloc replay [^\n<]*", b"", content)
-    reader = make_reader(BytesIO(content))
-    config = [without_command(each.name, each.data) for each in reader.iter_attachments()]
-    return config, [(channel.topic, message.log_time, message.data) for _, channel, message in reader.iter_messages()]
 
 
 def test_two_parts_then_an_extended_map_scored_by_relations(

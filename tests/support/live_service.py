@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import httpx2 as httpx
+from mcap.reader import make_reader
 
 from hsloc_service.settings import Settings
 
@@ -108,3 +111,12 @@ class Live:
 
     def client(self) -> httpx.Client:
         return httpx.Client(base_url=self.url, timeout=20.0)
+
+
+def without_command(name: str, content: bytes) -> Any:
+    """A file of the results without the line "run it again with": the service names no folders in it."""
+    if name != "run.mcap":
+        return re.sub(rb"hsloc replay [^\n<]*", b"", content)
+    reader = make_reader(BytesIO(content))
+    config = [without_command(each.name, each.data) for each in reader.iter_attachments()]
+    return config, [(channel.topic, message.log_time, message.data) for _, channel, message in reader.iter_messages()]

@@ -1,6 +1,7 @@
 // The page. Whatever comes from a log or a person goes in as text, never as markup.
 
 import { Refused, events, get, hasToken, onToken, post, request, useToken } from "./api.js";
+import { build, chosen as chosenOptions } from "./options.js";
 import { plot } from "./plot.js";
 import { upload } from "./upload.js";
 import { Viewer } from "./viewer.js";
@@ -55,6 +56,7 @@ $("token-form").addEventListener("submit", (event) => {
 async function about() {
   const info = await guarded(() => get("/v1/info"));
   if (info) $("server").textContent = `version ${info.version}, ${bytes(info.free_bytes)} free, ${info.tenant}`;
+  if (info && !$("options").children.length) build($("options"), (await guarded(() => get("/v1/options")))?.run ?? []);
 }
 
 // --- new job ---------------------------------------------------------------------------------------------------------
@@ -75,16 +77,8 @@ for (const kind of ["dragover", "dragleave", "drop"]) {
 }
 
 function options() {
-  const found = { mode: $("mode").value, preset: $("preset").value, seed: Number($("seed").value), unknown_start: $("unknown").checked };
-  if ($("matcher").value) found.matcher = $("matcher").value;
+  const found = chosenOptions($("options"));
   if ($("resume").value) found.resume = $("resume").value;
-  if ($("pose").value.trim()) {
-    found.initial_pose = $("pose").value.trim().split(/[\s,]+/).map(Number);
-    if (found.initial_pose.length !== 3 || found.initial_pose.some(Number.isNaN)) throw new SyntaxError("start: three numbers are needed: x, y (metres) and yaw (radians)");
-  }
-  if ($("config").value.trim()) {
-    try { found.config = JSON.parse($("config").value); } catch (error) { throw new SyntaxError(`parameters are not JSON: ${error.message}`); }
-  }
   return found;
 }
 
@@ -105,12 +99,13 @@ async function submit() {
     if (!yaml || !image || files.length !== 2) throw new SyntaxError("a map is two files: its YAML and its image");
     wanted.map = { yaml: await send(yaml), image: await send(image) };
   }
-  if ($("relations").files.length) wanted.relations = await send($("relations").files[0]);
+  const others = ["relations", "reference"].filter((name) => $(name).files.length);
+  for (const name of others) wanted[name] = await send($(name).files[0]);
   const logs = [];
   for (const file of $("log").files) logs.push(await send(file));
   if (logs.length === 1) [wanted.log] = logs; else wanted.logs = logs;
   const job = await post("/v1/jobs", wanted, { "Idempotency-Key": crypto.randomUUID ? crypto.randomUUID() : String(Math.random()) });
-  for (const file of [...$("log").files, ...files, ...$("relations").files]) sent.delete(file);
+  for (const file of [...$("log").files, ...files, ...others.map((name) => $(name).files[0])]) sent.delete(file);
   await refresh();
   show(job.id, true);
 }

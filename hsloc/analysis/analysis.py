@@ -18,7 +18,7 @@ from hsloc.analysis.metrics import (
     run_identity,
     scan_counts,
 )
-from hsloc.analysis.quality import quality_warnings, verdict_reasons
+from hsloc.analysis.quality import offset_warnings, quality_warnings, verdict_reasons
 from hsloc.analysis.scan_statistics import ConvergenceSample, ExtrinsicsCheck, Residuals
 from hsloc.analysis.second_pass import posed_events
 from hsloc.errors import EvaluationError
@@ -87,7 +87,8 @@ def analyse(
             for statistics in (residuals, check, sample):
                 statistics.add(posed.event.scan, posed.T_map_base)
     errors = _Errors(result, spec.alignment or ("se2" if result.mode == "slam" else "none"))
-    warnings = (*result.warnings, *quality_warnings(result), *residuals.warnings(), *check.warnings())
+    found = (*quality_warnings(result), *offset_warnings(result), *residuals.warnings(), *check.warnings())
+    warnings = (*result.warnings, *found)
     reasons = verdict_reasons(result, warnings)
     metrics = RunMetrics(
         verdict=verdict_of(reasons),

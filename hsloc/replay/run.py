@@ -20,6 +20,7 @@ from hsloc.matching.window import Window
 from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
+from hsloc.options import AUTO
 from hsloc.preprocessing.odometry_resets import ContinuousOdometry
 from hsloc.preprocessing.odometry_watch import OdometryWatch, UnusableOdometry
 from hsloc.replay.engine import replay
@@ -33,6 +34,7 @@ from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.parameters import Resume
 from hsloc.slam.point_mapper import PointMapper
+from hsloc.slam.time_offset import HINT_S, as_option, in_words, offset_warning, offsets_of_log
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -151,6 +153,9 @@ def _run_with(
 ) -> Result:
     begin = time.perf_counter()
     log = open_log(spec.logs, spec.reading())
+    if not lidar_only:
+        log, of_clocks = with_offset(spec, log)
+        warnings = (*warnings, *of_clocks)
     of_reference: list[RunWarning] = []
     reference = None if spec.reference is None else read_reference(spec.reference, spec.logs, of_reference)
     grid, of_map = find_map(spec, log)
@@ -217,6 +222,32 @@ def _run_with(
         lidar_only=lidar_only,
         deskewed=deskew,
     )
+
+
+def with_offset(spec: RunRequest, log: Log) -> tuple[Log, tuple[RunWarning, ...]]:
+    """The log with the estimated offset of its scans, if that is asked for; a warning where there is one.
+
+    Otherwise it is estimated only where log times hint at it: `hsloc.analysis` finds smaller ones in the result.
+    """
+    automatic = spec.read.time_offset == AUTO
+    apart = abs(log.summary.clocks_apart_s) > HINT_S and spec.read.time_offset is None
+    if not (automatic or apart):
+        return log, ()
+    found = offsets_of_log(spec.logs, spec.reading(), spec.config.graph_mapper.front_end)
+    option = as_option(found)
+    if option is None:
+        return log, ()
+    if not automatic:
+        return log, tuple(offset_warning(topic, offset) for topic, offset in found.items() if offset.is_significant)
+    warnings = tuple(
+        RunWarning(
+            WarningCode.CLOCK_OFFSET_APPLIED,
+            f"the stamps of {topic} were {in_words(offset)} those of the odometry, which was corrected",
+        )
+        for topic, offset in found.items()
+        if offset.is_significant
+    )
+    return open_log(spec.logs, replace(spec.reading(), time_offset=option)), warnings
 
 
 def _mapped(history: RunHistory, mapping: MappingResult) -> tuple[Trajectory, NDArray[np.bool_]]:

@@ -101,7 +101,10 @@ def main() -> int:
         (output / "sub").mkdir()
         (output / "sub" / "x").write_text("x")
         (output / "<img src=x>").write_text("x")
-    tell({"done": {"metrics": {}, "data_lost": False, "warnings": [], "notes": [], "timings": {}}})
+    warning = {"code": "clocks_apart", "text": "the stamps are 3.0 s apart", "remedy": "check the clocks"}
+    figure = {"name": "APE rmse", "values": ["1.23 cm", "0.45°"]}
+    summary = {"metrics": {"verdict": "check"}, "figures": [figure], "warnings": [warning]}
+    tell({"done": {**summary, "data_lost": False, "notes": [], "timings": {}}})
     return 0
 
 

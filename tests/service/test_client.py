@@ -88,6 +88,9 @@ def test_the_command(make_live: Callable[..., Live], log: Path, tmp_path: Path) 
     assert done.returncode == 0, done.stderr
     assert "succeeded" in done.stdout
     assert (tmp_path / "got" / "trajectory.tum").read_text().startswith("8 ")
+    assert "hsloc: warning: the stamps are 3.0 s apart; check the clocks\n" in done.stderr
+    assert "verdict: check\n" in done.stdout
+    assert " ".join(done.stdout.split()).endswith("APE rmse 1.23 cm 0.45°")
     log.write_bytes(b"bad-input")
     failed = submit(live, str(log), "--wait")
     assert failed.returncode == 1
@@ -126,6 +129,7 @@ def test_the_command_sends_what_replay_takes(make_live: Callable[..., Live], log
     assert client.request("GET", f"/v1/files/{request['relations']}").json()["name"] == "some.relations"
     assert (request["alignment"], request["no_odometry"], request["mode"]) == ("origin", True, "slam")
     read = {key: value for key, value in request["read"].items() if value is not None}
+    assert read.pop("stamps") == "header"
     assert read == {"scan_topic": "/a,/b", "start_s": 2.0, "laser_pose": [1.0, 2.0, 3.0], "deskew": True}
     assert client.wait(job["id"], every_s=0.1)["state"] == "succeeded"
     refused = submit(live, str(log), "--resume", job["id"])

@@ -89,7 +89,7 @@ class Live:
                 stdout=log,
                 stderr=log,
             )
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + 60.0  # a machine that runs other tests may be slow
         while time.monotonic() < deadline:
             with contextlib.suppress(httpx.HTTPError):
                 if httpx.get(f"{self.url}/readyz").status_code == 200:
@@ -97,7 +97,9 @@ class Live:
             if self.process.poll() is not None:
                 raise RuntimeError(self.log.read_text())
             time.sleep(0.05)
-        raise AssertionError("the server did not start")
+        self.process.kill()
+        self.process.wait()
+        raise AssertionError(f"the server did not start: {self.log.read_text()}")
 
     def end(self, which: int = signal.SIGTERM) -> int:
         assert self.process is not None

@@ -88,6 +88,9 @@ class TextSource:
         self._format = line_format
         self._options = options
         self._rule = RangeRule()
+        # Laser lines, which may have several keywords, are of one clock.
+        offsets = options.offsets_s()
+        self._scan_offset_ns = round(1e9 * sum(value for name, value in offsets.items() if name != "ODOM"))
         self._has_odometry_lines = False
         self.losses_at_opening = Losses()
         self.summary = self._survey()
@@ -114,6 +117,7 @@ class TextSource:
             mounting = self._options.laser_pose or line.scan.T_base_laser
             yield replace(
                 line.scan,
+                stamp_ns=line.scan.stamp_ns + self._scan_offset_ns,
                 ranges=self._rule.apply(line.scan.ranges),
                 range_min=RANGE_MIN,
                 range_max=line.scan.range_max or self._rule.range_max,

@@ -98,13 +98,15 @@ _MOST_LINES = 50
 def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
     """The summary of a job: the figures as the reports show them, the verdict, and all warnings of the run."""
     from hsloc.dataclass_json import to_json
-    from hsloc.report.table import table_rows
+    from hsloc.report.table import reason_text, table_rows
 
     values = metrics.to_json()
     return {
         "metrics": {key: values[key] for key in _SUMMARISED if key in values},
         "figures": [{"name": row.label, "values": list(row.values)} for row in table_rows(metrics)],
-        "verdict_reasons": [_shortened(each) for each in values["verdict_reasons"]][:_MOST_LINES],
+        "verdict_reasons": [
+            {**_shortened(to_json(each)), "line": reason_text(each)[:500]} for each in metrics.verdict_reasons
+        ][:_MOST_LINES],
         "data_lost": metrics.losses.data_lost,
         "warnings": [_shortened(to_json(each)) for each in metrics.warnings][:_MOST_LINES],
         "notes": [line[:500] for line in metrics.losses.notes][:_MOST_LINES],

@@ -319,9 +319,9 @@ function metrics(job) {
   if (found.run) row("Run", `hsloc ${found.run.hsloc}, ${found.run.matcher}, preset ${found.run.preset}, seed ${found.run.seed}`);
   if (found.run) row("SHA-256 of the log", found.run.input_sha256);
   $("metrics").tBodies[0].replaceChildren(...rows);
-  const reasons = (job.summary?.verdict_reasons ?? []).map(warningText);
-  const warnings = (job.summary?.warnings ?? []).map(warningText).filter((text) => !reasons.includes(text));
-  const lines = [...reasons, ...warnings, ...(job.summary?.notes ?? [])];
+  const reasons = job.summary?.verdict_reasons ?? [], known = new Set(reasons.map((reason) => reason.text));
+  const warnings = (job.summary?.warnings ?? []).filter((warning) => !known.has(warning.text)).map(warningText);
+  const lines = [...reasons.map((reason) => reason.line), ...warnings, ...(job.summary?.notes ?? [])];
   $("notes").replaceChildren(...lines.map((text) => element("p", text, "quiet")));
 }
 

@@ -74,7 +74,7 @@ def offset_warnings(result: Result) -> list[RunWarning]:
     if not offset.is_significant:
         return []
     # Poses are weighed with the odometry, which hides a part of the offset: the scans alone show the whole of it.
-    spec = result.spec
+    spec = result.request
     found = offsets_of_log(spec.logs, spec.reading(), spec.config.graph_mapper.front_end)
     given = spec.read.offsets_s()
     return [

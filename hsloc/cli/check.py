@@ -24,10 +24,10 @@ EXAMPLES = """
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `hsloc check`."""
-    parser.add_argument("log", nargs="+", metavar="LOG", help="the log: a file, its parts, or a folder with them")
+    parser.add_argument("log", nargs="+", metavar="LOG", help="Log: a file, its parts, or a folder with them.")
     add_read_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print errors and damage only")
+    parser.add_argument("--json", action="store_true", help="Print everything as JSON.")
+    parser.add_argument("-q", "--quiet", action="store_true", help="Print errors and damage only.")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -88,7 +88,10 @@ def request_of(given: Mapping[str, Any], upload: Callable[[Path], str]) -> dict[
             image = read_metadata(value).image
             request["map"] = {"yaml": upload(value), "image": upload(image)}
         elif name == "config":
-            request["config"] = read_values(value)
+            warnings: list[str] = []
+            request["config"] = read_values(value, warnings)
+            for line in warnings:
+                print(f"hsloc: warning: {line}", file=sys.stderr)
         elif name == "resume":
             request["resume"] = str(value)
         elif name == "reference":

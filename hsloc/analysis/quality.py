@@ -75,9 +75,9 @@ def offset_warnings(result: Result) -> list[RunWarning]:
     if not offset.is_significant:
         return []
     # Poses are weighed with the odometry, which hides a part of the offset: the scans alone show the whole of it.
-    spec = result.request
-    found = offsets_of_log(spec.logs, spec.reading(), spec.config.graph_mapper.front_end)
-    given = spec.read.offsets_s()
+    request = result.request
+    found = offsets_of_log(request.logs, request.reading(), request.config.graph_mapper.front_end)
+    given = request.read.offsets_s()
     return [
         offset_warning(topic, each, given.get(topic.lstrip("/"), 0.0))
         for topic, each in found.items()

@@ -95,9 +95,9 @@ def verdict_reasons(result: Result, warnings: Sequence[RunWarning]) -> tuple[Ver
         elif warning.code in _VERDICTS:
             verdict = _VERDICTS[WarningCode(warning.code)]
             reasons.append(VerdictReason(verdict, warning.code, warning.text, warning.remedy))
-    if result.states is not None:
+    if result.states is not None and (_share(result) > 0.0 or not reasons):
         reasons += localisation_reasons(result.states, result.trajectory)
-    elif 0.0 < _share(result) < 1.0:
+    elif result.states is None and 0.0 < _share(result) < 1.0:
         reasons.append(_not_localised(result))
     return tuple(reasons)
 

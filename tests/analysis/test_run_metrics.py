@@ -174,7 +174,7 @@ def test_counts_of_scans_add_up(run: Any, metrics: Any) -> None:
 
 def test_the_reasons_name_places_and_times(metrics: Any) -> None:
     (reason,) = metrics.verdict_reasons
-    assert reason.code == "poses_not_localised"
+    assert reason.code == "poses_lost"
     ((begin, end),) = reason.times
     assert 9.0 < begin < end < 13.0
     assert len(reason.places) == 2

@@ -33,7 +33,8 @@ _MAX_GAP = 0.2
 def match_information(points: F64, field: LikelihoodField, pose: Pose2) -> F64 | None:
     """Information (3, 3) of (x, y, theta) in the map frame (1/m^2, 1/rad^2) of points (n, 2) in the order of the beams.
 
-    Zero in directions that no wall holds; None where most points show no wall, so that nothing is known of it. The wall's own variance is that of a place within a cell.
+    Zero in directions that no wall holds; None where most points show no wall, so that nothing is known of it.
+    The wall's own variance is that of a place within a cell.
     """
     if len(points) == 0:
         return np.zeros((3, 3))

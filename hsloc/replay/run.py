@@ -73,8 +73,8 @@ class Result:
     `trajectory` has one pose for each odometry message; where there are none, one for each scan. `localised` says
     which of them are believed. `grid` is the map that was used, or, in `mode` "slam", the one that was drawn; then
     `true_grid` is the one that the log carries, if any. `likelihood` is the field that was matched on, of a given map.
-    `states` are the states of the poses of a localiser that weighs evidence; `localised` are those in this state; `tracked` are
-    the poses that were not searched for, whether their scans fit or not.
+    `states` are the states of the poses of a localiser that weighs evidence; `localised` are those in this state,
+    `tracked` the poses that were not searched for, whether their scans fit or not.
     With `lidar_only` the log's odometry was not used: a localiser's `odometry` is then that of the scans. `deskewed`
     says whether the beams were moved to where the robot was when each was measured.
     """

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from hsloc.errors import ConfigError
 from hsloc.localisation.localiser import LocaliserParameters
+from hsloc.matching.exact import Exact
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.hide import Hide
 from hsloc.matching.icp import Icp
@@ -48,6 +49,7 @@ class Config(Parameters):
     hide: Hide = field(default_factory=Hide)
     harmony_search: HarmonySearch = field(default_factory=HarmonySearch)
     icp: Icp = field(default_factory=Icp)
+    exact: Exact = field(default_factory=Exact)
     likelihood_field: FieldParameters = field(default_factory=FieldParameters)
     localiser: LocaliserParameters = field(default_factory=LocaliserParameters)
     mapper: Annotated[str, OneOf(MAPPERS)] = "graph"

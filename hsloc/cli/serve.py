@@ -34,6 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--retention-days", type=float, metavar="D", help="Remove jobs that ended more than this many days ago."
     )
+    parser.add_argument(
+        "--backup", type=Path, metavar="DIR", help="Copy the data folder to DIR, also while a server runs, and exit."
+    )
     group = parser.add_argument_group("tokens")
     group.add_argument("--first-token", action="store_true", help="Make a token on the first start and print it.")
     group.add_argument("--open-to-all", action="store_true", help="Listen beyond loopback without any token.")
@@ -56,6 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
             from dataclasses import replace
 
             chosen = replace(chosen, allowed_hosts=(*chosen.allowed_hosts, *arguments.allowed_host))
+        if arguments.backup is not None:
+            return int(service.back_up_folder(chosen, arguments.backup))
         if arguments.new_token is not None:
             return int(service.new_token(chosen, arguments.new_token, arguments.scopes, arguments.expires_days))
         if arguments.list_tokens:

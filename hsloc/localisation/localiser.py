@@ -14,6 +14,8 @@ import numpy as np
 
 from hsloc.localisation.motion import OdometryNoise, fuse, predict_covariance
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters, Verdict
+from hsloc.matching.certificate import CertificateParameters, certify
+from hsloc.matching.exact import heuristic
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
@@ -65,6 +67,9 @@ class LocaliserParameters(Parameters):
     """Standard deviation of a given initial pose in x and y [m]."""
     initial_sigma_angle: Positive = radians(15.0)
     """Standard deviation of a given initial pose in heading [rad]."""
+    certify: bool = False
+    """Whether each match is followed by a proof that no pose of its window is fitter."""
+    certificate: CertificateParameters = field(default_factory=CertificateParameters)
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
     relocaliser: RelocaliserParameters = field(default_factory=RelocaliserParameters)
 
@@ -103,7 +108,7 @@ class Localiser:
         self._rejected = 0
         self._start_given = initial_pose is not None
         self._relocaliser = Relocaliser(
-            grid, likelihood, matcher, parameters.relocaliser, parameters.odometry_noise, rng
+            grid, likelihood, heuristic(matcher), parameters.relocaliser, parameters.odometry_noise, rng
         )
         self._searching = initial_pose is None
 
@@ -158,13 +163,21 @@ class Localiser:
         self._rejected = 0
         self._usual = match.fitness if self._usual is None else self._usual + _FORGET * (match.fitness - self._usual)
         self._take(pose, covariance, T_odom_base)
-        return Estimate(scan.stamp_ns, pose, Status.MATCHED, covariance, match.fitness, evaluations)
+        return Estimate(
+            scan.stamp_ns,
+            pose,
+            Status.MATCHED,
+            covariance,
+            match.fitness,
+            evaluations,
+            certificate=match.certificate,
+        )
 
     def _match(self, points: F64, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
         """Match in the window of the prediction; a refused match may give way to one in a wider window."""
         p = self._parameters
         window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
-        best = self._matcher.match(points, self._field, window, self._rng)
+        best = self._match_in(points, window)
         evaluations = best.evaluations
         if self._usual is not None and self._refusal(best):
             wide = Window(
@@ -173,11 +186,17 @@ class Localiser:
                 max(window.half_y, p.wide_window),
                 max(window.half_theta, p.wide_window_angle),
             )
-            match = self._matcher.match(points, self._field, wide, self._rng)
+            match = self._match_in(points, wide)
             evaluations += match.evaluations
             if match.fitness >= max(best.fitness + _BETTER, p.recovery_fitness_ratio * self._usual):
                 best = match
         return best, evaluations
+
+    def _match_in(self, points: F64, window: Window) -> Match:
+        match = self._matcher.match(points, self._field, window, self._rng)
+        if self._parameters.certify and match.certificate is None:
+            return certify(match, points, self._field, window, self._parameters.certificate)
+        return match
 
     def _refusal(self, match: Match) -> str:
         """Why a match is not believed; empty if it is."""

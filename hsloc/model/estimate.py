@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from hsloc.model.certificate import Certificate
     from hsloc.model.pose2 import Pose2
 
 
@@ -53,6 +54,8 @@ class Estimate:
     evaluations: int = 0
     reason: str = ""
     revision: tuple[tuple[int, Pose2], ...] = ()
+    certificate: Certificate | None = None
+    """What was proven about the match, where it was asked for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +74,8 @@ class ScanDiagnostics:
     evaluations: NDArray[np.int64]
     reason: tuple[str, ...]
     covariance: NDArray[np.float64]
+    certificates: tuple[Certificate, ...] = ()
+    """Of those scans that have one, in their order."""
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

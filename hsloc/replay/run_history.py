@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.model.certificate import Certificate
     from hsloc.model.estimate import Estimate
 
 
@@ -38,6 +39,7 @@ class RunHistory:
         self._sigma = array("d")
         self._covariance = array("d")
         self._evaluations = array("q")
+        self._certificates: list[Certificate] = []
         self._believed = 0
         self._searching = False
         self._revisions: list[tuple[int, tuple[tuple[int, Pose2], ...]]] = []
@@ -73,6 +75,8 @@ class RunHistory:
             self._sigma.extend(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
             self._covariance.extend(covariance.ravel())
         self._evaluations.append(estimate.evaluations)
+        if estimate.certificate is not None:
+            self._certificates.append(estimate.certificate)
         if estimate.revision:
             self._revisions.append((len(self._odometry_stamps), estimate.revision))
 
@@ -123,6 +127,7 @@ class RunHistory:
             evaluations=np.array(self._evaluations, dtype=np.int64),
             reason=tuple(self._reason),
             covariance=np.array(self._covariance, dtype=np.float64).reshape(-1, 3, 3),
+            certificates=tuple(self._certificates),
         )
 
 

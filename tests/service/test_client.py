@@ -12,6 +12,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from live_service import free_port
 from paths import RECORDINGS
 
 from hsloc.cli.main import main
@@ -73,11 +74,11 @@ def test_refusals_are_told_at_once(make_live: Callable[..., Live], log: Path) ->
     assert refused.value.status == 401
     with pytest.raises(ClientError, match="at most 1048576 are taken"):
         Client(live.url, "a-token-of-the-operator-0123456789").upload(log)
-    with pytest.raises(ClientError, match="cannot be reached"):
+    with pytest.raises(ClientError, match=r"cannot be reached"):
         Client("http://127.0.0.1:1", attempts=2).job("x")
     with pytest.raises(ClientError, match="begins with http"):
         Client("localhost:8000")
-    with pytest.raises(ClientError, match="cannot be read"):
+    with pytest.raises(ClientError, match=r"cannot be read"):
         Client(live.url).upload(log.parent / "not there")
 
 
@@ -176,3 +177,10 @@ def test_a_reference_is_uploaded_and_named_without_the_servers_folders(
     for name in ("config.yaml", "report.html", "metrics.json"):
         assert str(live.data) not in (tmp_path / "there" / name).read_text()
     assert "--reference=reference.tum" in (tmp_path / "there" / "config.yaml").read_text()
+
+
+def test_a_dead_port_is_given_up_within_seconds(log: Path) -> None:
+    begin = time.monotonic()
+    with pytest.raises(ClientError, match=r"cannot be reached.*refused.*is the server running, and the address right"):
+        Client(f"http://127.0.0.1:{free_port()}").upload(log)
+    assert time.monotonic() - begin < 10.0

@@ -15,6 +15,7 @@ from live_service import upload, wait, without_command
 from paths import RECORDINGS
 
 from hsloc.errors import MapError
+from hsloc.maps.metadata import read_metadata
 from hsloc_service.execution.worker import linked_map
 from hsloc_service.settings import Settings
 
@@ -116,12 +117,29 @@ def test_hostile_files_fail_in_seconds_with_a_reason(make_client: Callable[..., 
     assert client.get("/healthz").status_code == 200
 
 
-@pytest.mark.parametrize("image", ["/etc/passwd", "../input/log.mcap", "..", "a/b.pgm", "", 3, None])
-def test_a_map_may_not_name_a_file_elsewhere(tmp_path: Path, image: object) -> None:
-    (tmp_path / "map").mkdir()
-    (tmp_path / "map" / "map.yaml").write_text(f"image: {json.dumps(image)}\nresolution: 0.05\norigin: [0, 0, 0]\n")
-    with pytest.raises(MapError, match="plain name"):
+def map_yaml(folder: Path, image: object) -> None:
+    (folder / "map").mkdir()
+    (folder / "map" / "map.yaml").write_text(
+        f"image: {json.dumps(image)}\nresolution: 0.05\norigin: [0, 0, 0]\n"
+        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+    )
+
+
+@pytest.mark.parametrize("image", ["..", "a/..", "", 3, None])
+def test_a_map_must_name_an_image(tmp_path: Path, image: object) -> None:
+    map_yaml(tmp_path, image)
+    with pytest.raises(MapError, match="must name a file"):
         linked_map(tmp_path, "map.yaml", ".image")
+
+
+@pytest.mark.parametrize("image", ["/etc/passwd", "../input/log.mcap", "a/b.pgm", "C:\\maps\\b.pgm", "b.pgm"])
+def test_a_map_never_reads_a_file_that_was_not_uploaded(tmp_path: Path, image: str) -> None:
+    """A path is of the user's machine: the uploaded image is meant, whatever this machine has there."""
+    map_yaml(tmp_path, image)
+    (tmp_path / "map" / ".image").write_bytes(b"uploaded")
+    named = read_metadata(linked_map(tmp_path, "map.yaml", ".image")).image
+    assert named.parent == tmp_path / "map"
+    assert named.read_bytes() == b"uploaded"
 
 
 def test_a_map_of_two_uploads(make_client: Callable[..., TestClient]) -> None:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from fastapi.testclient import TestClient
+    from live_service import Live
 
 OFFICE = RECORDINGS / "office.mcap"
 REAL = Settings().worker_command
@@ -211,7 +212,7 @@ def test_what_an_active_job_reads_stays(make_client: Callable[..., TestClient]) 
         assert client.delete(f"/v1/files/{file}").json()["code"] == "in_use"
     assert client.delete(f"/v1/jobs/{drawn}").json()["code"] == "in_use"
     context = client.app.state.context  # type: ignore[attr-defined]
-    Housekeeping(context.database, context.storage, context.settings, context.stores).tidy(time.time() + 150.0)
+    Housekeeping(context.database, context.storage, context.settings, context.deletions).tidy(time.time() + 150.0)
     assert client.get(f"/v1/jobs/{drawn}/results/map.npz").content == b"a saved map"
     assert len(client.get("/v1/files").json()["files"]) == 3
     client.post(f"/v1/jobs/{job}/cancel")
@@ -274,3 +275,19 @@ def test_every_example_of_the_api_fits_it(client: TestClient) -> None:
         JobRequest.model_validate(example)
         named |= set(example)
     assert {"log", "logs", "relations", "resume"} <= named
+
+
+def test_what_has_not_changed_is_304_and_the_rest_is_compressed(make_live: Callable[..., Live]) -> None:
+    live = make_live()
+    with live.client() as client:
+        for seed in range(20):
+            wait(client, submit(client, seed=seed, config={"hide": {"budget": 300}}))
+        full = client.get("/v1/jobs", headers={"Accept-Encoding": "identity"})
+        packed = client.get("/v1/jobs", headers={"Accept-Encoding": "gzip"})
+        assert packed.headers["content-encoding"] == "gzip"
+        assert int(packed.headers["content-length"]) < len(full.content) / 5
+        assert packed.json() == full.json()
+        again = client.get("/v1/jobs", headers={"If-None-Match": packed.headers["etag"]})
+        assert (again.status_code, again.content) == (304, b"")
+        submit(client)
+        assert client.get("/v1/jobs", headers={"If-None-Match": packed.headers["etag"]}).status_code == 200

@@ -31,7 +31,7 @@ SMALL: dict[str, Any] = {
 
 
 def settings(folder: Path, **changes: Any) -> Settings:
-    return Settings(data=folder / "data", **{**SMALL, **changes})
+    return Settings(**{"data": folder / "data", **SMALL, **changes})
 
 
 def upload(client: Any, content: bytes = b"ok", name: str = "run.mcap") -> str:
@@ -77,7 +77,7 @@ class Live:
         return f"http://127.0.0.1:{self.port}"
 
     def start(self) -> Live:
-        environment = os.environ | {
+        environment = {k: v for k, v in os.environ.items() if not k.startswith("HSLOC_")} | {
             "HSLOC_MIN_FREE_BYTES": "1M",
             "HSLOC_GRACE_S": "0.3",
             "HSLOC_HEARTBEAT_S": "0.5",

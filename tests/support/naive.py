@@ -34,6 +34,27 @@ def score_sum(scores: Any, points: Any, x: Any, y: Any, theta: Any) -> Any:
     return total
 
 
+def largest_score(scores: Any, u_low: float, u_high: float, v_low: float, v_high: float, sizes: Any, step: int) -> int:
+    """The greatest node, in steps of 1 / 255 rounded up, of the square of whole entries that covers a rectangle.
+
+    An entry is step x step nodes; the square begins at the entry of the rectangle's corner, has the smallest of `sizes`
+    that covers the rectangle and one node more, and is 255 where none of them does.
+    """
+    height, width = scores.shape
+    entries = -(-height // step), -(-width // step)
+    u0, u1 = floor(u_low) // step, (floor(u_high) + 1) // step
+    v0, v1 = floor(v_low) // step, (floor(v_high) + 1) // step
+    if u1 < 0 or v1 < 0 or u0 >= entries[1] or v0 >= entries[0]:
+        return 0
+    fitting = [size for size in sizes if size >= max(u1 - u0, v1 - v0) + 1]
+    if not fitting:
+        return 255
+    rows = slice(max(v0, 0) * step, max((v0 + fitting[0]) * step, 0))
+    columns = slice(max(u0, 0) * step, max((u0 + fitting[0]) * step, 0))
+    under = scores[rows, columns]
+    return min(int(np.ceil(float(under.max()) * 255.0 + 1e-4)), 255) if under.size else 0
+
+
 def distance_to_nearest(cells: Any, row: Any, column: Any) -> Any:
     """Distance in cells from a cell's centre to the nearest occupied cell's centre, by looking at all of them."""
     rows, columns = np.nonzero(cells)

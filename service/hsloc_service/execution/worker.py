@@ -141,24 +141,19 @@ def linked_map(folder: Path, name: str, image: str) -> Path:
 
     Of a path the last name counts: a YAML that says `image: /etc/passwd` must not have us read what was not uploaded.
     """
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     from hsloc.errors import MapError
+    from hsloc.maps.metadata import load_yaml
 
     path = folder / "map" / name
-    if path.stat().st_size > 1 << 20:
-        raise MapError(f"{name}: larger than 1 MiB, which no map's YAML is")
-    try:
-        values = YAML(typ="safe", pure=True).load(path)
-        wanted = values["image"]
-    except (YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise MapError(f"{name}: not a map's YAML with an `image`") from error
+    values = load_yaml(path)
+    wanted = values.get("image")
     plain = wanted.replace("\\", "/").rpartition("/")[2] if isinstance(wanted, str) else ""
     if plain in ("", ".", "..") or "\0" in plain or len(plain) > 200:
         raise MapError(f"{name}: image is {wanted!r:.100}; it must name a file")
     if plain != wanted:
         # The path is of another machine: the image is the one that was uploaded, never a file of this machine.
+        from ruamel.yaml import YAML
+
         values["image"] = plain
         path.unlink()
         with path.open("w", encoding="utf-8") as file:

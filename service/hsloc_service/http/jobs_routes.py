@@ -105,7 +105,7 @@ def delete(ctx: Ctx, who: Writer, job_id: JobId) -> None:
     Results in an object store are unreachable at once, and removed within a minute, or when the store is there again.
     """
     ctx.storage.with_room(lambda: ctx.jobs.delete(who, job_id))
-    ctx.removals.clear_folder()
+    ctx.deletions.clear_folder()
 
 
 @router.get("/{job_id}/webhooks", responses=problems(404))

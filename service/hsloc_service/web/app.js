@@ -50,6 +50,7 @@ $("token-form").addEventListener("submit", (event) => {
   notice("");
   refresh();
   about();
+  if (chosen) show(chosen, false);
 });
 
 async function about() {
@@ -215,7 +216,7 @@ function render(job) {
     $("job-bar").value = progress.fraction;
     const speed = progress.phase === "replay" && progress.speed ? `, ${progress.speed.toFixed(0)} times real time` : "";
     const amount = progress.phase === "replay" ? `${progress.done.toFixed(0)} of ${progress.total.toFixed(0)} s` : `${Math.round(100 * progress.fraction)} %`;
-    state.append(`: ${progress.phase}, ${amount}${speed}, told ${progress.age_s.toFixed(0)} s ago`);
+    state.append(`: ${progress.phase}, ${amount}${speed}, ${progress.age_s.toFixed(0)} s ago`);
   } else {
     $("job-bar").removeAttribute("value");
   }
@@ -366,6 +367,6 @@ guarded(refresh).then(() => {
 });
 setInterval(async () => {
   if (!document.hidden && $("token-form").hidden) {
-    try { await refresh(); } catch { /* the next round will tell */ }
+    try { await refresh(); } catch { /* the next round tries again */ }
   }
 }, 3000);

@@ -25,11 +25,15 @@ ALWAYS_READ = (
 
 def plain(request: Mapping[str, Any]) -> dict[str, Any]:
     """The request as it is kept. What is as usual is left out, but for the keys that version 0.1 had."""
-    kept = {key: value for key, value in request.items() if key in ALWAYS or value is not None}
+    kept = {key: value for key, value in request.items() if key in ALWAYS or not _is_usual(key, value)}
     if isinstance(kept.get("read"), dict):
         read = kept["read"].items()
-        kept["read"] = {key: value for key, value in read if key in ALWAYS_READ or value != BY_NAME[key].default}
+        kept["read"] = {key: value for key, value in read if key in ALWAYS_READ or not _is_usual(key, value)}
     return kept
+
+
+def _is_usual(key: str, value: Any) -> bool:
+    return value is None or (key in BY_NAME and value == BY_NAME[key].default)
 
 
 def logs_of(request: Mapping[str, Any]) -> list[str]:

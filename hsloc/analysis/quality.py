@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.verdict import localisation_reasons
 from hsloc.model.estimate import Status
 from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.slam.time_offset import Headings, find_offset, offset_warning, offsets_of_log
@@ -94,7 +95,9 @@ def verdict_reasons(result: Result, warnings: Sequence[RunWarning]) -> tuple[Ver
         elif warning.code in _VERDICTS:
             verdict = _VERDICTS[WarningCode(warning.code)]
             reasons.append(VerdictReason(verdict, warning.code, warning.text, warning.remedy))
-    if 0.0 < _share(result) < 1.0:
+    if result.states is not None:
+        reasons += localisation_reasons(result.states, result.trajectory)
+    elif 0.0 < _share(result) < 1.0:
         reasons.append(_not_localised(result))
     return tuple(reasons)
 

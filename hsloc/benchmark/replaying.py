@@ -116,7 +116,9 @@ def _parts(request: RunRequest) -> dict[str, float]:
     stated = log.initial_pose()
     matcher = _Timed(config.make_matcher())
     rng = np.random.default_rng(0)
-    localiser = Localiser(grid, field, matcher, config.localiser, rng, None if stated is None else stated[1])
+    localiser = Localiser.from_parameters(
+        grid, field, matcher, config.localiser, rng, None if stated is None else stated[1]
+    )
     history = RunHistory()
     reading = 0.0
 

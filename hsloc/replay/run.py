@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.localisation.states import StateRows
     from hsloc.log import Log
     from hsloc.matching.match import Matcher
     from hsloc.model.estimate import ScanDiagnostics
@@ -72,6 +73,7 @@ class Result:
     `trajectory` has one pose for each odometry message; where there are none, one for each scan. `localised` says
     which of them are believed. `grid` is the map that was used, or, in `mode` "slam", the one that was drawn; then
     `true_grid` is the one that the log carries, if any. `likelihood` is the field that was matched on, of a given map.
+    `states` are the states of the poses of a localiser that weighs evidence; `localised` are those in this state.
     With `lidar_only` the log's odometry was not used: a localiser's `odometry` is then that of the scans. `deskewed`
     says whether the beams were moved to where the robot was when each was measured.
     """
@@ -92,6 +94,7 @@ class Result:
     mapping: MappingResult | None = None
     true_grid: OccupancyGrid | None = None
     likelihood: LikelihoodField | None = None
+    states: StateRows | None = None
     lidar_only: bool = False
     deskewed: bool = False
 
@@ -114,7 +117,7 @@ class Result:
         if self.mapping is not None:
             return np.full((len(self.trajectory), 3, 3), np.nan)
         config = self.request.config
-        noise = config.localiser.odometry_noise if self.mode == "localise" else config.point_mapper.odometry_noise
+        noise = config.localiser.noise() if self.mode == "localise" else config.point_mapper.odometry_noise
         return pose_covariances(self.trajectory, self.localised, self.diagnostics, noise.covariance)
 
     @property
@@ -224,6 +227,9 @@ def _run_with(
     elif isinstance(estimator, PointMapper):
         grid = estimator.grid()
     trajectory, localised = history.trajectory() if mapping is None else _mapped(history, mapping)
+    states = history.states() if localise else None
+    if states is not None:
+        localised = states.is_localised()
     return Result(
         request=request,
         summary=log.summary,
@@ -241,6 +247,7 @@ def _run_with(
         mapping=mapping,
         true_grid=true_grid,
         likelihood=likelihood,
+        states=states,
         lidar_only=lidar_only,
         deskewed=deskew,
     )
@@ -329,7 +336,7 @@ def _localiser(request: RunRequest, grid: OccupancyGrid, likelihood: LikelihoodF
 
     rng = np.random.default_rng(request.seed)
     _warm_up(request.matcher, likelihood)
-    return Localiser(grid, likelihood, request.matcher, request.config.localiser, rng, start)
+    return Localiser.from_parameters(grid, likelihood, request.matcher, request.config.localiser, rng, start)
 
 
 def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:

@@ -38,7 +38,7 @@ REAL = Settings().worker_command
 def test_the_result_is_that_of_hsloc_replay_byte_for_byte(
     make_client: Callable[..., TestClient], tmp_path: Path, request_: dict[str, object], options: list[str]
 ) -> None:
-    client = make_client(worker_command=REAL, job_memory_bytes=4 << 30)
+    client = make_client(worker_command=REAL, sandbox="none", job_memory_bytes=4 << 30)
     file = upload(client, (RECORDINGS / "office.mcap").read_bytes(), "office.mcap")
     job = client.post("/v1/jobs", json={"log": file, **request_}).json()["id"]
     (tmp_path / "c.yaml").write_text("hide: {budget: 250}\n")
@@ -100,7 +100,7 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
 
 
 def test_hostile_files_fail_in_seconds_with_a_reason(make_client: Callable[..., TestClient]) -> None:
-    client = make_client(worker_command=REAL, job_memory_bytes=2 << 30, slots=2, job_wall_s=30.0)
+    client = make_client(worker_command=REAL, sandbox="none", job_memory_bytes=2 << 30, slots=2, job_wall_s=30.0)
     begin = time.monotonic()
     jobs = {}
     for name, content in HOSTILE.items():
@@ -143,7 +143,7 @@ def test_a_map_never_reads_a_file_that_was_not_uploaded(tmp_path: Path, image: s
 
 
 def test_a_map_of_two_uploads(make_client: Callable[..., TestClient]) -> None:
-    client = make_client(worker_command=REAL, job_memory_bytes=2 << 30)
+    client = make_client(worker_command=REAL, sandbox="none", job_memory_bytes=2 << 30)
     yaml = (
         b"image: my map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
     )
@@ -159,7 +159,7 @@ def test_a_map_of_two_uploads(make_client: Callable[..., TestClient]) -> None:
 
 
 def test_a_warning_names_the_map_and_not_the_servers_folder(make_client: Callable[..., TestClient]) -> None:
-    client = make_client(worker_command=REAL, job_memory_bytes=2 << 30)
+    client = make_client(worker_command=REAL, sandbox="none", job_memory_bytes=2 << 30)
     yaml = b"image: m.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
     pixels = b"P5 100 100 255\n" + (b"\x00" * 100 + b"\xcd" * 100) * 50
     chart = {"yaml": upload(client, yaml, "office.yaml"), "image": upload(client, pixels, "m.pgm")}

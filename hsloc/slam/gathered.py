@@ -69,7 +69,7 @@ def gather(
     poses = np.array([found.pose.to_array() for found in local])
     motions = np.array([found.motion.to_array() for found in local])
     covariances = np.array([found.covariance for found in local])
-    refused = np.array([found.status is Status.REJECTED for found in local], dtype=bool)
+    refused = np.array([found.status is Status.REJECTED or found.is_doubtful for found in local], dtype=bool)
     length, turn = parameters.loops.place_length, parameters.local_matching.turn_length
     return Gathered(
         scans=KeyScans.joined(scans),

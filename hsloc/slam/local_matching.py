@@ -60,13 +60,15 @@ class LocalMatchingParameters:
     window_min_angle: float = radians(4.0)
     """And so much of an angle (rad)."""
     wide_window: float = 0.6
-    """Where the match is refused, a window of so many metres is tried (m): what wheels may slip."""
-    wide_window_angle: float = radians(25.0)
-    """And of such an angle (rad)."""
+    """Half-width [m] of the window that is searched where the match in the first window is doubtful."""
+    wide_window_angle: float = radians(90.0)
+    """Half-width [rad] of that window: turns are missed by odometry more often than translations."""
     min_fitness: float = 0.35
     """A match below is refused."""
     usual_fraction: float = 0.7
     """And so is one below this part of the usual fitness."""
+    doubtful_fraction: float = 0.85
+    """A match below this part of the usual fitness is doubtful: its step is not trusted by the pose graph."""
     match_trust: float = 0.05
     """A match's covariance is taken times this: against the scans just before, errors of the map hardly count."""
     restart_after: int = 3
@@ -75,9 +77,9 @@ class LocalMatchingParameters:
     hide_wide: Hide = field(default_factory=lambda: Hide(restarts=16, agreement=3, budget=400))
     """The search of the wide window."""
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
-    no_odometry_window: float = 0.3
+    no_odometry_window: float = 0.6
     """Without odometry: half-width of the window around the constant-velocity prediction (m)."""
-    no_odometry_window_angle: float = radians(20.0)
+    no_odometry_window_angle: float = radians(45.0)
     """And in theta (rad)."""
 
     def __post_init__(self) -> None:
@@ -105,6 +107,7 @@ class LocalMatch:
     fitness: float | None = None
     evaluations: int = 0
     reason: str = ""
+    is_doubtful: bool = False
 
 
 FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
@@ -178,22 +181,32 @@ class LocalMatcher:
         reason = self._refusal(match)
         if reason:
             self._refused += 1
-            return LocalMatch(predicted, motion, covariance, Status.REJECTED, True, match.fitness, evaluations, reason)
+            return LocalMatch(
+                predicted, motion, covariance, Status.REJECTED, True, match.fitness, evaluations, reason, True
+            )
+        doubtful = self._is_doubtful(match)
         self._refused = 0
         self._usual = match.fitness if self._usual is None else self._usual + _FORGET * (match.fitness - self._usual)
         pose, fused = fuse(predicted, in_map, match.pose, p.match_trust * match.covariance)
         return LocalMatch(
-            pose, key.between(pose), turn.T @ fused @ turn + FLOOR, Status.MATCHED, True, match.fitness, evaluations
+            pose,
+            key.between(pose),
+            turn.T @ fused @ turn + FLOOR,
+            Status.MATCHED,
+            True,
+            match.fitness,
+            evaluations,
+            is_doubtful=doubtful,
         )
 
     def _search(self, points: F64, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
-        """HIDE in the window of the prediction; where that is refused, in a wide one."""
+        """HIDE in the window of the prediction; where that is doubtful, in a wide one."""
         p = self._parameters
         local = self._maps[0][0].field
         window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
         best = p.hide.match(points, local, window, self._rng)
         evaluations = best.evaluations
-        if self._refusal(best):
+        if self._is_doubtful(best):
             wide = Window(
                 predicted,
                 max(window.half_x, p.wide_window),
@@ -206,6 +219,11 @@ class LocalMatcher:
             if match.fitness >= max(best.fitness + 0.1, _CONVINCING * usual):
                 best = match
         return best, evaluations
+
+    def _is_doubtful(self, match: Match) -> bool:
+        p = self._parameters
+        usual = p.min_fitness if self._usual is None else p.doubtful_fraction * self._usual
+        return match.fitness < max(p.min_fitness, usual)
 
     def _refusal(self, match: Match) -> str:
         p = self._parameters
@@ -237,6 +255,7 @@ class LocalMatcher:
             found.fitness,
             found.evaluations,
             found.reason,
+            found.is_doubtful,
         )
 
     def _keep(self, paired: PairedScan, points: F64, found: LocalMatch) -> LocalMatch:

@@ -37,6 +37,9 @@ _SAME_FACE = 0.7
 """Cosine of the angle between the normals of one wall in two scans, at least."""
 _THROUGH = 0.25
 """A beam that ends so far (m) behind a point has looked through it."""
+_CLEARED = 4.0
+"""A beam without a return has looked through what lies nearer than this [m], as where the map is built: beyond, it may
+have been out of the lidar's range, or have met glass."""
 
 
 @njit(cache=True, nogil=True)
@@ -251,6 +254,8 @@ def pair_terms(
             known = 0
             for k in range(max(middle - 1, 0), min(middle + 2, n_beams)):
                 end = np.float64(ranges[first + k])
+                if end == np.inf:
+                    end = _CLEARED
                 if end == end:
                     known += 1
                     nearest = min(nearest, end)

@@ -14,18 +14,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import ConfigError
-from hsloc.localisation.motion import OdometryNoise, fuse
+from hsloc.localisation.motion import OdometryNoise
 from hsloc.matching.hide import Hide
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Status
 from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle
+from hsloc.slam.keyscans import KeyScan
 from hsloc.slam.local_map import LocalMap
+from hsloc.slam.recent_scans import SURPRISE, MovingScan, RecentScans, Registration, fused_covariance
 
 if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from hsloc.matching.match import Match
     from hsloc.model.events import PairedScan
 
     F64 = NDArray[np.float64]
@@ -64,13 +65,9 @@ class LocalMatchingParameters:
     wide_window_angle: float = radians(90.0)
     """Half-width [rad] of that window: turns are missed by odometry more often than translations."""
     min_fitness: float = 0.35
-    """A match below is refused."""
-    usual_fraction: float = 0.7
-    """And so is one below this part of the usual fitness."""
-    doubtful_fraction: float = 0.85
-    """A match below this part of the usual fitness is doubtful: its step is not trusted by the pose graph."""
-    match_trust: float = 0.05
-    """A match's covariance is taken times this: against the scans just before, errors of the map hardly count."""
+    """A match that contradicts the odometry is refused below this fitness."""
+    usual_fraction: float = 0.9
+    """A match that contradicts the odometry is refused below this part of the usual fitness."""
     restart_after: int = 3
     """A new local map begins after so many refused matches in a row."""
     hide: Hide = field(default_factory=lambda: Hide(restarts=6, agreement=2, budget=200, memory_size=20))
@@ -117,7 +114,9 @@ _FORGET = 0.05
 _KNOWN = 0.85
 """A point is spared whose nearest node scores as much: the local map has one within a part of a cell."""
 _CONVINCING = 0.9
-"""A match in the wide window must reach this part of the usual fitness."""
+"""A pose that contradicts the odometry must be this consistent."""
+_CONVINCING_PAIRED = 0.35
+"""And this part of the points that both sides could see must be paired."""
 
 
 class LocalMatcher:
@@ -130,6 +129,8 @@ class LocalMatcher:
         self._T_map_key = IDENTITY
         self._T_odom_key: Pose2 | None = None
         self._maps: list[tuple[LocalMap, float]] = []
+        self._recent = RecentScans()
+        self._hidden = np.zeros((3, 3))
         self._way = 0.0
         self._usual: float | None = None
         self._refused = 0
@@ -152,7 +153,9 @@ class LocalMatcher:
         if not enough:
             found = LocalMatch(predicted, motion, covariance, Status.NO_RETURNS, False, reason=f"{len(points)} returns")
         else:
-            found = self._matched(points[np.hypot(points[:, 0], points[:, 1]) < p.local_range], motion, covariance)
+            scans = _moving(paired)
+            near = points[np.hypot(points[:, 0], points[:, 1]) < p.local_range]
+            found = self._matched(near, scans, motion, covariance)
         if not self._use_odometry:
             found = self._without_odometry(paired, found)
         return self._keep(paired, points, found) if found.is_keyscan else found
@@ -171,67 +174,64 @@ class LocalMatcher:
         motion = self._T_map_key.between(pose @ Pose2(float(step[0]), float(step[1]), float(step[2])))
         return motion, np.diag((most / p.window_sigmas) ** 2)
 
-    def _matched(self, points: F64, motion: Pose2, covariance: F64) -> LocalMatch:
-        p = self._parameters
+    def _matched(self, points: F64, scans: tuple[MovingScan, ...], motion: Pose2, covariance: F64) -> LocalMatch:
         key = self._T_map_key
         predicted = key @ motion
         turn = _turn(key.theta)
         in_map = turn @ covariance @ turn.T
-        match, evaluations = self._search(points, predicted, in_map)
-        reason = self._refusal(match)
+        found, evaluations = self._search(points, scans, predicted, in_map)
+        fitness = self._maps[0][0].field.fitness(points, found.pose)
+        reason = found.refusal()
         if reason:
             self._refused += 1
-            return LocalMatch(
-                predicted, motion, covariance, Status.REJECTED, True, match.fitness, evaluations, reason, True
-            )
-        doubtful = self._is_doubtful(match)
+            return LocalMatch(predicted, motion, covariance, Status.REJECTED, True, fitness, evaluations, reason, True)
+        # What is measured is the pose in the local map; the step to it also holds what the refused steps may hide.
+        after_refusal = self._refused > 0
         self._refused = 0
-        self._usual = match.fitness if self._usual is None else self._usual + _FORGET * (match.fitness - self._usual)
-        pose, fused = fuse(predicted, in_map, match.pose, p.match_trust * match.covariance)
+        self._usual = fitness if self._usual is None else self._usual + _FORGET * (fitness - self._usual)
+        fused = turn.T @ fused_covariance(found, in_map) @ turn + FLOOR
         return LocalMatch(
-            pose,
-            key.between(pose),
-            turn.T @ fused @ turn + FLOOR,
+            found.pose,
+            key.between(found.pose),
+            fused + self._hidden if after_refusal else fused,
             Status.MATCHED,
             True,
-            match.fitness,
+            fitness,
             evaluations,
-            is_doubtful=doubtful,
+            is_doubtful=found.is_doubtful() or after_refusal,
         )
 
-    def _search(self, points: F64, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
-        """HIDE in the window of the prediction; where that is doubtful, in a wide one."""
+    def _search(
+        self, points: F64, scans: tuple[MovingScan, ...], predicted: Pose2, covariance: F64
+    ) -> tuple[Registration, int]:
+        """Registration from the prediction; where that is refused, from what HIDE finds in a narrow and a wide window."""
         p = self._parameters
+        best = self._recent.register(scans, predicted, predicted, covariance)
+        evaluations = 1
+        if not best.refusal():
+            return best, evaluations
         local = self._maps[0][0].field
         window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
-        best = p.hide.match(points, local, window, self._rng)
-        evaluations = best.evaluations
-        if self._is_doubtful(best):
-            wide = Window(
-                predicted,
-                max(window.half_x, p.wide_window),
-                max(window.half_y, p.wide_window),
-                max(window.half_theta, p.wide_window_angle),
-            )
-            match = p.hide_wide.match(points, local, wide, self._rng)
+        wide = Window(
+            predicted,
+            max(window.half_x, p.wide_window),
+            max(window.half_y, p.wide_window),
+            max(window.half_theta, p.wide_window_angle),
+        )
+        usual = p.min_fitness if self._usual is None else max(p.min_fitness, p.usual_fraction * self._usual)
+        for hide, box in ((p.hide, window), (p.hide_wide, wide)):
+            match = hide.match(points, local, box, self._rng)
             evaluations += match.evaluations
-            usual = p.min_fitness if self._usual is None else self._usual
-            if match.fitness >= max(best.fitness + 0.1, _CONVINCING * usual):
-                best = match
+            found = self._recent.register(scans, match.pose, predicted, covariance)
+            surprising = found.chi > SURPRISE
+            convincing = not surprising or (
+                found.paired >= _CONVINCING_PAIRED
+                and found.consistency >= _CONVINCING
+                and local.fitness(points, found.pose) >= usual
+            )
+            if convincing and not found.refusal():
+                return found, evaluations
         return best, evaluations
-
-    def _is_doubtful(self, match: Match) -> bool:
-        p = self._parameters
-        usual = p.min_fitness if self._usual is None else p.doubtful_fraction * self._usual
-        return match.fitness < max(p.min_fitness, usual)
-
-    def _refusal(self, match: Match) -> str:
-        p = self._parameters
-        if match.fitness < p.min_fitness:
-            return f"fitness {match.fitness:.2f} below {p.min_fitness:.2f}"
-        if self._usual is not None and match.fitness < p.usual_fraction * self._usual:
-            return f"fitness {match.fitness:.2f} far below the usual {self._usual:.2f}"
-        return ""
 
     def _without_odometry(self, paired: PairedScan, found: LocalMatch) -> LocalMatch:
         """Remember the velocity, and apply the motion gate to the match."""
@@ -264,8 +264,10 @@ class LocalMatcher:
         self._way += hypot(found.motion.x, found.motion.y) + p.turn_length * abs(wrap_angle(found.motion.theta))
         if self._refused >= p.restart_after:
             self._maps, self._refused = [], 0
+            self._recent.clear()
         if not self._maps or self._way - self._maps[-1][1] > p.submap_length:
             self._maps = [*self._maps[-1:], (LocalMap(p.resolution, p.sigma, p.reach), self._way)]
+        self._hidden = self._hidden + found.covariance if found.status is not Status.MATCHED else np.zeros((3, 3))
         self._T_map_key, self._T_odom_key = found.pose, paired.T_odom_base
         if self._last is None:
             self._last = (paired.scan.stamp_ns, found.pose)
@@ -273,7 +275,14 @@ class LocalMatcher:
         if found.status is Status.MATCHED or len(self._maps) == 1:
             for local, _ in self._maps:
                 local.draw(moved, _KNOWN)
+            self._recent.add(found.pose, _moving(paired))
         return found
+
+
+def _moving(paired: PairedScan) -> tuple[MovingScan, ...]:
+    """The scan and its companions, as seen from the base at the scan's stamp."""
+    parts = ((paired.scan, IDENTITY), *((other.scan, paired.to(other)) for other in paired.companions))
+    return tuple(MovingScan.of(KeyScan.of(scan), pose) for scan, pose in parts)
 
 
 def _turn(theta: float) -> F64:

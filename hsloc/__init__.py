@@ -4,4 +4,6 @@ Importing the package is cheap: the compiled kernels, SciPy and the readers are 
 that use them, so that `hsloc --help` answers at once.
 """
 
-__version__ = "0.1.0"
+from hsloc.version import __version__
+
+__all__ = ["__version__"]

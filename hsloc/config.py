@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import types
 import typing
 from dataclasses import dataclass, field, replace
@@ -14,7 +15,7 @@ from hsloc.localisation.localiser import LocaliserParameters
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.hide import Hide
 from hsloc.matching.icp import Icp
-from hsloc.slam.mapper import GraphMapperParameters
+from hsloc.slam.parameters import GraphMapperParameters
 from hsloc.slam.point_mapper import PointMapperParameters
 
 if TYPE_CHECKING:
@@ -116,10 +117,41 @@ def from_dict(kind: type[T], values: Any, base: T | None = None, where: str = "c
     names = [f.name for f in dataclasses.fields(typing.cast("Any", kind))]
     for key in values:
         if key not in names:
-            raise ConfigError(f"{where} has the unknown key {key!r}; known are {', '.join(names)}")
+            raise ConfigError(f"{where} has the unknown key {key!r}; {_instead(str(key), names)}")
     start = kind() if base is None else base
     changes = {key: _convert(hints[key], value, getattr(start, key), f"{where}.{key}") for key, value in values.items()}
     return typing.cast("T", replace(typing.cast("Any", start), **changes))
+
+
+_RENAMED = {
+    "convincing_fraction": "recovery_fitness_ratio",
+    "correlated": "correlated_points",
+    "crowd": "max_scans_per_view",
+    "drawing": "occupancy",
+    "hit": "hit_probability",
+    "local_matching": "front_end",
+    "lost_after": "max_consecutive_rejections",
+    "min_lead": "min_margin",
+    "min_way": "min_path_length",
+    "miss": "miss_probability",
+    "most": "max_probability",
+    "most_candidates": "max_candidates",
+    "partners": "max_partners",
+    "place_length": "submap_length",
+    "reach": "max_distance or search_radius",
+    "refinement": "joint_registration",
+    "still": "convergence_tolerance",
+    "usual_fraction": "min_fitness_ratio",
+}
+"""Parameters of version 0.1 by their names in 0.2."""
+
+
+def _instead(key: str, names: list[str]) -> str:
+    """What to write instead of an unknown key."""
+    if key in _RENAMED:
+        return f"since version 0.2 it is called {_RENAMED[key]}"
+    close = difflib.get_close_matches(key, names, 1)
+    return f"did you mean {close[0]}?" if close else f"known are {', '.join(names)}"
 
 
 def _convert(hint: Any, value: Any, base: Any, where: str) -> Any:

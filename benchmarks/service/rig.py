@@ -62,6 +62,6 @@ class Server:
 
 def jobs_processes(data: Path) -> list[int]:
     """Processes of jobs that are alive."""
-    from service.processes import marked
+    from hsloc_service.execution.processes import marked
 
     return list(marked((data / "instance").read_text().strip() + ":"))

@@ -7,7 +7,7 @@ import platform
 from importlib import metadata
 from pathlib import Path
 
-from hsloc import __version__
+from hsloc.version import __version__
 
 PACKAGES = ("numpy", "numba", "scipy", "mealpy", "small-gicp")
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from hsloc.errors import HslocError
-from hsloc.replay.run import RunSpec, run
+from hsloc.replay.run import run
+from hsloc.request import RunRequest
 from hsloc.simulation.presets import OFFICE
 from hsloc.simulation.recorder import record
 
@@ -23,9 +24,10 @@ TIMES = 10
 _CHILD = """
 import json, sys
 from pathlib import Path
-from hsloc.replay.run import RunSpec, run
+from hsloc.replay.run import run
+from hsloc.request import RunRequest
 
-result = run(RunSpec(logs=(Path(sys.argv[1]),)))
+result = run(RunRequest(logs=(Path(sys.argv[1]),)))
 try:
     # Not ru_maxrss: on Linux that starts with the peak of the process that started this one.
     lines = Path("/proc/self/status").read_text().splitlines()
@@ -89,7 +91,7 @@ def measure_memory(folder: Path, seconds: float | None = None) -> Memory:
         long = replace(OFFICE, seed=1, duration_s=TIMES * seconds)
     warm_up = folder / "warm-up.mcap"
     record(replace(short, duration_s=1.0), warm_up)
-    run(RunSpec(logs=(warm_up,)))  # a process that has to compile the kernels needs 100 MB for that alone
+    run(RunRequest(logs=(warm_up,)))  # a process that has to compile the kernels needs 100 MB for that alone
     one, ten = (_replayed(scenario, folder / f"{name}.mcap") for name, scenario in (("short", short), ("long", long)))
     return Memory(
         one["seconds"], int(one["peak"]), int(one["trajectory"]),

@@ -14,11 +14,12 @@ from hsloc.benchmark.clock import Timing
 from hsloc.config import Config
 from hsloc.errors import MapError
 from hsloc.localisation.localiser import Localiser
-from hsloc.log.reader import open_log
+from hsloc.log import open_log
 from hsloc.matching import LikelihoodField
 from hsloc.replay.engine import replay
-from hsloc.replay.recording import Recording
-from hsloc.replay.run import RunSpec, find_map, run
+from hsloc.replay.run import find_map, run
+from hsloc.replay.run_history import RunHistory
+from hsloc.request import RunRequest
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -71,7 +72,7 @@ def fixture() -> Path | None:
 
 def time_replay(log: Path, repeats: int) -> ReplayTiming:
     """Replay `log` with the defaults once to warm up, `repeats` times by the clock and once taken to pieces."""
-    spec = RunSpec(logs=(log,))
+    spec = RunRequest(logs=(log,))
     run(spec)
     seconds = []
     for _ in range(repeats):
@@ -103,7 +104,7 @@ class _Timed:
         return match
 
 
-def _parts(spec: RunSpec) -> dict[str, float]:
+def _parts(spec: RunRequest) -> dict[str, float]:
     """Seconds of reading (unpacking and decoding the log), of searching, and of all else."""
     log = open_log(spec.logs)
     grid, _ = find_map(spec, log)
@@ -115,7 +116,7 @@ def _parts(spec: RunSpec) -> dict[str, float]:
     matcher = _Timed(config.make_matcher())
     rng = np.random.default_rng(0)
     localiser = Localiser(grid, field, matcher, config.localiser, rng, None if stated is None else stated[1])
-    recording = Recording()
+    history = RunHistory()
     reading = 0.0
 
     def timed(events: Iterator[Event]) -> Iterator[Event]:
@@ -130,6 +131,6 @@ def _parts(spec: RunSpec) -> dict[str, float]:
 
     begin = perf_counter()
     for event, estimate in replay(timed(iter(log.events())), localiser):
-        recording.add(event, estimate)
+        history.add(event, estimate)
     total = perf_counter() - begin
     return {"read": reading, "search": matcher.seconds, "other": total - reading - matcher.seconds}

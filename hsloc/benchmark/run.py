@@ -15,7 +15,7 @@ from hsloc.benchmark.methods import our_methods, peers
 from hsloc.benchmark.replaying import fixture, time_replay
 from hsloc.benchmark.scene import office_scene
 from hsloc.benchmark.sub_cell import measure_sub_cell
-from hsloc.benchmark.targets import Target, targets
+from hsloc.benchmark.targets import Bench
 from hsloc.simulation.presets import OFFICE
 from hsloc.simulation.recorder import record
 
@@ -23,10 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from hsloc.benchmark.cases import CaseResult
-    from hsloc.benchmark.kernel import KernelTiming, MatchTiming
-    from hsloc.benchmark.memory import Memory
-    from hsloc.benchmark.replaying import ReplayTiming
-    from hsloc.benchmark.sub_cell import SubCell
 
     Progress = Callable[[str, float], None]
 
@@ -58,47 +54,6 @@ QUICK = Sizes(
     cases=10,
 )
 """A look at whether all works; the figures mean little."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Bench:
-    """What was measured; None or empty where it was not asked for."""
-
-    machine: dict[str, object]
-    load_after: tuple[float, ...] | None
-    quick: bool
-    kernel: KernelTiming | None = None
-    matches: tuple[MatchTiming, ...] = ()
-    replay: ReplayTiming | None = None
-    memory: Memory | None = None
-    sub_cell: tuple[SubCell, ...] = ()
-    cases_name: str = ""
-    cases: tuple[CaseResult, ...] = ()
-    notes: tuple[str, ...] = ()
-
-    @property
-    def targets(self) -> tuple[Target, ...]:
-        """What the project promises, and whether it was kept."""
-        return targets(self)
-
-    def to_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return {
-            "machine": self.machine | {"load_average_after": self.load_after},
-            "quick": self.quick,
-            **({"kernel": self.kernel.to_dict()} if self.kernel else {}),
-            **({"match": [match.to_dict() for match in self.matches]} if self.matches else {}),
-            **({"replay": self.replay.to_dict()} if self.replay else {}),
-            **({"memory": self.memory.to_dict()} if self.memory else {}),
-            **({"sub_cell": [row.to_dict() for row in self.sub_cell]} if self.sub_cell else {}),
-            **(
-                {"cases": {"name": self.cases_name, "results": [row.to_dict() for row in self.cases]}}
-                if self.cases
-                else {}
-            ),
-            "targets": [target.to_dict() for target in self.targets],
-            "notes": list(self.notes),
-        }
 
 
 def run_bench(

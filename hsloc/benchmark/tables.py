@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from hsloc.benchmark.cases import LEVELS, SUCCESS
-from hsloc.evaluation.markdown import DASH, table
+from hsloc.text_table import DASH, table
 
 if TYPE_CHECKING:
     from hsloc.benchmark.cases import CaseResult
     from hsloc.benchmark.memory import Memory
     from hsloc.benchmark.replaying import ReplayTiming
-    from hsloc.benchmark.run import Bench
+    from hsloc.benchmark.targets import Bench
 
 
 def markdown(bench: Bench) -> str:

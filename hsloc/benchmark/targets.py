@@ -1,4 +1,4 @@
-"""What the project promises."""
+"""What was measured, and what the project promises."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from hsloc.benchmark.run import Bench
+    from hsloc.benchmark.cases import CaseResult
+    from hsloc.benchmark.kernel import KernelTiming, MatchTiming
+    from hsloc.benchmark.memory import Memory
+    from hsloc.benchmark.replaying import ReplayTiming
+    from hsloc.benchmark.sub_cell import SubCell
 
 CASES = {"track": (1.0, None), "small": (1.0, 1.0), "large": (0.99, 4.0)}
 """Least success of HIDE, and most milliseconds (median)."""
@@ -38,6 +42,47 @@ class Target:
             "unit": self.unit,
             "at_least": self.at_least,
             "met": self.met,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bench:
+    """What was measured; None or empty where it was not asked for."""
+
+    machine: dict[str, object]
+    load_after: tuple[float, ...] | None
+    quick: bool
+    kernel: KernelTiming | None = None
+    matches: tuple[MatchTiming, ...] = ()
+    replay: ReplayTiming | None = None
+    memory: Memory | None = None
+    sub_cell: tuple[SubCell, ...] = ()
+    cases_name: str = ""
+    cases: tuple[CaseResult, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def targets(self) -> tuple[Target, ...]:
+        """What the project promises, and whether it was kept."""
+        return targets(self)
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return {
+            "machine": self.machine | {"load_average_after": self.load_after},
+            "quick": self.quick,
+            **({"kernel": self.kernel.to_dict()} if self.kernel else {}),
+            **({"match": [match.to_dict() for match in self.matches]} if self.matches else {}),
+            **({"replay": self.replay.to_dict()} if self.replay else {}),
+            **({"memory": self.memory.to_dict()} if self.memory else {}),
+            **({"sub_cell": [row.to_dict() for row in self.sub_cell]} if self.sub_cell else {}),
+            **(
+                {"cases": {"name": self.cases_name, "results": [row.to_dict() for row in self.cases]}}
+                if self.cases
+                else {}
+            ),
+            "targets": [target.to_dict() for target in self.targets],
+            "notes": list(self.notes),
         }
 
 

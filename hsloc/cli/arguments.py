@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from hsloc.config import Config
-    from hsloc.log.summary import ReadOptions
+    from hsloc.log import ReadOptions
     from hsloc.model.pose2 import Pose2
 
 
@@ -65,7 +65,7 @@ def add_read_arguments(parser: argparse.ArgumentParser) -> None:
 
 def read_options(arguments: argparse.Namespace) -> ReadOptions:
     """What `add_read_arguments` collected."""
-    from hsloc.log.summary import ReadOptions
+    from hsloc.log import ReadOptions
 
     end = arguments.end if arguments.duration is None else (arguments.start or 0.0) + arguments.duration
     return ReadOptions(

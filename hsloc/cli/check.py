@@ -13,8 +13,7 @@ from hsloc.cli.progress import ProgressLine
 if TYPE_CHECKING:
     import argparse
 
-    from hsloc.log.check import CheckReport
-    from hsloc.log.findings import Finding
+    from hsloc.log import CheckReport, Finding
 
 HELP = "check a log for what spoils results"
 
@@ -31,8 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Check; returns the exit code."""
     from dataclasses import replace
 
-    from hsloc.log.check import check_log
-    from hsloc.log.reader import open_log
+    from hsloc.log import check_log, open_log
 
     log = open_log(arguments.log, replace(read_options(arguments), require_scan=False, require_odometry=False))
     start, span = log.summary.start_ns, max(log.summary.end_ns - log.summary.start_ns, 1)

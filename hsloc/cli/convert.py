@@ -12,8 +12,7 @@ from hsloc.cli.progress import ProgressLine
 if TYPE_CHECKING:
     import argparse
 
-    from hsloc.log.convert import Conversion
-    from hsloc.log.summary import LogSummary
+    from hsloc.log import Conversion, LogSummary
 
 HELP = "convert a log to MCAP"
 
@@ -34,8 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     from pathlib import Path
 
     from hsloc.errors import OutputError
-    from hsloc.log.convert import convert_log
-    from hsloc.log.reader import open_log
+    from hsloc.log import convert_log, open_log
 
     target = Path(arguments.out)
     if target.exists() and not target.is_dir():

@@ -17,7 +17,7 @@ def default_folder(name: str) -> Path:
 def refuse_early(folder: Path, overwrite: bool) -> None:
     """A folder that cannot be written is told before the work, not after it: raises OutputError."""
     from hsloc.errors import OutputError
-    from hsloc.replay.results import refuse_folder
+    from hsloc.export.results_folder import refuse_folder
 
     refuse_folder(folder, overwrite)
     parent = folder.resolve().parent

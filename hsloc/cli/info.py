@@ -9,8 +9,7 @@ from hsloc.cli.arguments import add_read_arguments, read_options
 if TYPE_CHECKING:
     import argparse
 
-    from hsloc.log.reader import Log
-    from hsloc.log.summary import LogSummary, Losses
+    from hsloc.log import Log, LogSummary, Losses
     from hsloc.model import Pose2
 
 HELP = "say what is in a log"
@@ -31,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
     from json import dumps
 
-    from hsloc.log.reader import open_log
+    from hsloc.log import open_log
 
     # What is missing or ambiguous is what a user wants to be told here.
     log = open_log(arguments.log, replace(read_options(arguments), require_scan=False, require_odometry=False))

@@ -16,8 +16,8 @@ import sys
 from io import TextIOWrapper
 from typing import TYPE_CHECKING
 
-from hsloc import __version__
 from hsloc.errors import HslocError
+from hsloc.version import __version__
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

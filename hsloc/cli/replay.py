@@ -68,11 +68,11 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.cli.main import EXIT_DATA_LOST, EXIT_OK
     from hsloc.cli.table import print_summary
     from hsloc.evaluation.metrics import format_json
-    from hsloc.replay.results import timings, write_results
-    from hsloc.replay.run import RunSpec
+    from hsloc.export.results_folder import timings, write_results
     from hsloc.replay.run import run as run_replay
+    from hsloc.request import RunRequest
 
-    spec = RunSpec(
+    spec = RunRequest(
         logs=tuple(arguments.log),
         map_path=arguments.map,
         resume=arguments.resume,

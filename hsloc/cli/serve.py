@@ -71,11 +71,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _service() -> tuple[Any, Any]:
-    """`service.main` and `service.settings`, found by name: the library does not import the service."""
+    """`hsloc_service.main` and `hsloc_service.settings`, found by name: the library does not import the service."""
     from hsloc.errors import ConfigError
 
     try:
-        return importlib.import_module("service.main"), importlib.import_module("service.settings")
+        return importlib.import_module("hsloc_service.main"), importlib.import_module("hsloc_service.settings")
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"{error.name} is not installed; install the service with: pip install 'hsloc[serve]'"

@@ -16,7 +16,7 @@ from hsloc.cli.progress import ProgressLine
 
 if TYPE_CHECKING:
     from hsloc.config import Config
-    from hsloc.replay.sweep import Outcome
+    from hsloc.sweep.runs import Outcome
 
 HELP = "replay many logs, configurations and seeds"
 PRESETS = ("default", "paper", "paper-literal")
@@ -56,9 +56,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Sweep; 1 where a run failed, else 3 where part of an input was lost."""
     from hsloc.cli.main import EXIT_DATA_LOST, EXIT_FAILED, EXIT_OK
     from hsloc.errors import OutputError
-    from hsloc.replay.sweep import FAILED, plan
-    from hsloc.replay.sweep_pool import sweep_in_processes
-    from hsloc.replay.sweep_table import as_csv, as_json, as_text
+    from hsloc.sweep.process_pool import sweep_in_processes
+    from hsloc.sweep.runs import FAILED, plan
+    from hsloc.sweep.table import as_csv, as_json, as_text
 
     runs = plan(
         arguments.log,

@@ -4,7 +4,7 @@ from hsloc.evaluation.metrics import Evaluation, evaluate, write_json
 from hsloc.evaluation.relations import evaluate_relations, read_relations
 from hsloc.evaluation.rpe import Delta
 from hsloc.evaluation.statistics import Statistics
-from hsloc.evaluation.tum import read_tum, write_tum
+from hsloc.trajectory_io.tum import read_tum, write_tum
 
 __all__ = [
     "Delta",

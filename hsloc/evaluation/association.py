@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 
 from hsloc.errors import EvaluationError
-from hsloc.evaluation.tum import NS_PER_S
 from hsloc.model import wrap_angles
+from hsloc.trajectory_io.tum import NS_PER_S
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -15,8 +15,8 @@ from zipfile import ZipFile, ZipInfo
 
 import numpy as np
 
+from hsloc.atomic_write import write_atomically
 from hsloc.evaluation.association import seconds
-from hsloc.evaluation.files import write_atomically
 from hsloc.evaluation.rpe import pieces, rpe
 from hsloc.evaluation.statistics import Statistics
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.atomic_write import write_text_atomically
 from hsloc.errors import EvaluationError
 from hsloc.evaluation.alignment import Alignment, align, parse_alignment
 from hsloc.evaluation.ape import ape, axis_rmse
 from hsloc.evaluation.association import AssociationMethod, associate
-from hsloc.evaluation.files import write_text_atomically
 from hsloc.evaluation.rpe import Delta, rpe
 from hsloc.model.pose2 import compose_poses
 

@@ -15,9 +15,9 @@ import numpy as np
 from hsloc.errors import EvaluationError
 from hsloc.evaluation.association import interpolate_poses
 from hsloc.evaluation.statistics import PoseErrors, PoseStatistics
-from hsloc.evaluation.tum import NS_PER_S, parse_numbers, parse_stamp_field, read_lines
 from hsloc.model import wrap_angles
 from hsloc.model.pose2 import relative_poses
+from hsloc.trajectory_io.tum import NS_PER_S, parse_numbers, parse_stamp_field, read_lines
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

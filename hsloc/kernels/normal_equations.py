@@ -1,7 +1,7 @@
 """The normal equations of poses that pull at each other: pairs of scans, and edges of a pose graph.
 
-A term in the pose of one scan seen from another (`hsloc.kernels.surfels.pair_terms`, or what an edge measured) is moved
-onto the two poses in the map, and added to the 3x3 blocks of a sparse symmetric system.
+A term in the pose of one scan seen from another (`hsloc.kernels.point_to_line.pair_terms`, or what an edge measured) is
+moved onto the two poses in the map, and added to the 3x3 blocks of a sparse symmetric system.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
-from hsloc.kernels.surfels import pair_terms
+from hsloc.kernels.point_to_line import pair_terms
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,6 +1,6 @@
 """One scan onto several others that stand still: point to line, with a prior on the pose.
 
-Gauss-Newton on the terms of `hsloc.kernels.surfels.pair_terms`, taken in both directions. A direction that no wall
+Gauss-Newton on the terms of `hsloc.kernels.point_to_line.pair_terms`, taken in both directions. A direction that no wall
 fixes has no gradient, so that there the pose stays where the prior has it; a field of scores does not have this property,
 it prefers the pose at which the scans overlap most.
 """
@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 
 from hsloc.kernels.normal_equations import add_relative_term, relative
-from hsloc.kernels.polish import solve_damped
-from hsloc.kernels.surfels import pair_terms
+from hsloc.kernels.levenberg_marquardt import solve_damped
+from hsloc.kernels.point_to_line import pair_terms
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from hsloc.kernels.fitness import score_sum
-from hsloc.kernels.polish import polish
+from hsloc.kernels.levenberg_marquardt import polish
 
 if TYPE_CHECKING:
     from numpy.random import Generator

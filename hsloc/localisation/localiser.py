@@ -49,11 +49,11 @@ class LocaliserParameters:
     """And so much of an angle (rad)."""
     min_fitness: float = 0.3
     """A match below is refused, whatever was usual before."""
-    usual_fraction: float = 0.7
+    min_fitness_ratio: float = 0.7
     """A match below this part of the usual fitness (of the matches before) is refused."""
-    convincing_fraction: float = 0.9
+    recovery_fitness_ratio: float = 0.9
     """After a refusal a match in a wider window must reach this part of the usual fitness."""
-    lost_after: int = 5
+    max_consecutive_rejections: int = 5
     """The pose is lost after so many refused matches in a row."""
     fuse: bool = True
     """Weigh match and prediction by their covariances (EKF); otherwise the match is the new pose ([P])."""
@@ -65,10 +65,10 @@ class LocaliserParameters:
     relocaliser: RelocaliserParameters = field(default_factory=RelocaliserParameters)
 
     def __post_init__(self) -> None:
-        for name in ("min_points", "lost_after"):
+        for name in ("min_points", "max_consecutive_rejections"):
             if not getattr(self, name) >= 1:
                 raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("update_min_d", "update_min_a", "min_fitness", "usual_fraction", "convincing_fraction"):
+        for name in ("update_min_d", "update_min_a", "min_fitness", "min_fitness_ratio", "recovery_fitness_ratio"):
             if not getattr(self, name) >= 0.0:
                 raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be 0 or more")
         for name in ("window_sigmas", "window_min", "window_min_angle", "initial_sigma", "initial_sigma_angle"):
@@ -184,7 +184,7 @@ class Localiser:
             )
             match = self._matcher.match(points, self._field, wide, self._rng)
             evaluations += match.evaluations
-            if match.fitness >= max(best.fitness + _BETTER, p.convincing_fraction * self._usual):
+            if match.fitness >= max(best.fitness + _BETTER, p.recovery_fitness_ratio * self._usual):
                 best = match
         return best, evaluations
 
@@ -193,7 +193,7 @@ class Localiser:
         p = self._parameters
         if match.fitness < p.min_fitness:
             return f"fitness {match.fitness:.2f} below {p.min_fitness:.2f}"
-        if self._usual is not None and match.fitness < p.usual_fraction * self._usual:
+        if self._usual is not None and match.fitness < p.min_fitness_ratio * self._usual:
             return f"fitness {match.fitness:.2f} far below the usual {self._usual:.2f}"
         return ""
 
@@ -210,7 +210,7 @@ class Localiser:
         self._rejected += 1
         self._take(predicted, covariance, paired.T_odom_base)
         status = Status.REJECTED
-        if self._rejected >= self._parameters.lost_after:
+        if self._rejected >= self._parameters.max_consecutive_rejections:
             self._searching = True
             self._search_began = self._count
             self._relocaliser.start()

@@ -1,5 +1,64 @@
-"""THE ONE DOOR to MCAP, ROS bags and CARMEN.
+"""Recordings: `open_log` gives events of the model from MCAP, ROS bags and text logs, `LogWriter` writes MCAP.
 
-`open_log` gives events of the model from whatever holds a recording; `LogWriter` writes them down so that every
-tool of the field can read them.
+What is listed here is the public face of the package; nothing else of it is imported from outside. Names are imported
+when they are first used: whoever needs `ReadOptions` alone does not wait for the readers.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hsloc.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from hsloc.log.checks.checker import CheckReport, check_log
+    from hsloc.log.checks.findings import Finding
+    from hsloc.log.checks.topics import LEAST_JUMP, LONGEST_JUMP_S, MAX_SPEED
+    from hsloc.log.convert import Conversion, convert_log
+    from hsloc.log.messages.decode import LinkMessage
+    from hsloc.log.reader import Log, is_log, open_log
+    from hsloc.log.session.topic_selection import TF, TF_NAMES, TF_STATIC
+    from hsloc.log.summary import LaserSummary, LogSummary, Losses, ReadOptions
+    from hsloc.log.transforms import FrameTree, Transform3
+    from hsloc.log.writer import LogWriter
+
+__all__ = [
+    "LEAST_JUMP",
+    "LONGEST_JUMP_S",
+    "MAX_SPEED",
+    "TF",
+    "TF_NAMES",
+    "TF_STATIC",
+    "CheckReport",
+    "Conversion",
+    "Finding",
+    "FrameTree",
+    "LaserSummary",
+    "LinkMessage",
+    "Log",
+    "LogSummary",
+    "LogWriter",
+    "Losses",
+    "ReadOptions",
+    "Transform3",
+    "check_log",
+    "convert_log",
+    "is_log",
+    "open_log",
+]
+
+_MODULES = {
+    "checks.checker": ("CheckReport", "check_log"),
+    "checks.findings": ("Finding",),
+    "checks.topics": ("LEAST_JUMP", "LONGEST_JUMP_S", "MAX_SPEED"),
+    "convert": ("Conversion", "convert_log"),
+    "messages.decode": ("LinkMessage",),
+    "reader": ("Log", "is_log", "open_log"),
+    "session.topic_selection": ("TF", "TF_NAMES", "TF_STATIC"),
+    "summary": ("LaserSummary", "LogSummary", "Losses", "ReadOptions"),
+    "transforms": ("FrameTree", "Transform3"),
+    "writer": ("LogWriter",),
+}
+__getattr__, __dir__ = lazy_names(
+    __name__, {name: f"hsloc.log.{module}" for module, names in _MODULES.items() for name in names}
+)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hsloc.errors import LogFormatError
-from hsloc.log.ros_source import INITIAL_POSE
-from hsloc.log.ros_survey import CONVERTED
+from hsloc.log.session.log_session import CONVERTED
+from hsloc.log.session.message_source import INITIAL_POSE
 from hsloc.log.writer import LogWriter
 from hsloc.model import IDENTITY, Odometry, Scan
 

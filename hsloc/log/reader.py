@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.errors import LogError, LogFormatError
-from hsloc.log.mcap_records import MAGIC
+from hsloc.log.mcap.records import MAGIC
 from hsloc.log.summary import NANOSECONDS, LogSummary, Losses, ReadOptions
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class Log:
         return self._source.summary
 
     def events(self) -> Iterator[Event]:
-        """All events in a total, repeatable order (see `hsloc.log.ordering`), with their own header stamps.
+        """All events in a total, repeatable order (see `hsloc.log.session.ordering`), with their own header stamps.
 
         Only those whose effective stamp lies in [start_s, end_s) of the options, counted from `origin_ns`. Each
         call reads the log anew, and counts its losses anew. Raises LogError where a file vanishes under way.
@@ -115,7 +115,7 @@ def open_log(paths: Path | str | Sequence[Path | str], options: ReadOptions | No
         if len(files) > 1:
             raise LogFormatError(f"{files[0]}: text logs are read one at a time; convert them first")
         return Log(_text_source(files[0], options), options, files)
-    from hsloc.log.ros_source import RosSource
+    from hsloc.log.session.message_source import RosSource
 
     containers = [_container(path, kind) for path, kind in zip(files, kinds, strict=True)]
     return Log(RosSource(containers, options), options, [part for file in files for part in _parts(file)])
@@ -123,14 +123,14 @@ def open_log(paths: Path | str | Sequence[Path | str], options: ReadOptions | No
 
 def is_log(path: Path) -> bool:
     """Whether a file or folder is a log of a known format, by what it holds; raises LogError as `open_log`."""
-    from hsloc.log.text import find_format
+    from hsloc.log.text.source import find_format
 
     (first, *_) = _expand(path)
     return _kind(first) != "text" or find_format(first) is not None
 
 
 def _text_source(path: Path, options: ReadOptions) -> Source:
-    from hsloc.log.text import TextSource, find_format
+    from hsloc.log.text.source import TextSource, find_format
 
     line_format = find_format(path)
     if line_format is None:
@@ -140,10 +140,10 @@ def _text_source(path: Path, options: ReadOptions) -> Source:
 
 def _container(path: Path, kind: str) -> Container:
     if kind == "mcap":
-        from hsloc.log.mcap_container import McapContainer
+        from hsloc.log.mcap.container import McapContainer
 
         return McapContainer(path)
-    from hsloc.log.bag_container import BagContainer
+    from hsloc.log.bags import BagContainer
 
     return BagContainer(path)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from hsloc.log.decode import LinkMessage, OdometryMessage, ScanMessage
+    from hsloc.log.messages.decode import LinkMessage, OdometryMessage, ScanMessage
     from hsloc.log.summary import LogSummary, Losses
     from hsloc.model import Event, OccupancyGrid, Pose2
 

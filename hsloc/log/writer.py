@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, BinaryIO
 from mcap.writer import CompressionType, Writer
 
 from hsloc.errors import OutputError
-from hsloc.log import definitions, encode
+from hsloc.log.messages import definitions, encode
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

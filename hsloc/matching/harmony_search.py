@@ -124,7 +124,7 @@ class HarmonySearch:
         """`match` in many windows of one size: the fittest pose in each, their fitness (n,), and the evaluations."""
         if not windows or len(points) == 0:
             return [window.centre for window in windows], np.zeros(len(windows)), 0
-        scaled = field.scale(points[spread_order(len(points))])
+        scaled = field.scale(points[low_discrepancy_order(len(points))])
         cells = np.array([field.to_cells(window.centre) for window in windows])
         poses, fitness = np.empty_like(cells), np.empty(len(cells))
         evaluations = search_boxes(
@@ -181,7 +181,7 @@ def half_widths_in(field: LikelihoodField, window: Window) -> F64:
     return np.array((c * half[0] + s * half[1], s * half[0] + c * half[1], half[2]))
 
 
-def spread_order(n: int) -> NDArray[np.int64]:
+def low_discrepancy_order(n: int) -> NDArray[np.int64]:
     """An order of n beams in which every beginning is spread evenly over the turn (golden-ratio sequence)."""
     return np.argsort((np.arange(n) * _GOLDEN) % 1.0, kind="stable")
 
@@ -199,7 +199,7 @@ def run_search(
     half = half_widths_in(field, window)
     if len(points) == 0:
         return Match(window.centre, 0.0, np.diag(half**2 / 3.0), 0, StopReason.NO_POINTS)
-    scaled = field.scale(points[spread_order(len(points))])
+    scaled = field.scale(points[low_discrepancy_order(len(points))])
     few = scaled[: matcher.search_points]
     pose = np.empty(3)
     information = np.zeros((3, 3))

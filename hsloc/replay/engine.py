@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Protocol
 
 from hsloc.model.events import Odometry, PairedScan, Scan, Truth
 from hsloc.model.pose2 import IDENTITY, Pose2
-from hsloc.replay.clouds import clouds
-from hsloc.replay.deskew import deskewed
+from hsloc.preprocessing.deskew import deskewed
+from hsloc.preprocessing.merge_scans import clouds
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -16,17 +16,13 @@ import numpy as np
 
 from hsloc.errors import EvaluationError, HslocError
 from hsloc.evaluation import read_tum
-from hsloc.log.reader import is_log, open_log
-from hsloc.log.summary import ReadOptions
-from hsloc.log.topics import TF, TF_NAMES, TF_STATIC
-from hsloc.log.transforms import FrameTree
+from hsloc.log import TF, TF_NAMES, TF_STATIC, FrameTree, ReadOptions, is_log, open_log
 from hsloc.model import Odometry, Pose2, Trajectory, Truth
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from hsloc.log.decode import LinkMessage
-    from hsloc.log.reader import Log
+    from hsloc.log import LinkMessage, Log
 
     Stamped = tuple[int, Pose2]
 

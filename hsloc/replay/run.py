@@ -5,115 +5,44 @@ from __future__ import annotations
 import signal
 import time
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from os import fsencode
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.config import Config
 from hsloc.errors import ConfigError, LogError, MapError
-from hsloc.log.reader import open_log
-from hsloc.log.summary import LogSummary, Losses, ReadOptions
+from hsloc.log import LogSummary, Losses, open_log
 from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.matching.window import Window
 from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
-from hsloc.replay.continuity import Joined
+from hsloc.preprocessing.odometry_resets import ContinuousOdometry
 from hsloc.replay.engine import replay
 from hsloc.replay.garbage import seldom_collected
-from hsloc.replay.recording import Recording
+from hsloc.replay.initial_pose import find_start, first_odometry
+from hsloc.replay.map_sources import load_grid, load_state, maps_beside, unread_maps
 from hsloc.replay.references import read_reference
-from hsloc.replay.saved_maps import load_grid, load_state, maps_beside, unread_maps
-from hsloc.replay.start import find_start, first_odometry
-from hsloc.slam.mapper import Mapper, Resume
+from hsloc.replay.run_history import RunHistory
+from hsloc.slam.mapper import Mapper
+from hsloc.slam.parameters import Resume
 from hsloc.slam.point_mapper import PointMapper
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from hsloc.log.reader import Log
+    from hsloc.log import Log
     from hsloc.matching.match import Matcher
     from hsloc.model.estimate import ScanDiagnostics
     from hsloc.model.events import Event
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.model.pose2 import Pose2
     from hsloc.replay.engine import Estimator
-    from hsloc.slam.mapper import GraphMapperParameters
+    from hsloc.request import RunRequest
+    from hsloc.slam.map_state import MapState
     from hsloc.slam.result import MappingResult
-    from hsloc.slam.state import MapState
-
-
-_LONGEST_S = 1e9
-"""No log takes so many seconds; in nanoseconds it fits 64 bits."""
-MODES = ("auto", "localise", "slam")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunSpec:
-    """What to run. The same spec on the same files gives the same result, bit for bit.
-
-    With `resume`, the results of an earlier mapping run, that run's map is extended: the new map and trajectory are in
-    its frame. `mode` is "localise", "slam" or "auto": localise if there is a map, `map_path` or the log's own, else
-    draw one.
-    With `no_odometry` the log's odometry is not looked at (slam alone). The start is `initial_pose`, else the one
-    that the log states for the time of the first event, else unknown; with `unknown_start` it is unknown whatever the
-    log states. `labels` are the names of the logs in reports, where the files' own names say nothing.
-    `reference` names poses to compare with, see `hsloc.replay.references`; otherwise they are the log's truth.
-    """
-
-    logs: tuple[Path, ...]
-    map_path: Path | None = None
-    resume: Path | None = None
-    config: Config = field(default_factory=Config)
-    read: ReadOptions = field(default_factory=ReadOptions)
-    initial_pose: Pose2 | None = None
-    unknown_start: bool = False
-    seed: int = 0
-    preset: str = "default"
-    labels: tuple[str, ...] = ()
-    mode: str = "auto"
-    no_odometry: bool = False
-    reference: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise ConfigError(f"mode is {self.mode!r}; it must be one of {', '.join(MODES)}")
-        if self.no_odometry and (self.mode == "localise" or self.map_path is not None):
-            raise ConfigError(
-                "a robot on a given map is followed with odometry; leave out --no-odom or use --mode slam"
-            )
-        if self.resume is not None and (self.mode == "localise" or self.map_path is not None):
-            raise ConfigError("a map is either localised in (--map) or extended (--resume); leave out one of them")
-        if self.resume is not None and self.config.mapper != "graph":
-            raise ConfigError(
-                f"a map is extended by the graph mapper; leave out --resume or --mapper {self.config.mapper}"
-            )
-        if self.no_odometry and self.read.deskew:
-            raise ConfigError("scans are deskewed with odometry; leave out --no-odom or --deskew")
-        if self.reference is not None and self.read.truth_topic is not None:
-            raise ConfigError(
-                "--reference and --truth-topic both name the poses to compare with; leave out one of them"
-            )
-        _check_window(self.read.start_s, self.read.end_s)
-        if len({path.resolve() for path in self.logs}) < len(self.logs):
-            raise ConfigError(f"{self.logs[0]}: a log is named twice; several logs must be parts of one run")
-
-    def mapping(self) -> GraphMapperParameters:
-        """The graph mapper's parameters as this run uses them."""
-        return replace(self.config.graph_mapper, use_odometry=not self.no_odometry)
-
-    def reading(self) -> ReadOptions:
-        """How this run reads its logs, each time it does: odometry may be missing where it is not looked at."""
-        return replace(self.read, require_odometry=not self.no_odometry)
-
-    def names(self) -> tuple[str, ...]:
-        """What to call the logs in reports; of a name that is no text (UTF-8) the odd bytes as `\\xfc`."""
-        return self.labels or tuple(fsencode(path.name).decode("utf-8", "backslashreplace") for path in self.logs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +64,7 @@ class Result:
     `true_grid` is the one that the log carries, if any. `likelihood` is the field that was matched on, of a given map.
     """
 
-    spec: RunSpec
+    spec: RunRequest
     summary: LogSummary
     input_sha256: str
     trajectory: Trajectory
@@ -158,7 +87,7 @@ class Result:
         return len(self.odometry) == 0
 
 
-def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Result:
+def run(spec: RunRequest, progress: Callable[[Progress], None] | None = None) -> Result:
     """Replay a log through the localiser or the mapper.
 
     Raises an `HslocError` for a log, map or configuration that cannot be used.
@@ -175,24 +104,24 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
     if progress is not None:
         progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
     if localise:
-        start, doubts = find_start(spec, log, _must(grid))
+        start, doubts = find_start(spec, log, require_map(grid))
         warnings = (*warnings, *doubts)
         likelihood = LikelihoodField.from_grid(
-            _must(grid), spec.config.likelihood_field.sigma, spec.config.likelihood_field.margin
+            require_map(grid), spec.config.likelihood_field.sigma, spec.config.likelihood_field.margin
         )
-        estimator: Estimator = _localiser(spec, _must(grid), likelihood, start)
+        estimator: Estimator = _localiser(spec, require_map(grid), likelihood, start)
     else:
         likelihood, estimator = None, _mapper(spec, state)
     first = None if spec.no_odometry else first_odometry(log.events())
     prepared = time.perf_counter()
-    recording, events = Recording(), Joined(_events(spec, log), log.summary.odom_topic)
+    history, events = RunHistory(), ContinuousOdometry(_events(spec, log), log.summary.odom_topic)
     with seldom_collected():
         for event, estimate in replay(
-            _reported(log, events, recording, progress), estimator, deskew=spec.read.deskew, first=first
+            _reported(log, events, history, progress), estimator, deskew=spec.read.deskew, first=first
         ):
-            recording.add(event, estimate)
+            history.add(event, estimate)
     replayed = time.perf_counter()
-    if recording.scans == 0:
+    if history.scans == 0:
         where = "between --start and --end" if _cut(spec) else f"on {log.summary.scan_topic} that could be read"
         lost = "".join(f": {line}" for line in ["; ".join(log.losses.lines())] if line)
         raise LogError(f"{spec.logs[0]}: no scan {where}{lost}")
@@ -202,22 +131,22 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
     mapping, true_grid = None, None if localise else grid
     if isinstance(estimator, Mapper):
-        mapping = estimator.finish(_share(progress, log.summary.duration_s, recording.scans))
+        mapping = estimator.finish(_share(progress, log.summary.duration_s, history.scans))
         grid = mapping.grid
         seconds["finish"] = time.perf_counter() - replayed
     elif isinstance(estimator, PointMapper):
         grid = estimator.grid()
-    trajectory, localised = recording.trajectory() if mapping is None else _mapped(recording, mapping)
+    trajectory, localised = history.trajectory() if mapping is None else _mapped(history, mapping)
     return Result(
         spec=spec,
         summary=log.summary,
         input_sha256=log.sha256(),
         trajectory=trajectory,
         localised=localised,
-        odometry=recording.odometry(),
-        reference=recording.reference() if reference is None else reference,
-        grid=_must(grid),
-        diagnostics=recording.diagnostics(),
+        odometry=history.odometry(),
+        reference=history.reference() if reference is None else reference,
+        grid=require_map(grid),
+        diagnostics=history.diagnostics(),
         losses=log.losses,
         warnings=(*log.summary.warnings, *warnings, *events.doubt()),
         seconds=seconds,
@@ -228,16 +157,16 @@ def run(spec: RunSpec, progress: Callable[[Progress], None] | None = None) -> Re
     )
 
 
-def _mapped(recording: Recording, mapping: MappingResult) -> tuple[Trajectory, NDArray[np.bool_]]:
+def _mapped(history: RunHistory, mapping: MappingResult) -> tuple[Trajectory, NDArray[np.bool_]]:
     """The trajectory as it is known at the end: at the odometry messages, or at the scans if there are none."""
-    stamps = recording.odometry().stamps_ns
+    stamps = history.odometry().stamps_ns
     poses = mapping.odometry_poses
     if len(stamps) == 0:
-        stamps, poses = recording.diagnostics().stamps_ns, mapping.scan_poses
+        stamps, poses = history.diagnostics().stamps_ns, mapping.scan_poses
     return Trajectory(stamps, poses), np.ones(len(stamps), dtype=np.bool_)
 
 
-def _events(spec: RunSpec, log: Log) -> Iterator[Event]:
+def _events(spec: RunRequest, log: Log) -> Iterator[Event]:
     """The events of the log; without its odometry if that is not to be looked at."""
     for event in log.events():
         if not (spec.no_odometry and isinstance(event, Odometry)):
@@ -250,7 +179,7 @@ def _share(progress: Callable[[Progress], None] | None, total: float, scans: int
     return lambda share: progress(Progress("refine", share * total, total, scans))
 
 
-def find_map(spec: RunSpec, log: Log) -> tuple[OccupancyGrid | None, tuple[str, ...]]:
+def find_map(spec: RunRequest, log: Log) -> tuple[OccupancyGrid | None, tuple[str, ...]]:
     """The map that is given or that the log carries, and what there is to warn of."""
     if spec.map_path is not None:
         return load_grid(spec.map_path)
@@ -269,13 +198,14 @@ def find_map(spec: RunSpec, log: Log) -> tuple[OccupancyGrid | None, tuple[str, 
     return None, (hint + ("" if not beside[1:] else f" (also there: {', '.join(p.name for p in beside[1:])})"),)
 
 
-def _must(grid: OccupancyGrid | None) -> OccupancyGrid:
+def require_map(grid: OccupancyGrid | None) -> OccupancyGrid:
+    """The map. Raises MapError where there is none."""
     if grid is None:
         raise MapError("no map to localise in")
     return grid
 
 
-def _mapper(spec: RunSpec, state: MapState | None) -> Mapper | PointMapper:
+def _mapper(spec: RunRequest, state: MapState | None) -> Mapper | PointMapper:
     if spec.config.mapper == "point":
         if spec.no_odometry:
             raise ConfigError("the point mapper predicts with odometry; leave out --no-odom, or use --mapper graph")
@@ -286,7 +216,7 @@ def _mapper(spec: RunSpec, state: MapState | None) -> Mapper | PointMapper:
     return Mapper(spec.mapping(), np.random.default_rng(spec.seed), resume)
 
 
-def _localiser(spec: RunSpec, grid: OccupancyGrid, likelihood: LikelihoodField, start: Pose2 | None) -> Estimator:
+def _localiser(spec: RunRequest, grid: OccupancyGrid, likelihood: LikelihoodField, start: Pose2 | None) -> Estimator:
     from hsloc.localisation.localiser import Localiser
 
     config = spec.config
@@ -316,21 +246,12 @@ def _uninterrupted() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _check_window(start: float | None, end: float | None) -> None:
-    for name, value in (("--start", start), ("--end", end)):
-        if value is not None and not abs(value) <= _LONGEST_S:
-            raise ConfigError(f"{name} is {value}; it must be a number of seconds into the log")
-    if end is not None and end <= max(start or 0.0, 0.0):
-        begin = "the beginning of the log" if start is None else f"--start {start:g}"
-        raise ConfigError(f"--end is {end:g}; it must be later than {begin}")
-
-
-def _cut(spec: RunSpec) -> bool:
+def _cut(spec: RunRequest) -> bool:
     return spec.read.start_s is not None or spec.read.end_s is not None
 
 
 def _reported(
-    log: Log, events: Iterable[Event], recording: Recording, progress: Callable[[Progress], None] | None
+    log: Log, events: Iterable[Event], history: RunHistory, progress: Callable[[Progress], None] | None
 ) -> Iterator[Event]:
     """The events, telling now and then how far they are."""
     if progress is None:
@@ -341,4 +262,4 @@ def _reported(
     for event in events:
         yield event
         if isinstance(event, Scan):
-            progress(Progress("replay", max((event.stamp_ns - origin) / 1e9, 0.0), total, recording.scans))
+            progress(Progress("replay", max((event.stamp_ns - origin) / 1e9, 0.0), total, history.scans))

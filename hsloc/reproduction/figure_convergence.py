@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.evaluation import report_style as style
+from hsloc.report import style
 from hsloc.reproduction.convergence import COUNTS, ITERATIONS, REACHED
 from hsloc.reproduction.figure_style import COLOURS, head, quiet
 

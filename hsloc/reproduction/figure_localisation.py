@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.patches import ConnectionPatch, Rectangle
 
-from hsloc.evaluation import report_style as style
 from hsloc.model.pose2 import compose_poses, wrap_angles
+from hsloc.report import style
 from hsloc.reproduction import published
 from hsloc.reproduction.figure_style import COLOURS, head, quiet
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from hsloc.evaluation import report_style as style
 from hsloc.model.pose2 import compose_poses
+from hsloc.report import style
 from hsloc.reproduction import published
 from hsloc.reproduction.figure_localisation import draw_columns
 from hsloc.reproduction.figure_style import COLOURS, head, quiet

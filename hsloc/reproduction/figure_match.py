@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.evaluation import report_style as style
 from hsloc.model.pose2 import Pose2, wrap_angle
+from hsloc.report import style
 from hsloc.reproduction.figure_style import COLOURS, head, quiet
 from hsloc.reproduction.material import SEEN_FROM
 from hsloc.reproduction.scan_match import START, scan_seen

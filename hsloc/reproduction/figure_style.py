@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from hsloc.evaluation import report_style as style
+from hsloc.report import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

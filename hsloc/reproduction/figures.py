@@ -9,8 +9,8 @@ import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hsloc.evaluation import report_style as style
-from hsloc.evaluation.files import write_atomically
+from hsloc.atomic_write import write_atomically
+from hsloc.report import style
 from hsloc.reproduction.figure_convergence import draw_convergence
 from hsloc.reproduction.figure_localisation import draw_errors, draw_path
 from hsloc.reproduction.figure_mapping import draw_map, draw_map_errors

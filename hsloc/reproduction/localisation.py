@@ -15,7 +15,7 @@ from hsloc.localisation.localiser import Localiser
 from hsloc.matching import LikelihoodField
 from hsloc.model.estimate import Status
 from hsloc.replay.engine import replay
-from hsloc.replay.recording import Recording
+from hsloc.replay.run_history import RunHistory
 from hsloc.reproduction.variants import NAMES
 from hsloc.simulation.presets import preset as scenario_preset
 from hsloc.simulation.simulator import events
@@ -119,15 +119,15 @@ def _localise(
 ) -> Drive:
     rng = np.random.default_rng(seed)
     localiser = Localiser(grid, field, config.make_matcher(), config.localiser, rng, world.start())
-    recording = Recording()
+    history = RunHistory()
     begin = perf_counter()
     for event, estimate in replay(drive, localiser):
-        recording.add(event, estimate)
+        history.add(event, estimate)
     seconds = perf_counter() - begin
-    estimated, _ = recording.trajectory()
-    truth = recording.reference()
+    estimated, _ = history.trajectory()
+    truth = history.reference()
     assert truth is not None
-    diagnostics = recording.diagnostics()
+    diagnostics = history.diagnostics()
     return Drive(
         matcher=NAMES[config.matcher],
         preset=preset_name,
@@ -139,5 +139,5 @@ def _localise(
         evaluations=int(diagnostics.evaluations.sum()),
         length_m=truth.length(),
         duration_s=float(truth.stamps_ns[-1] - truth.stamps_ns[0]) * 1e-9,
-        path=Path(estimated, truth, recording.odometry()) if seed == 0 else None,
+        path=Path(estimated, truth, history.odometry()) if seed == 0 else None,
     )

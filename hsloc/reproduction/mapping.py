@@ -14,7 +14,7 @@ from hsloc.evaluation import evaluate
 from hsloc.model.estimate import Status
 from hsloc.model.trajectory import Trajectory
 from hsloc.replay.engine import replay
-from hsloc.replay.recording import Recording
+from hsloc.replay.run_history import RunHistory
 from hsloc.reproduction.localisation import MATCHERS, Path
 from hsloc.reproduction.variants import NAMES
 from hsloc.simulation.odometer import SteeringNoise
@@ -98,19 +98,19 @@ def run_mapping(world: World, seeds: int, progress: Callable[[float], None]) -> 
 def _map(drive: list[Event], world: World, config: Config, preset_name: str, seed: int) -> Mapped:
     rng = np.random.default_rng(seed)
     mapper = PointMapper(config.make_matcher(), config.point_mapper, rng, world.start())
-    recording = Recording()
+    history = RunHistory()
     known: dict[int, Pose2] = {}
     begin = perf_counter()
     for event, estimate in replay(drive, mapper):
-        recording.add(event, estimate)
+        history.add(event, estimate)
         if estimate is not None:
             known[estimate.stamp_ns] = estimate.T_map_base  # the scan's follows that of the odometry
     seconds = perf_counter() - begin
     estimated = Trajectory.from_pairs(sorted(known.items()))
-    truth = recording.reference()
+    truth = history.reference()
     assert truth is not None
     assert world.points is not None
-    diagnostics = recording.diagnostics()
+    diagnostics = history.diagnostics()
     points = mapper.points
     return Mapped(
         matcher=NAMES[config.matcher],
@@ -123,7 +123,7 @@ def _map(drive: list[Event], world: World, config: Config, preset_name: str, see
         points=len(points),
         complete=float((_distances(world.points, points) < NEAR).mean()),
         distance=float(_distances(points, world.points).mean()),
-        path=Path(estimated, truth, recording.odometry()) if seed == 0 else None,
+        path=Path(estimated, truth, history.odometry()) if seed == 0 else None,
         map_points=points if seed == 0 else None,
     )
 

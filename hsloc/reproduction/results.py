@@ -6,8 +6,8 @@ import os
 import shutil
 from typing import TYPE_CHECKING
 
+from hsloc.atomic_write import write_text_atomically
 from hsloc.errors import OutputError
-from hsloc.evaluation.files import write_text_atomically
 from hsloc.evaluation.metrics import write_json
 from hsloc.reproduction.figures import draw_figures
 from hsloc.reproduction.tables import markdown

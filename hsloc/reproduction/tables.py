@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.evaluation.markdown import DASH, table
 from hsloc.reproduction import published
 from hsloc.reproduction.convergence import COUNTS
 from hsloc.reproduction.localisation import INITIAL
@@ -14,6 +13,7 @@ from hsloc.reproduction.mapping import NEAR, NOISE, RANGE
 from hsloc.reproduction.scan_match import SUCCESS as E1_SUCCESS
 from hsloc.reproduction.windows import SUCCESS as M1_SUCCESS
 from hsloc.reproduction.windows import UNCERTAINTIES
+from hsloc.text_table import DASH, table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

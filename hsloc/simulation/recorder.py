@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.errors import OutputError
-from hsloc.log.transforms import Transform3
-from hsloc.log.writer import LogWriter
+from hsloc.log import LogWriter, Transform3
 from hsloc.model import Pose2, Scan
 from hsloc.simulation.simulator import Tick, simulate
 from hsloc.simulation.world_files import load_world

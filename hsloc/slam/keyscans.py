@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.surfels import choose_hits, fit_surfels
+from hsloc.kernels.point_to_line import choose_hits, fit_surfels
 from hsloc.model.events import Scan
 from hsloc.model.pose2 import Pose2
 
@@ -25,7 +25,7 @@ _SURFEL_RADIUS = 0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyScan:
-    """A scan prepared: its hits with surfels, and its beams for looking up (hsloc/kernels/surfels.py)."""
+    """A scan prepared: its hits with surfels, and its beams for looking up (hsloc/kernels/point_to_line.py)."""
 
     points: F32
     normals: F32
@@ -70,7 +70,7 @@ class KeyScans:
     geometry: F64
 
     @staticmethod
-    def joined(scans: list[KeyScan]) -> KeyScans:
+    def from_scans(scans: list[KeyScan]) -> KeyScans:
         """Of at least one scan."""
         return KeyScans(
             np.concatenate([scan.points for scan in scans]),
@@ -90,10 +90,10 @@ class KeyScans:
         for k in range(len(start) - 1):
             hits, beams = slice(start[k], start[k + 1]), slice(table_start[k], table_start[k + 1])
             scans.append(KeyScan.fitted(points[hits], hit_of_beam[beams], ranges[beams], geometry[k]))
-        return KeyScans.joined(scans)
+        return KeyScans.from_scans(scans)
 
     @staticmethod
-    def together(first: KeyScans, second: KeyScans) -> KeyScans:
+    def concatenate(first: KeyScans, second: KeyScans) -> KeyScans:
         """Those of two logs."""
         return KeyScans(
             np.concatenate((first.points, second.points)),

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.splat import decay_table, splat
+from hsloc.kernels.score_field_update import decay_table, splat
 from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.model.pose2 import Pose2
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 class LocalMap:
     """exp(-d / sigma) of the distance d to the nearest point drawn so far, on nodes `resolution` metres apart.
 
-    Beyond `reach` metres from every point the score is zero. The array grows by half its size where points fall
+    Beyond `max_distance` metres from every point the score is zero. The array grows by half its size where points fall
     outside; drawing is local. `field` is what matchers want; it stays valid until the next `draw`.
     """
 
-    def __init__(self, resolution: float, sigma: float, reach: float) -> None:
+    def __init__(self, resolution: float, sigma: float, max_distance: float) -> None:
         self._resolution = resolution
         self._sigma = sigma
-        self._radius = reach / resolution
+        self._radius = max_distance / resolution
         self._table = decay_table(sigma / resolution, self._radius)
         self._margin = int(self._radius) + 4
         self._scores = np.zeros((0, 0), dtype=np.float32)
@@ -49,7 +49,7 @@ class LocalMap:
         """Scores on the nodes, shape (h, w)."""
         return self._scores
 
-    def draw(self, points: F64, known: float = 0.98) -> int:
+    def draw(self, points: F64, saturation_score: float = 0.98) -> int:
         """Draw points (n, 2) in metres in the map's frame; those whose nearest node scores `known` already are spared.
 
         Returns how many points were new.
@@ -58,7 +58,7 @@ class LocalMap:
             return 0
         self._make_room(points)
         cells = np.ascontiguousarray(points / self._resolution - self._corner, dtype=np.float32)
-        drawn = int(splat(self._scores, self._packed, cells, self._table, self._radius, known))
+        drawn = int(splat(self._scores, self._packed, cells, self._table, self._radius, saturation_score))
         self.drawn += drawn
         return drawn
 
@@ -86,8 +86,8 @@ class LocalMap:
         self._corner, self._scores, self._packed = new_low, scores, packed
 
 
-def field_of_points(points: F64, resolution: float, sigma: float, reach: float) -> LikelihoodField:
+def field_of_points(points: F64, resolution: float, sigma: float, max_distance: float) -> LikelihoodField:
     """The field of a set of points at once."""
-    drawn = LocalMap(resolution, sigma, reach)
-    drawn.draw(points, known=2.0)
+    drawn = LocalMap(resolution, sigma, max_distance)
+    drawn.draw(points, saturation_score=2.0)
     return drawn.field

@@ -3,8 +3,9 @@
 Places are visited in their order. Those seen before that could be near, by a drift that is assumed too large rather
 than too small, are searched by HIDE over the whole window in which they could lie. A match is believed if it is fit,
 if neither place looks through the walls of the other, and if no other pose in the window comes near to it (branch and
-bound, hsloc/kernels/bounds.py: in a corridor whose every bay looks the same there is one). It becomes an edge of the
-pose graph with a covariance and a robust weight, and the graph is solved before the next place is looked at.
+bound, hsloc/kernels/branch_and_bound.py: in a corridor whose every bay looks the same there is one). It becomes an
+edge of the pose graph with a covariance and a robust weight, and the graph is solved before the next place is looked
+at.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.bounds import best_on_lattice, pool
-from hsloc.kernels.surfels import pair_terms
-from hsloc.matching.harmony_search import spread_order
+from hsloc.kernels.branch_and_bound import best_on_lattice, pool
+from hsloc.kernels.point_to_line import pair_terms
+from hsloc.matching.harmony_search import low_discrepancy_order
 from hsloc.matching.hide import Hide
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2, compose_poses, relative_poses
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.slam.keyscans import KeyScans
-    from hsloc.slam.places import Places
+    from hsloc.slam.submaps import Submaps
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
@@ -41,11 +42,11 @@ if TYPE_CHECKING:
 class LoopParameters:
     """Where loops are looked for, and when one is believed."""
 
-    place_length: float = 3.0
+    submap_length: float = 3.0
     """A place is so much of the way (m)."""
-    min_way: float = 12.0
+    min_path_length: float = 12.0
     """Places nearer along the way or over loops already closed are let be (m)."""
-    reach: float = 3.0
+    search_radius: float = 3.0
     """Places are compared that could lie so near (m)."""
     drift: float = 0.02
     """Assumed standard deviation of the drift, as a part of the way."""
@@ -53,7 +54,7 @@ class LoopParameters:
     """And of the heading, times the square root of the way in metres (rad)."""
     sigmas: float = 3.0
     """Half-width of the window in these standard deviations."""
-    most_candidates: int = 3
+    max_candidates: int = 3
     """Old places searched for each place, the nearest ones of different times."""
     resolution: float = 0.1
     """Of the field of a place (m)."""
@@ -67,7 +68,7 @@ class LoopParameters:
     """Another pose may reach at most this part of the fitness."""
     wide: float = 2.0
     """A window with half-widths of more metres is a wide one (m): where so much is possible, more is asked."""
-    min_lead: float = 0.11
+    min_margin: float = 0.11
     """In a wide window the fitness must be so much above that of any other pose."""
     max_conflict: float = 0.1
     """At most this part of the points may lie where the other place looked through."""
@@ -119,7 +120,7 @@ class LoopCloser:
 
     def __init__(
         self,
-        places: Places,
+        places: Submaps,
         scans: KeyScans,
         parameters: LoopParameters,
         rng: Generator,
@@ -159,8 +160,10 @@ class LoopCloser:
     def connections(self, place: int) -> list[Loop]:
         """What is found between a place of this log and the nearest before `first`, its pose being nearly known."""
         distance = np.hypot(*(self.poses[: self._first, :2] - self.poses[place, :2]).T)
-        near = [int(old) for old in np.argsort(distance, kind="stable") if distance[old] < self._parameters.reach]
-        return [self._search(old, place, _CONNECTED_WAY) for old in near[: self._parameters.most_candidates]]
+        near = [
+            int(old) for old in np.argsort(distance, kind="stable") if distance[old] < self._parameters.search_radius
+        ]
+        return [self._search(old, place, _CONNECTED_WAY) for old in near[: self._parameters.max_candidates]]
 
     def edges(self) -> Edges:
         """The accepted loops as edges between the places."""
@@ -178,7 +181,7 @@ class LoopCloser:
         """Solve the graph of the places: the front end's steps, and the loops with robust weights."""
         places = self._places
         steps = Edges.chain(places.steps, places.covariances, places.doubted)
-        self.poses = solve_edges(self.poses, Edges.joined([steps, self.edges()]))
+        self.poses = solve_edges(self.poses, Edges.concatenate([steps, self.edges()]))
 
     def _candidates(self, place: int) -> list[tuple[int, float]]:
         """Old places that could be near, nearest first, with the way to each over the graph."""
@@ -188,7 +191,7 @@ class LoopCloser:
         distance = np.hypot(*(self.poses[:place, :2] - self.poses[place, :2]).T)
         # Places next to each other are drawn from the same scans: those would match themselves.
         apart = place - old > 3
-        could = apart & (way >= p.min_way) & (distance <= p.reach + p.sigmas * p.drift * way)
+        could = apart & (way >= p.min_path_length) & (distance <= p.search_radius + p.sigmas * p.drift * way)
         order = np.lexsort((old[could], distance[could]))
         chosen: list[tuple[int, float]] = []
         for candidate in old[could][order]:
@@ -196,7 +199,7 @@ class LoopCloser:
                 continue
             if all(abs(candidate - other) > 2 for other, _ in chosen):
                 chosen.append((int(candidate), float(way[candidate])))
-            if len(chosen) == p.most_candidates:
+            if len(chosen) == p.max_candidates:
                 break
         return chosen
 
@@ -238,7 +241,7 @@ class LoopCloser:
             rival = self._rival(points, likelihood, pooled, match.pose, centre, half, half_angle)
             if not rival <= p.max_rival:
                 reason = f"ambiguous: another pose reaches {100.0 * rival:.0f} % of the fitness"
-            elif half > p.wide and match.fitness * (1.0 - rival) < p.min_lead:
+            elif half > p.wide and match.fitness * (1.0 - rival) < p.min_margin:
                 reason = (
                     f"ambiguous in a wide window: fitness {match.fitness:.2f}, another pose {100.0 * rival:.0f} % of it"
                 )
@@ -280,7 +283,7 @@ class LoopCloser:
     ) -> float:
         """The best lattice pose distinct from `pose`, as a part of the best one near it."""
         p = self._parameters
-        few = likelihood.scale(points[spread_order(len(points))][: p.hide.search_points])
+        few = likelihood.scale(points[low_discrepancy_order(len(points))][: p.hide.search_points])
         step = 2.0 * p.resolution / p.scan_range
         cell = likelihood.resolution
         near = np.array((1.0, 1.0, step))

@@ -7,7 +7,7 @@ the map is drawn.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,12 +16,10 @@ from hsloc.localisation.motion import predict_covariance
 from hsloc.model.estimate import Estimate, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY
-from hsloc.slam.drawing import DrawingParameters
+from hsloc.slam.back_end import finish
+from hsloc.slam.front_end import FLOOR, FrontEnd
 from hsloc.slam.keyscans import KeyScan
-from hsloc.slam.local_matching import FLOOR, LocalMatcher, LocalMatchingParameters
-from hsloc.slam.loop_closer import LoopParameters
-from hsloc.slam.refinement import RefinementParameters
-from hsloc.slam.track import Track
+from hsloc.slam.trajectory_correction import EventLog
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,34 +28,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.model.events import Scan
-    from hsloc.model.pose2 import Pose2
-    from hsloc.slam.local_matching import LocalMatch
+    from hsloc.slam.front_end import LocalMatch
+    from hsloc.slam.parameters import GraphMapperParameters, Resume
     from hsloc.slam.result import MappingResult
-    from hsloc.slam.state import MapState
 
     F64 = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GraphMapperParameters:
-    """All of the graph mapper's, one default for all logs."""
-
-    local_matching: LocalMatchingParameters = field(default_factory=LocalMatchingParameters)
-    loops: LoopParameters = field(default_factory=LoopParameters)
-    refinement: RefinementParameters = field(default_factory=RefinementParameters)
-    drawing: DrawingParameters = field(default_factory=DrawingParameters)
-    use_odometry: bool = True
-    """Otherwise a constant velocity predicts, and the log's odometry is not looked at."""
-    passes: int = 3
-    """The whole log is gone over again at most so often, until nothing moves."""
-
-
-@dataclass(frozen=True, slots=True)
-class Resume:
-    """A saved map to go on from, and where in it the log begins, if that is known."""
-
-    state: MapState
-    T_map_first: Pose2 | None = None
 
 
 class Mapper:
@@ -67,8 +42,8 @@ class Mapper:
         self._parameters = parameters
         self._rng = rng
         self._resume = resume
-        self._matcher = LocalMatcher(parameters.local_matching, rng, parameters.use_odometry)
-        self._track = Track(parameters.local_matching.turn_length)
+        self._matcher = FrontEnd(parameters.front_end, rng, parameters.use_odometry)
+        self._track = EventLog(parameters.front_end.turn_length)
         self._scans: list[KeyScan] = []
         self._stamps: list[int] = []
         self._local: list[LocalMatch] = []
@@ -138,8 +113,6 @@ class Mapper:
 
         Raises MapError if no connection with the saved map is found.
         """
-        from hsloc.slam.second_pass import finish
-
         return finish(
             self._scans, np.array(self._stamps, dtype=np.int64), self._local, self._track, self._parameters,
             self._rng, progress, self._resume,

@@ -50,7 +50,7 @@ class PointMapperParameters:
     """And so much of an angle (rad)."""
     resolution: float = 0.25
     """Between the nodes of the field (m)."""
-    reach: float = 6.0
+    max_distance: float = 6.0
     """Beyond, a point scores nothing (m); [P] has no such limit, exp(-6) is 0.002."""
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
 
@@ -58,8 +58,8 @@ class PointMapperParameters:
         for name in ("sigma", "threshold", "window_sigmas", "window_min", "window_min_angle", "resolution"):
             if not getattr(self, name) > 0.0:
                 raise ConfigError(f"point_mapper: {name} is {getattr(self, name)}; it must be positive")
-        if not self.reach >= self.threshold:
-            raise ConfigError(f"point_mapper: reach is {self.reach}; it must be at least the threshold")
+        if not self.max_distance >= self.threshold:
+            raise ConfigError(f"point_mapper: max_distance is {self.max_distance}; it must be at least the threshold")
         if self.min_points < 1:
             raise ConfigError(f"point_mapper: min_points is {self.min_points}; it must be at least 1")
 
@@ -77,7 +77,7 @@ class PointMapper:
         self._matcher = matcher
         self._parameters = parameters
         self._rng = rng
-        self._map = LocalMap(parameters.resolution, parameters.sigma, parameters.reach)
+        self._map = LocalMap(parameters.resolution, parameters.sigma, parameters.max_distance)
         self._points: list[F64] = []
         self._T_map_base = initial_pose
         self._T_odom_base: Pose2 | None = None
@@ -139,4 +139,4 @@ class PointMapper:
     def _add(self, points: F64) -> None:
         if len(points):
             self._points.append(points)
-            self._map.draw(points, known=2.0)
+            self._map.draw(points, saturation_score=2.0)

@@ -11,7 +11,7 @@ import numpy as np
 from hsloc.errors import LogFormatError, OutputError
 from hsloc.kernels.normal_equations import add_edges
 from hsloc.model.pose2 import wrap_angles
-from hsloc.slam.sparse import BlockSystem
+from hsloc.slam.sparse_solver import BlockSystem
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -53,7 +53,7 @@ class Edges:
         return Edges(np.column_stack((first, first + 1)), measured, information, scale)
 
     @staticmethod
-    def joined(parts: list[Edges]) -> Edges:
+    def concatenate(parts: list[Edges]) -> Edges:
         """Several sets as one."""
         return Edges(
             np.concatenate([part.pairs for part in parts]),
@@ -143,7 +143,7 @@ def solve_edges(poses: F64, edges: Edges, rounds: int = 20, still: float = 1e-5)
         diagonal, right = np.zeros((len(poses), 3, 3)), np.zeros((len(poses), 3))
         add_edges(poses, edges.pairs, edges.measured, edges.information, edges.scale, diagonal, blocks, right)
         step = solve_anchored(system, diagonal, blocks, right)
-        poses = moved_by(poses, step)
+        poses = apply_increment(poses, step)
         if np.abs(step).max() < still:
             break
     return poses
@@ -157,7 +157,7 @@ def solve_anchored(system: BlockSystem, diagonal: F64, off_diagonal: F64, gradie
     return -system.solve(diagonal, off_diagonal, gradient)
 
 
-def moved_by(poses: F64, step: F64) -> F64:
+def apply_increment(poses: F64, step: F64) -> F64:
     """Poses after a step, both (n, 3), theta wrapped."""
     moved = poses + step
     moved[:, 2] = wrap_angles(moved[:, 2])

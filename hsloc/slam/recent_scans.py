@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.kernels.registration import RegistrationParameters, ScanArrays, register
-from hsloc.kernels.surfels import choose_hits
+from hsloc.kernels.point_to_line import choose_hits
 from hsloc.model.pose2 import IDENTITY, Pose2
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class MovingScan:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Registration:
+class ScanRegistration:
     """Where a scan was registered.
 
     `information` (3, 3) is that of the pairs alone, in the map. `paired` and `conflict` are parts of the points that
@@ -114,7 +114,7 @@ class RecentScans:
 
     def register(
         self, scans: tuple[MovingScan, ...], start: Pose2, predicted: Pose2, covariance: F64
-    ) -> Registration:
+    ) -> ScanRegistration:
         """Register a scan with its companions from `start` on; odometry has it at `predicted` +- `covariance` (3, 3)."""
         fixed = [self._kept[-back] for back in _BACK if back <= len(self._kept)]
         still = [(_composed(pose, scan.pose), scan) for pose, kept in fixed for scan in kept]
@@ -129,7 +129,7 @@ class RecentScans:
             pose, len(still), poses, arrays, predicted.to_array(), prior, parameters, information, counts
         )
         seen = max(float(counts[2]), 1.0)
-        return Registration(
+        return ScanRegistration(
             Pose2.from_array(pose),
             information,
             float(counts[0]) / seen,
@@ -139,7 +139,7 @@ class RecentScans:
         )
 
 
-def fused_covariance(found: Registration, covariance: F64) -> F64:
+def fused_covariance(found: ScanRegistration, covariance: F64) -> F64:
     """Covariance (3, 3) of a registered pose: the pairs, and the odometry with the weight that its chi leaves it."""
     weight = _PRIOR_SCALE**2 / (_PRIOR_SCALE**2 + found.chi**2)
     fused: F64 = np.linalg.inv(found.information + weight * np.linalg.inv(covariance))

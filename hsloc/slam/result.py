@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from hsloc.model.pose2 import Pose2
     from hsloc.slam.calibration import OdometryCalibration
     from hsloc.slam.loop_closer import Loop
+    from hsloc.slam.map_state import MapState
     from hsloc.slam.pose_graph import PoseGraph
-    from hsloc.slam.state import MapState
 
     F64 = NDArray[np.float64]
 

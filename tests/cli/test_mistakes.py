@@ -104,7 +104,7 @@ def test_not_a_log(here, capsys):
 def write_log(path, scans=("/scan",), odometry=True, grid=False):
     import numpy as np
 
-    from hsloc.log.writer import LogWriter
+    from hsloc.log import LogWriter
     from hsloc.model import Pose2, Scan
 
     with LogWriter(path) as writer:

@@ -23,8 +23,11 @@ from hsloc.model.occupancy_grid import OccupancyGrid
         ({"hide": {"budget": 10**30}}, "budget is 1000000000000000000000000000000; it must be at most"),
         ({"localiser": {"relocaliser": {"sectors": 0}}}, "relocaliser: sectors is 0; it must be at least 1"),
         ({"localiser": {"relocaliser": {"tile": -1.0}}}, "relocaliser: tile is -1.0; it must be positive"),
-        ({"localiser": {"lost_after": 0}}, "localiser: lost_after is 0; it must be at least 1"),
-        ({"localiser": {"usual_fraction": -1}}, "usual_fraction is -1"),
+        (
+            {"localiser": {"max_consecutive_rejections": 0}},
+            "localiser: max_consecutive_rejections is 0; it must be at least 1",
+        ),
+        ({"localiser": {"min_fitness_ratio": -1}}, "min_fitness_ratio is -1"),
         ({"icp": {"tolerance": -1.0}}, "tolerance is -1.0"),
     ],
 )

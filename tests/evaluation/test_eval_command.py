@@ -13,8 +13,8 @@ from hsloc.cli import eval as command
 from hsloc.errors import EvaluationError
 from hsloc.evaluation.metrics import evaluate
 from hsloc.evaluation.rpe import Delta
-from hsloc.evaluation.tum import format_stamp, write_tum
 from hsloc.model.pose2 import relative_poses
+from hsloc.trajectory_io.tum import format_stamp, write_tum
 
 
 def run(*arguments):

@@ -13,7 +13,7 @@ import pytest
 from evaluation_paths import disturb, make_path
 
 from hsloc.cli.main import main
-from hsloc.evaluation.tum import write_tum
+from hsloc.trajectory_io.tum import write_tum
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from hsloc.evaluation.markdown import table
+from hsloc.text_table import table
 
 
 def test_table_is_markdown_in_columns() -> None:

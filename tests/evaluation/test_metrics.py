@@ -17,9 +17,9 @@ from hsloc.evaluation.association import associate
 from hsloc.evaluation.metrics import evaluate, format_json, write_json
 from hsloc.evaluation.rpe import Delta, pieces
 from hsloc.evaluation.statistics import Statistics
-from hsloc.evaluation.tum import write_tum
 from hsloc.model import Pose2, Trajectory
 from hsloc.model.pose2 import compose_poses
+from hsloc.trajectory_io.tum import write_tum
 
 NAMES = ("rmse", "mean", "median", "std", "min", "max", "sse")
 

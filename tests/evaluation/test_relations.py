@@ -8,9 +8,9 @@ from evaluation_paths import make_path
 
 from hsloc.errors import EvaluationError
 from hsloc.evaluation.relations import Relations, evaluate_relations, read_relations, relation_errors
-from hsloc.evaluation.tum import parse_stamp, read_tum
 from hsloc.model import Pose2, Trajectory
 from hsloc.model.pose2 import compose_poses, relative_poses
+from hsloc.trajectory_io.tum import parse_stamp, read_tum
 
 S = 1_000_000_000
 
@@ -90,10 +90,10 @@ def test_bad_files(tmp_path, content, message):
 
 
 @pytest.mark.data
-def test_intel_scores_as_published(data_folder):
+def test_intel_scores_as_published(data):
     """Raw odometry 7.37 m +- 14.3, GMapping's poses 0.046 m +- 0.040: figures found by others on these files."""
-    relations = read_relations(data_folder / "intel" / "intel.relations")
-    with gzip.open(data_folder / "intel" / "intel.clf.gz", "rt") as log:
+    relations = read_relations(data / "intel" / "intel.relations")
+    with gzip.open(data / "intel" / "intel.clf.gz", "rt") as log:
         lines = [line.split() for line in log if line.startswith("ODOM ")]
     odometry = Trajectory(
         np.array([parse_stamp(line[7]) for line in lines]), np.array([line[1:4] for line in lines], dtype=float)
@@ -102,6 +102,6 @@ def test_intel_scores_as_published(data_folder):
     assert (raw.matched, raw.unmatched) == (2984, 0)
     assert raw.statistics.trans_part.mean == pytest.approx(7.37, abs=0.01)
     assert raw.statistics.trans_part.std == pytest.approx(14.3, abs=0.1)
-    mapped = evaluate_relations(read_tum(data_folder / "intel" / "intel.rbpf.txt.gz"), relations)
+    mapped = evaluate_relations(read_tum(data / "intel" / "intel.rbpf.txt.gz"), relations)
     assert mapped.statistics.trans_part.mean == pytest.approx(0.046, abs=0.001)
     assert mapped.statistics.trans_part.std == pytest.approx(0.040, abs=0.001)

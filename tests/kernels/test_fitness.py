@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hsloc.kernels.fitness import fitness_many, normal_equations, pack, point_scores, score_sum
-from hsloc.kernels.polish import polish, solve_damped
+from hsloc.kernels.levenberg_marquardt import polish, solve_damped
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ import pytest
 from log_builders import DATA, MOUNTING, SECOND, START, chunk_data_at, chunks_of, flipped, make_scan, write_run
 
 from hsloc.cli.main import main
-from hsloc.log import encode
-from hsloc.log.check import check_log
-from hsloc.log.findings import Intervals, Place
+from hsloc.log.checks.checker import check_log
+from hsloc.log.checks.findings import Intervals, Place
+from hsloc.log.messages import encode
 from hsloc.log.reader import open_log
 from hsloc.log.summary import ReadOptions
 from hsloc.log.writer import LogWriter

@@ -15,9 +15,10 @@ from log_builders import START, make_scan
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hsloc.errors import LogFormatError
-from hsloc.log import decode, definitions, encode, schema
 from hsloc.log.container import Channel
-from hsloc.log.decoders import Undecodable, decoder_for, is_decodable
+from hsloc.log.messages import decode, definitions, encode
+from hsloc.log.messages import definition_compatibility as schema
+from hsloc.log.messages.decoders import Undecodable, decoder_for, is_decodable
 from hsloc.log.transforms import Transform3
 from hsloc.model import OccupancyGrid, Pose2
 

@@ -18,16 +18,17 @@ from hypothesis import strategies as st
 
 from hsloc.cli.main import main
 from hsloc.errors import LogFormatError
-from hsloc.log import foxglove
 from hsloc.log.container import Channel
-from hsloc.log.decoders import Undecodable, decoder_for
-from hsloc.log.frames import Mountings
+from hsloc.log.messages import foxglove
+from hsloc.log.messages.decoders import Undecodable, decoder_for
 from hsloc.log.reader import open_log
+from hsloc.log.session.extrinsics import Extrinsics
 from hsloc.log.summary import Losses, ReadOptions
 from hsloc.log.transforms import Mounting, Transform3
 from hsloc.log.writer import LogWriter
 from hsloc.model import Odometry, Pose2, Scan
-from hsloc.replay.run import Result, RunSpec, run
+from hsloc.replay.run import Result, run
+from hsloc.request import RunRequest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -57,7 +58,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def localised(path: Path) -> Result:
     start = open_log(RECORDINGS / "kidnapped.mcap").initial_pose()
     assert start is not None
-    return run(RunSpec(logs=(path,), initial_pose=start[1]))
+    return run(RunRequest(logs=(path,), initial_pose=start[1]))
 
 
 def values(event: Event) -> tuple[object, ...]:
@@ -125,7 +126,7 @@ def test_the_pose_of_a_foxglove_scan_is_part_of_its_mounting() -> None:
     message.pose.orientation.x = 1.0  # head down
     scan = decoder_for(channel("foxglove.LaserScan"))(message.SerializeToString())
     assert scan.T_frame_laser == Transform3((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-    mountings = Mountings([], "base", None)
+    mountings = Extrinsics([], "base", None)
     mountings._spatial["laser"] = Transform3.from_pose2(Pose2(0.5, 0.25, np.pi / 2))
     mountings._known["laser"] = (Mounting(Pose2(0.5, 0.25, np.pi / 2)), "/tf_static")
     mounting = mountings.of("laser", scan.T_frame_laser)

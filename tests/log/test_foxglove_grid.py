@@ -14,7 +14,7 @@ from log_builders import START, write_raw
 
 from hsloc.cli.main import main
 from hsloc.log.container import Channel
-from hsloc.log.decoders import Undecodable, decoder_for
+from hsloc.log.messages.decoders import Undecodable, decoder_for
 from hsloc.log.reader import open_log
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from log_formats import foxglove_mcap, ros1_mcap
 from mcap.writer import CompressionType
 
 from hsloc.errors import HslocError
-from hsloc.log.check import check_log
+from hsloc.log.checks.checker import check_log
 from hsloc.log.reader import open_log
 from hsloc.log.summary import ReadOptions
 

@@ -15,8 +15,8 @@ from log_builders import DATA, SECOND, START, chunk_data_at, chunks_of, flipped,
 from mcap.writer import CompressionType, IndexType
 
 from hsloc.errors import LogFormatError
-from hsloc.log.mcap_container import McapContainer
-from hsloc.log.mcap_records import MAGIC
+from hsloc.log.mcap.container import McapContainer
+from hsloc.log.mcap.records import MAGIC
 from hsloc.log.summary import Losses
 
 if TYPE_CHECKING:
@@ -188,7 +188,7 @@ def test_out_of_order_and_overlapping_chunks_are_merged_exactly(tmp_path: Path) 
 
 @pytest.mark.parametrize("few", [0, 5])
 def test_much_that_overlaps_goes_through_a_heap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, few: int) -> None:
-    monkeypatch.setattr("hsloc.log.mcap_container._FEW", few)
+    monkeypatch.setattr("hsloc.log.mcap.container._FEW", few)
     first, second = scan_payloads(COUNT, "/a"), scan_payloads(COUNT, "/b")
     mixed = [message for pair in zip(first, reversed(second), strict=True) for message in pair]
     times, losses = read(write_raw(tmp_path / "log.mcap", mixed))
@@ -197,7 +197,7 @@ def test_much_that_overlaps_goes_through_a_heap(tmp_path: Path, monkeypatch: pyt
 
 
 def test_what_is_held_back_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hsloc.log.mcap_container.MAX_HELD_BYTES", 1000)
+    monkeypatch.setattr("hsloc.log.mcap.container.MAX_HELD_BYTES", 1000)
     first, second = scan_payloads(COUNT, "/a"), scan_payloads(COUNT, "/b")
     mixed = [message for pair in zip(first, reversed(second), strict=True) for message in pair]
     times, losses = read(write_raw(tmp_path / "log.mcap", mixed))
@@ -295,7 +295,7 @@ def test_a_record_length_beyond_the_file_ends_it(tmp_path: Path) -> None:
 
 
 def test_many_chunks_that_unpack_to_too_much_in_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hsloc.log.mcap_container.FREE_UNPACKED_BYTES", 10 << 20)
+    monkeypatch.setattr("hsloc.log.mcap.container.FREE_UNPACKED_BYTES", 10 << 20)
     filler = record(0x80, bytes((1 << 20) - 9))
     data = zstandard.compress(filler)
     path = tmp_path / "log.mcap"

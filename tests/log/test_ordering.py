@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_builders import SECOND, START, describe, make_scan
 
-from hsloc.log.ordering import KIND_ODOMETRY, KIND_SCAN, WINDOW_NS, Arrivals, Reorder, TopicClock
+from hsloc.log.session.ordering import KIND_ODOMETRY, KIND_SCAN, WINDOW_NS, Arrivals, Reorder, TopicClock
 from hsloc.log.summary import Losses
 from hsloc.model import Odometry, Pose2
 

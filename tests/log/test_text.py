@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from log_builders import DATA, SECOND
 
 from hsloc.errors import HslocError, LogFormatError, TopicError
-from hsloc.log.carmen import beam_angles
-from hsloc.log.ranges import RangeRule
 from hsloc.log.reader import open_log
 from hsloc.log.summary import Losses, ReadOptions
-from hsloc.log.text import stamp_ns
+from hsloc.log.text.carmen import beam_angles
+from hsloc.log.text.line_format import stamp_ns
+from hsloc.log.text.max_range_inference import RangeRule
 from hsloc.model import Odometry, Pose2, Scan, Truth
 
 if TYPE_CHECKING:

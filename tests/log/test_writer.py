@@ -13,7 +13,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from hsloc.errors import OutputError
-from hsloc.log import definitions, encode
+from hsloc.log.messages import definitions, encode
 from hsloc.log.transforms import Transform3
 from hsloc.log.writer import LogWriter
 from hsloc.model import OccupancyGrid, Pose2, Scan, Trajectory

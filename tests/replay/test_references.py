@@ -11,12 +11,11 @@ import pytest
 
 from hsloc.cli.main import main
 from hsloc.errors import ConfigError, EvaluationError, TopicError
-from hsloc.evaluation.tum import read_tum, write_tum
-from hsloc.log.summary import ReadOptions
-from hsloc.log.writer import LogWriter
+from hsloc.log import LogWriter, ReadOptions
 from hsloc.model import Pose2, Trajectory
 from hsloc.replay.references import read_reference
-from hsloc.replay.run import RunSpec
+from hsloc.request import RunRequest
+from hsloc.trajectory_io.tum import read_tum, write_tum
 
 HALL = Path(__file__).parents[2] / "recordings" / "hall.mcap"
 SECOND = 1_000_000_000
@@ -122,7 +121,7 @@ def test_a_reference_of_another_time_is_told(tmp_path, capsys, truth):
 def test_a_reference_that_is_missing_costs_no_replay(tmp_path, capsys):
     assert "no such file" in replay(tmp_path, capsys, "--reference", "none.tum", code=1)
     with pytest.raises(ConfigError, match="leave out one of them"):
-        RunSpec(logs=(HALL,), reference="x.tum", read=ReadOptions(truth_topic="/ground_truth"))
+        RunRequest(logs=(HALL,), reference="x.tum", read=ReadOptions(truth_topic="/ground_truth"))
 
 
 def test_eval_takes_logs(tmp_path, capsys, truth):

@@ -13,12 +13,11 @@ import pytest
 from hsloc.cli.main import main
 from hsloc.errors import TopicError
 from hsloc.evaluation import evaluate
-from hsloc.log.reader import open_log
-from hsloc.log.summary import ReadOptions
-from hsloc.log.writer import LogWriter
+from hsloc.log import LogWriter, ReadOptions, open_log
 from hsloc.model import Odometry, Pose2, Scan
 from hsloc.model.events import HELD
-from hsloc.replay.run import RunSpec, run
+from hsloc.replay.run import run
+from hsloc.request import RunRequest
 from hsloc.simulation.presets import preset
 from hsloc.simulation.recorder import record
 
@@ -77,7 +76,7 @@ def test_scans_of_all_topics_come_in_order_with_their_own_mounting(log):
 
 def error(log, topics, mode):
     """RMSE of APE (m) and the result."""
-    result = run(RunSpec(logs=(log,), read=ReadOptions(scan_topic=topics), mode=mode))
+    result = run(RunRequest(logs=(log,), read=ReadOptions(scan_topic=topics), mode=mode))
     alignment = "none" if mode == "localise" else "se2"
     return evaluate(result.trajectory, result.reference, alignment=alignment).ape.trans_part.rmse, result
 

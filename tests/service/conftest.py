@@ -3,38 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
-import socket
-import subprocess
-import sys
-import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import httpx2 as httpx
 import pytest
 from fastapi.testclient import TestClient
 
-from service.http.app import create_app
-from service.settings import Settings
+from hsloc_service.http.app import create_app
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
-FAKE = (sys.executable, "-P", str(Path(__file__).parent / "fake_worker.py"))
-SMALL: dict[str, Any] = {
-    "min_free_bytes": 1 << 20,
-    "grace_s": 0.3,
-    "heartbeat_s": 0.5,
-    "lease_s": 5.0,
-    "job_memory_bytes": 1 << 30,
-    "worker_command": FAKE,
-}
-
-
-def settings(folder: Path, **changes: Any) -> Settings:
-    return Settings(data=folder / "data", **{**SMALL, **changes})
+from live_service import Live, settings
 
 
 @pytest.fixture
@@ -53,83 +34,6 @@ def make_client(tmp_path: Path) -> Iterator[Callable[..., TestClient]]:
 @pytest.fixture
 def client(make_client: Callable[..., TestClient]) -> TestClient:
     return make_client()
-
-
-def upload(client: Any, content: bytes = b"ok", name: str = "run.mcap") -> str:
-    answer = client.post("/v1/files", params={"name": name}, content=content)
-    assert answer.status_code == 201, answer.text
-    return str(answer.json()["id"])
-
-
-def submit(client: Any, content: bytes = b"ok", **request: Any) -> str:
-    answer = client.post("/v1/jobs", json={"log": upload(client, content), **request})
-    assert answer.status_code == 201, answer.text
-    return str(answer.json()["id"])
-
-
-def wait(client: Any, job: str, seconds: float = 20.0, states: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The job when it has ended (or is in one of the states)."""
-    wanted = states or ("succeeded", "failed", "crashed", "cancelled")
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        found: dict[str, Any] = client.get(f"/v1/jobs/{job}").json()
-        if found["state"] in wanted:
-            return found
-        time.sleep(0.03)
-    raise AssertionError(f"job is still {found['state']} after {seconds} s: {found}")
-
-
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
-
-
-class Live:
-    """`hsloc serve` as a process."""
-
-    def __init__(self, folder: Path, **variables: str) -> None:
-        self.data, self.port, self._variables = folder / "data", free_port(), variables
-        self.process: subprocess.Popen[bytes] | None = None
-        self.log = folder / "server.log"
-
-    @property
-    def url(self) -> str:
-        return f"http://127.0.0.1:{self.port}"
-
-    def start(self) -> Live:
-        environment = os.environ | {
-            "HSLOC_MIN_FREE_BYTES": "1M",
-            "HSLOC_GRACE_S": "0.3",
-            "HSLOC_HEARTBEAT_S": "0.5",
-            "HSLOC_LEASE_S": "5",
-            "HSLOC_WORKER_COMMAND": ",".join(FAKE),
-            **self._variables,
-        }
-        with self.log.open("ab") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "hsloc.cli.main", "serve", "--data", str(self.data), "--port", str(self.port)],
-                env=environment,
-                stdout=log,
-                stderr=log,
-            )
-        deadline = time.monotonic() + 20.0
-        while time.monotonic() < deadline:
-            with contextlib.suppress(httpx.HTTPError):
-                if httpx.get(f"{self.url}/readyz").status_code == 200:
-                    return self
-            if self.process.poll() is not None:
-                raise RuntimeError(self.log.read_text())
-            time.sleep(0.05)
-        raise AssertionError("the server did not start")
-
-    def end(self, which: int = signal.SIGTERM) -> int:
-        assert self.process is not None
-        self.process.send_signal(which)
-        return self.process.wait(20.0)
-
-    def client(self) -> httpx.Client:
-        return httpx.Client(base_url=self.url, timeout=20.0)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""A job's process that does what the first word of the uploaded log says; started like `service.worker`."""
+"""A job's process that does what the first word of the log says; runs like `hsloc_service.execution.worker`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from service import limits
+from hsloc_service.execution import limits
 
 
 def main() -> int:

@@ -8,22 +8,22 @@ import uuid
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from conftest import settings, submit, upload, wait
 from fastapi.testclient import TestClient
+from live_service import settings, submit, upload, wait
 
 from hsloc.cli.main import main as program
-from service.database import Database
-from service.http.app import create_app
-from service.main import with_tokens
-from service.principal import Tokens
-from service.settings import SettingsError
-from service.storage import Storage
+from hsloc_service.auth import Tokens
+from hsloc_service.db.database import Database
+from hsloc_service.http.app import create_app
+from hsloc_service.main import with_tokens
+from hsloc_service.settings import SettingsError
+from hsloc_service.storage import Storage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from conftest import Live
+    from live_service import Live
 
 PUBLIC = {("get", "/healthz"), ("get", "/readyz")}
 READ = {

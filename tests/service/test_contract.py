@@ -15,13 +15,13 @@ import hypothesis
 import pytest
 import requests
 import schemathesis
-from conftest import Live, settings, submit, upload, wait
 from hypothesis import HealthCheck, Phase
+from live_service import Live, settings, submit, upload, wait
 from schemathesis.specs.openapi.checks import negative_data_rejection
 
-from service.http import tus
-from service.http.app import create_app
-from service.http.schemas import UUID_PATTERN
+from hsloc_service.http import tus
+from hsloc_service.http.app import create_app
+from hsloc_service.http.schemas import UUID_PATTERN
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

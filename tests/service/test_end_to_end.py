@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import upload, wait
+from live_service import upload, wait
 
 from hsloc.errors import MapError
-from service.settings import Settings
-from service.worker import linked_map
+from hsloc_service.execution.worker import linked_map
+from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable

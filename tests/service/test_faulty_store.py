@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import fsspec
 import pytest
-from conftest import settings, submit, wait
 from fastapi.testclient import TestClient
 from fsspec.implementations.memory import MemoryFileSystem
+from live_service import settings, submit, wait
 
-from service import patience
-from service.http import results_routes
-from service.http.app import create_app
-from service.waiting import Desk
+from hsloc_service.call_timeout import BoundedExecutor
+from hsloc_service.execution import retry as patience
+from hsloc_service.http import results_routes
+from hsloc_service.http.app import create_app
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -117,7 +117,7 @@ def wait_for_store(client: TestClient, job: str) -> None:
 
 
 def failures() -> float:
-    from service.http.metrics import REGISTRY
+    from hsloc_service.http.metrics import REGISTRY
 
     return REGISTRY.get_sample_value("hsloc_store_errors_total") or 0.0
 
@@ -195,7 +195,7 @@ def test_many_readers_wait_for_their_turn() -> None:
         return k
 
     async def all_at_once() -> list[int]:
-        desk = Desk(timeout_s=5.0, most=3)
+        desk = BoundedExecutor(timeout_s=5.0, most=3)
         return list(await asyncio.gather(*(desk.ask(functools.partial(read, k)) for k in range(30))))
 
     assert asyncio.run(all_at_once()) == list(range(30))

@@ -6,10 +6,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from conftest import settings, submit, wait
+from live_service import settings, submit, wait
 
-from service.housekeeping import Housekeeping
-from service.settings import SettingsError, from_environment, parse_size
+from hsloc_service.housekeeping import Housekeeping
+from hsloc_service.settings import SettingsError, from_environment, parse_size
 
 if TYPE_CHECKING:
     from collections.abc import Callable

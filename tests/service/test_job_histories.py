@@ -14,13 +14,13 @@ from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, multip
 from sqlalchemy import update
 from test_leases import Parts
 
-from service.errors import ServiceError
-from service.principal import ANYBODY
-from service.results import Asset
-from service.tables import JobRow
+from hsloc_service.auth import ANYBODY
+from hsloc_service.db.tables import JobRow
+from hsloc_service.errors import ServiceError
+from hsloc_service.results.store import Asset
 
 if TYPE_CHECKING:
-    from service.leases import Claim
+    from hsloc_service.jobs.leases import Claim
 
 GRAPH = {
     None: {"queued"},

@@ -8,7 +8,7 @@ import uuid
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import submit, upload, wait
+from live_service import submit, upload, wait
 
 if TYPE_CHECKING:
     from collections.abc import Callable

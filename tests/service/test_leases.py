@@ -6,15 +6,15 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import settings
+from live_service import settings
 
-from service.database import Database
-from service.files import Files
-from service.jobs import Jobs
-from service.leases import Leases
-from service.principal import ANYBODY, Principal
-from service.results import Asset
-from service.storage import Storage
+from hsloc_service.auth import ANYBODY, Principal
+from hsloc_service.db.database import Database
+from hsloc_service.jobs.leases import Leases
+from hsloc_service.jobs.repository import Jobs
+from hsloc_service.results.store import Asset
+from hsloc_service.storage import Storage
+from hsloc_service.uploads.repository import Files
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from conftest import upload
+from live_service import upload
 
-from service.settings import Settings
+from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from conftest import Live
+    from live_service import Live
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="THE PAGE IS NOT TESTED: playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")

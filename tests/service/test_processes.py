@@ -11,17 +11,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from conftest import free_port, submit, wait
+from live_service import free_port, submit, wait
 
-from service import supervisor
-from service.processes import marked
-from service.storage import Storage
+from hsloc_service.execution import supervisor
+from hsloc_service.execution.processes import marked
+from hsloc_service.storage import Storage
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from conftest import Live
     from fastapi.testclient import TestClient
+    from live_service import Live
 
 LIMITS: dict[str, Any] = {
     "job_memory_bytes": 1 << 29,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import httpx2 as httpx
 import pytest
-from conftest import Live, submit
+from live_service import Live, submit
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -11,15 +11,15 @@ import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from conftest import submit, upload, wait
+from live_service import submit, upload, wait
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from service.housekeeping import Housekeeping
-from service.principal import Tokens
-from service.results import Asset
-from service.settings import Settings
-from service.tables import AssetRow
+from hsloc_service.auth import Tokens
+from hsloc_service.db.tables import AssetRow
+from hsloc_service.housekeeping import Housekeeping
+from hsloc_service.results.store import Asset
+from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -262,7 +262,7 @@ def test_all_of_it_in_one_request(client: TestClient) -> None:
 
 
 def test_every_example_of_the_api_fits_it(client: TestClient) -> None:
-    from service.http.schemas import JobRequest
+    from hsloc_service.http.schemas import JobRequest
 
     schema = client.get("/openapi.json").json()["components"]["schemas"]["JobRequest"]
     assert len(schema["examples"]) >= 2

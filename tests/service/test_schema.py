@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from conftest import settings, wait
 from fastapi.testclient import TestClient
+from live_service import settings, wait
 from sqlalchemy import event
 
-from service import database, migrations
-from service.database import Database
-from service.files import need_quota
-from service.http.app import create_app
-from service.principal import ANYBODY
-from service.settings import SettingsError
-from service.tables import SCHEMA_VERSION
+from hsloc_service.auth import ANYBODY
+from hsloc_service.db import database, migrations
+from hsloc_service.db.database import Database
+from hsloc_service.db.tables import SCHEMA_VERSION
+from hsloc_service.http.app import create_app
+from hsloc_service.settings import SettingsError
+from hsloc_service.uploads.repository import need_quota
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

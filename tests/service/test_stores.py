@@ -12,30 +12,31 @@ from typing import TYPE_CHECKING, Any
 
 import fsspec
 import pytest
-from conftest import settings, submit, upload, wait
 from fastapi import HTTPException
 from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
+from live_service import settings, submit, upload, wait
 from sqlalchemy import select
 
-from service.errors import ServiceError
-from service.files import need_quota
-from service.housekeeping import Housekeeping
-from service.http.app import create_app
-from service.http.results_routes import parse_range
-from service.object_store import ObjectStore
-from service.principal import ANYBODY
-from service.results import BLOCK, Asset, FolderStore, ResultStore, Stores, collect
-from service.settings import SettingsError
-from service.storage import Storage
-from service.tables import AssetRow, JobRow
+from hsloc_service.auth import ANYBODY
+from hsloc_service.db.tables import AssetRow, JobRow
+from hsloc_service.errors import ServiceError
+from hsloc_service.housekeeping import Housekeeping
+from hsloc_service.http.app import create_app
+from hsloc_service.http.results_routes import parse_range
+from hsloc_service.results.object_store import ObjectStore
+from hsloc_service.results.store import BLOCK, Asset, FolderStore, ResultStore, collect
+from hsloc_service.results.stores import ResultStores
+from hsloc_service.settings import SettingsError
+from hsloc_service.storage import Storage
+from hsloc_service.uploads.repository import need_quota
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from conftest import Live
+    from live_service import Live
 
 KINDS = ("folder", "memory", "file")
 NAME = f"{uuid.UUID(int=1)}.1"
@@ -58,7 +59,7 @@ def client(make_client: Callable[..., TestClient], url: str) -> TestClient:
 @pytest.fixture
 def store(url: str, tmp_path: Path) -> Iterator[ResultStore]:
     storage = Storage(tmp_path / "data")
-    yield Stores(storage, settings(tmp_path, results_url=url)).current
+    yield ResultStores(storage, settings(tmp_path, results_url=url)).current
     storage.close()
 
 
@@ -358,7 +359,7 @@ def test_ranges_mean_what_the_standard_says(first: int, last: int, size: int) ->
 
 def test_the_folder_is_the_default(tmp_path: Path) -> None:
     storage = Storage(tmp_path / "data")
-    assert isinstance(Stores(storage, settings(tmp_path)).current, FolderStore)
+    assert isinstance(ResultStores(storage, settings(tmp_path)).current, FolderStore)
     storage.close()
 
 

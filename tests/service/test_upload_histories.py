@@ -10,15 +10,15 @@ import time
 from pathlib import Path
 from typing import Any
 
-from conftest import settings as service_settings
 from fastapi.testclient import TestClient
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, rule
+from live_service import settings as service_settings
 from test_uploads import TUS, append, begin
 
-from service.housekeeping import Housekeeping
-from service.http.app import create_app
+from hsloc_service.housekeeping import Housekeeping
+from hsloc_service.http.app import create_app
 
 TTL = 1000.0
 

@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any
 
 import httpx2 as httpx
 import pytest
-from conftest import upload
+from live_service import upload
 
-from service.dispatcher import sweep
-from service.files import Files
+from hsloc_service.execution.dispatcher import sweep
+from hsloc_service.uploads.repository import Files
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from conftest import Live
     from fastapi.testclient import TestClient
+    from live_service import Live
 
 TUS = {"Tus-Resumable": "1.0.0"}
 PATCH = {**TUS, "Content-Type": "application/offset+octet-stream"}
@@ -234,7 +234,7 @@ def test_bytes_beyond_the_offset_do_not_count(client: TestClient) -> None:
 
 
 def test_an_unfinished_upload_expires(make_client: Callable[..., TestClient]) -> None:
-    from service.housekeeping import Housekeeping
+    from hsloc_service.housekeeping import Housekeeping
 
     client = make_client(upload_ttl_s=10.0)
     path, whole = begin(client, 10), upload(client)

@@ -16,11 +16,11 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from conftest import settings, submit, wait
+from live_service import settings, submit, wait
 
-from service import webhooks
-from service.database import Database
-from service.tables import DeliveryRow
+from hsloc_service import webhooks
+from hsloc_service.db.database import Database
+from hsloc_service.db.tables import DeliveryRow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -186,7 +186,7 @@ def test_a_tenant_with_many_webhooks_does_not_hold_up_another(tmp_path: Path, mo
         raise TimeoutError
 
     monkeypatch.setattr(webhooks, "post", dead)
-    deliverer = webhooks.Deliverer(database, settings(tmp_path))
+    deliverer = webhooks.WebhookSender(database, settings(tmp_path))
     while deliverer.deliver_next():
         assert len(order) <= 22
     database.close()

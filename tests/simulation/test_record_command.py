@@ -10,7 +10,7 @@ import pytest
 
 from hsloc.cli import record as command
 from hsloc.errors import HslocError
-from hsloc.log.reader import open_log
+from hsloc.log import open_log
 from hsloc.simulation.scenario import Scenario
 
 

@@ -13,7 +13,7 @@ import pytest
 from mcap.reader import make_reader
 
 from hsloc.errors import OutputError
-from hsloc.log.reader import open_log
+from hsloc.log import open_log
 from hsloc.model import Odometry, Pose2, Scan, Truth
 from hsloc.simulation.built_in import built_in
 from hsloc.simulation.presets import SCENARIOS

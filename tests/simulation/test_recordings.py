@@ -15,7 +15,7 @@ import zstandard
 from mcap.reader import make_reader
 
 from hsloc.cli import record as command
-from hsloc.log.reader import open_log
+from hsloc.log import open_log
 from hsloc.model import Odometry, Scan, Truth
 from hsloc.simulation.built_in import built_in
 

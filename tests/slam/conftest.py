@@ -2,36 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
-
-from hsloc.model import PairedScan, Trajectory, Truth
-from hsloc.replay.engine import pair
-from hsloc.simulation.presets import preset
-from hsloc.simulation.simulator import events
-from hsloc.simulation.world_files import load_world
-
-
-def drive(scenario, **changes):
-    """Events of a drive as the mapper gets them, and the truth."""
-    setting = replace(preset(scenario), **changes)
-    told = list(pair(events(setting, load_world(setting.world, None))))
-    truth = Trajectory.from_pairs([(event.stamp_ns, event.T_map_base) for event in told if isinstance(event, Truth)])
-    return [event for event in told if not isinstance(event, Truth)], truth
-
-
-def ape_rmse(events, poses, truth):
-    """RMSE (m) of the poses at the scans, after rotation and translation."""
-    stamps = np.array([event.scan.stamp_ns for event in events if isinstance(event, PairedScan)])
-    known = (stamps >= truth.stamps_ns[0]) & (stamps <= truth.stamps_ns[-1])
-    ours, theirs = poses[known, :2], truth.interpolated(stamps[known])[:, :2]
-    a, b = ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)
-    h = a.T @ b
-    theta = np.arctan2(h[0, 1] - h[1, 0], h[0, 0] + h[1, 1])
-    c, s = np.cos(theta), np.sin(theta)
-    return float(np.sqrt(((a @ np.array(((c, s), (-s, c))) - b) ** 2).sum(axis=1).mean()))
+from drives import drive
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ def wall(length=3.0, y=0.0):
 
 def test_it_scores_as_a_field_of_the_same_points_does():
     drawn = LocalMap(0.05, 0.2, 0.6)
-    drawn.draw(wall(), known=2.0)
+    drawn.draw(wall(), saturation_score=2.0)
     whole = LikelihoodField.from_points(wall(), 0.2, 0.05, 0.7, 0.6)
     near = np.random.default_rng(0).uniform((0.0, -0.4), (3.0, 0.4), (200, 2))
     for point in near:
@@ -25,8 +25,8 @@ def test_growing_changes_nothing_that_was_drawn():
     grown, whole = LocalMap(0.05, 0.2, 0.6), LocalMap(0.05, 0.2, 0.6)
     parts = [wall(), wall(y=7.0) + np.array((5.0, 0.0)), wall(y=-9.0) - np.array((20.0, 0.0))]
     for part in parts:
-        grown.draw(part, known=2.0)
-    whole.draw(np.concatenate(parts), known=2.0)
+        grown.draw(part, saturation_score=2.0)
+    whole.draw(np.concatenate(parts), saturation_score=2.0)
     points = np.random.default_rng(1).uniform((-25, -12), (12, 10), (4000, 2))
     points = np.concatenate((points, np.concatenate(parts) + 0.03))
     for pose in (IDENTITY, Pose2(0.1, -0.2, 0.01)):
@@ -36,8 +36,8 @@ def test_growing_changes_nothing_that_was_drawn():
 
 def test_drawing_again_draws_nothing():
     drawn = LocalMap(0.05, 0.2, 0.6)
-    assert drawn.draw(wall(), known=2.0) == 60
+    assert drawn.draw(wall(), saturation_score=2.0) == 60
     before = drawn.scores.copy()
-    assert drawn.draw(wall(), known=0.8) == 0
+    assert drawn.draw(wall(), saturation_score=0.8) == 0
     assert drawn.draw(np.zeros((0, 2))) == 0
     np.testing.assert_array_equal(drawn.scores, before)

@@ -7,7 +7,8 @@ import pytest
 
 from hsloc.evaluation.relations import evaluate_relations, read_relations
 from hsloc.model import Odometry, PairedScan, Pose2, Scan, Trajectory
-from hsloc.slam.mapper import GraphMapperParameters, Mapper
+from hsloc.slam.mapper import Mapper
+from hsloc.slam.parameters import GraphMapperParameters
 
 pytestmark = pytest.mark.data
 

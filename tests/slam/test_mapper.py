@@ -4,10 +4,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from conftest import ape_rmse, drive
+from drives import ape_rmse, drive
 
 from hsloc.model import IDENTITY, Odometry, PairedScan, Pose2, Scan, Status
-from hsloc.slam.mapper import GraphMapperParameters, Mapper
+from hsloc.slam.mapper import Mapper
+from hsloc.slam.parameters import GraphMapperParameters
 
 
 def mapped(events, parameters=None, seed=0):

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import drive
+from drives import drive
 
 from hsloc.errors import ConfigError
 from hsloc.matching.hide import Hide
@@ -79,7 +79,7 @@ def test_the_reports_experiment_is_bettered():
     assert 330 < len(mapper.points) < 420
 
 
-@pytest.mark.parametrize("wrong", [{"sigma": 0.0}, {"reach": 1.0}, {"min_points": 0}])
+@pytest.mark.parametrize("wrong", [{"sigma": 0.0}, {"max_distance": 1.0}, {"min_points": 0}])
 def test_parameters_out_of_range_are_named(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         PointMapperParameters(**wrong)

@@ -4,7 +4,7 @@ import pytest
 from hsloc.errors import LogFormatError, OutputError
 from hsloc.model.pose2 import compose_poses, relative_poses
 from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
-from hsloc.slam.sparse import BlockSystem
+from hsloc.slam.sparse_solver import BlockSystem
 
 TIGHT = np.diag((1e4, 1e4, 1e5))
 
@@ -48,7 +48,7 @@ def test_a_loop_takes_the_drift_out():
     steps = edges_of(true, [(k, k + 1) for k in range(39)])
     steps.measured[:] += np.random.default_rng(1).normal(0, (0.02, 0.02, 0.01), steps.measured.shape)
     drifted = dead_reckoned(true, steps)
-    closed = solve_edges(drifted, Edges.joined([steps, edges_of(true, [(39, 0), (30, 2), (20, 5)])]))
+    closed = solve_edges(drifted, Edges.concatenate([steps, edges_of(true, [(39, 0), (30, 2), (20, 5)])]))
     before, after = (np.hypot(*(poses - true)[:, :2].T).max() for poses in (drifted, closed))
     assert before > 0.3
     assert after < 0.4 * before
@@ -61,7 +61,7 @@ def test_a_wrong_loop_with_a_robust_weight_is_harmless():
     right = edges_of(true, [(39, 0), (30, 1)], scale=1.0)
     wrong = edges_of(true, [(35, 10)], scale=1.0)
     wrong.measured[:] += (2.0, -1.0, 0.4)
-    poses = solve_edges(dead_reckoned(true, steps), Edges.joined([steps, right, wrong]))
+    poses = solve_edges(dead_reckoned(true, steps), Edges.concatenate([steps, right, wrong]))
     assert np.hypot(*(poses - true)[:, :2].T).max() < 0.05
     _, _, chi = edge_errors(poses, wrong)
     assert chi[0] > 50.0

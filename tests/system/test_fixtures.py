@@ -16,16 +16,17 @@ import numpy as np
 import pytest
 
 from hsloc.evaluation import evaluate, read_tum
+from hsloc.export.results_folder import write_results
 from hsloc.model import Status, wrap_angles
-from hsloc.replay.results import write_results
-from hsloc.replay.run import Result, RunSpec, run
+from hsloc.replay.run import Result, run
+from hsloc.request import RunRequest
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 
 
 @cache
 def result(name: str, seed: int = 0, unknown_start: bool = False) -> Result:
-    return run(RunSpec(logs=(RECORDINGS / f"{name}.mcap",), seed=seed, unknown_start=unknown_start))
+    return run(RunRequest(logs=(RECORDINGS / f"{name}.mcap",), seed=seed, unknown_start=unknown_start))
 
 
 def errors(found: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -120,8 +121,7 @@ def test_the_files_say_what_the_result_says(tmp_path):
 
 def test_the_recording_of_a_run_is_itself_a_log(tmp_path):
     """run.mcap reads back: the map, the scans and the odometry are those of the log, map -> base is the trajectory."""
-    from hsloc.log.reader import open_log
-    from hsloc.log.summary import ReadOptions
+    from hsloc.log import ReadOptions, open_log
     from hsloc.model import Scan, Truth
 
     found = result("kidnapped")

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from hsloc.log.summary import ReadOptions
-from hsloc.replay.results import metrics, write_recording
-from hsloc.replay.run import RunSpec, run
+from hsloc.export.results_folder import metrics, write_recording
+from hsloc.log import ReadOptions
+from hsloc.replay.run import run
+from hsloc.request import RunRequest
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,7 +21,7 @@ pytestmark = pytest.mark.data
 @pytest.mark.parametrize("name", ["robotdata1", "robotdata3"])
 def test_wean_hall_from_an_unknown_start(data: Path, name):
     folder = data / "wean"
-    found = run(RunSpec(logs=(folder / f"{name}.log.gz",), map_path=folder / "wean.yaml"))
+    found = run(RunRequest(logs=(folder / f"{name}.log.gz",), map_path=folder / "wean.yaml"))
     reference = np.loadtxt(folder / f"{name}.pf.ref.txt")
     poses = found.trajectory.interpolated(np.round(reference[:, 0] * 1e9).astype(np.int64))
     metres = np.hypot(poses[:, 0] - reference[:, 1], poses[:, 1] - reference[:, 2])
@@ -32,7 +33,7 @@ def test_wean_hall_from_an_unknown_start(data: Path, name):
 @pytest.mark.parametrize("log", ["mcap_zstd/mcap_zstd.mcap", "macfirst_floor_take_2/macfirst_floor_take_2_0.db3"])
 def test_turtlebot_from_an_unknown_start(data: Path, tmp_path, log):
     folder = data / "turtlebot4"
-    spec = RunSpec(
+    spec = RunRequest(
         logs=(folder / log,), map_path=folder / "mac_1st_floor_final.yaml", read=ReadOptions(), unknown_start=True
     )
     found = run(spec)

@@ -9,10 +9,11 @@ import pytest
 
 from hsloc.errors import ConfigError, HslocError, MapError
 from hsloc.evaluation.metrics import compare
-from hsloc.log.summary import ReadOptions
+from hsloc.export.results_folder import write_results
+from hsloc.log import ReadOptions
 from hsloc.model.pose2 import compose_poses, wrap_angles
-from hsloc.replay.results import write_results
-from hsloc.replay.run import RunSpec, run
+from hsloc.replay.run import run
+from hsloc.request import RunRequest
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 OFFICE = RECORDINGS / "office.mcap"
@@ -22,14 +23,14 @@ OFFICE = RECORDINGS / "office.mcap"
 def first(tmp_path_factory):
     """The first minute of the office: the result, and its folder."""
     folder = tmp_path_factory.mktemp("first") / "out"
-    found = run(RunSpec(logs=(OFFICE,), mode="slam", read=ReadOptions(end_s=60.0)))
+    found = run(RunRequest(logs=(OFFICE,), mode="slam", read=ReadOptions(end_s=60.0)))
     write_results(found, folder)
     return found, folder
 
 
 @pytest.fixture(scope="module")
 def second(first):
-    return run(RunSpec(logs=(OFFICE,), resume=first[1], read=ReadOptions(start_s=55.0)))
+    return run(RunRequest(logs=(OFFICE,), resume=first[1], read=ReadOptions(start_s=55.0)))
 
 
 def errors_in_frame_of(first, found):
@@ -56,7 +57,7 @@ def test_the_second_part_is_right_in_the_frame_of_the_first(first, second, tmp_p
     assert second.grid.free().sum() > first[0].grid.free().sum() + 5000, "25 square metres that were not seen before"
     # And what was extended can be extended again.
     third = run(
-        RunSpec(logs=(OFFICE,), resume=tmp_path / "out" / "map.npz", read=ReadOptions(start_s=20.0, end_s=35.0))
+        RunRequest(logs=(OFFICE,), resume=tmp_path / "out" / "map.npz", read=ReadOptions(start_s=20.0, end_s=35.0))
     )
     errors = errors_in_frame_of(first[0], third)
     assert np.sqrt((errors**2).mean()) < 0.05
@@ -70,7 +71,7 @@ def test_the_old_map_stays_where_it_was(first, second):
 
 
 def test_the_same_inputs_give_the_same_bytes(first, second, tmp_path):
-    again = run(RunSpec(logs=(OFFICE,), resume=first[1] / "map.npz", read=ReadOptions(start_s=55.0)))
+    again = run(RunRequest(logs=(OFFICE,), resume=first[1] / "map.npz", read=ReadOptions(start_s=55.0)))
     write_results(again, tmp_path / "again")
     write_results(second, tmp_path / "second")
     for name in ("map.npz", "map.pgm", "graph.g2o", "trajectory.tum"):
@@ -79,7 +80,7 @@ def test_the_same_inputs_give_the_same_bytes(first, second, tmp_path):
 
 def test_a_log_of_another_building_is_not_joined(first):
     with pytest.raises(MapError, match="no place of the log was recognised") as error:
-        run(RunSpec(logs=(RECORDINGS / "corridor_loop.mcap",), resume=first[1], read=ReadOptions(end_s=40.0)))
+        run(RunRequest(logs=(RECORDINGS / "corridor_loop.mcap",), resume=first[1], read=ReadOptions(end_s=40.0)))
     assert "\n" not in str(error.value)
 
 
@@ -87,7 +88,7 @@ def test_all_forms_of_a_map_can_be_localised_in(first):
     _, folder = first
     stamps = ReadOptions(start_s=5.0, end_s=25.0)
     found = [
-        run(RunSpec(logs=(OFFICE,), map_path=path, unknown_start=True, read=stamps))
+        run(RunRequest(logs=(OFFICE,), map_path=path, unknown_start=True, read=stamps))
         for path in (folder, folder / "map.yaml", folder / "map.npz")
     ]
     for result in found:
@@ -104,8 +105,8 @@ def test_mistakes_are_told(first, tmp_path):
         ({"map_path": tmp_path}, "without a map.yaml"),
     ):
         with pytest.raises(HslocError, match=said):
-            run(RunSpec(logs=(OFFICE,), **wrong))
+            run(RunRequest(logs=(OFFICE,), **wrong))
     with pytest.raises(ConfigError, match="leave out one"):
-        RunSpec(logs=(OFFICE,), resume=folder, map_path=folder)
+        RunRequest(logs=(OFFICE,), resume=folder, map_path=folder)
     with pytest.raises(ConfigError, match="leave out one"):
-        RunSpec(logs=(OFFICE,), resume=folder, mode="localise")
+        RunRequest(logs=(OFFICE,), resume=folder, mode="localise")

@@ -10,13 +10,12 @@ import pytest
 from hsloc.cli.main import main
 from hsloc.evaluation import evaluate, evaluate_relations, read_relations
 from hsloc.evaluation.alignment import umeyama
-from hsloc.log.reader import open_log
-from hsloc.log.summary import ReadOptions
-from hsloc.log.writer import LogWriter
+from hsloc.export.results_folder import write_results
+from hsloc.log import LogWriter, ReadOptions, open_log
 from hsloc.maps import load_map
 from hsloc.model import Scan
-from hsloc.replay.results import write_results
-from hsloc.replay.run import RunSpec, run
+from hsloc.replay.run import run
+from hsloc.request import RunRequest
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 
@@ -27,7 +26,7 @@ def ape(found):
 
 @pytest.mark.parametrize("name", ["office", "corridor_loop"])
 def test_a_map_is_drawn_and_the_way_is_right(tmp_path, name):
-    found = run(RunSpec(logs=(RECORDINGS / f"{name}.mcap",), mode="slam"))
+    found = run(RunRequest(logs=(RECORDINGS / f"{name}.mcap",), mode="slam"))
     assert ape(found).rmse < 0.03
     values = write_results(found, tmp_path / "out")
     assert values["run"]["mode"] == "slam"
@@ -38,16 +37,16 @@ def test_a_map_is_drawn_and_the_way_is_right(tmp_path, name):
 
 
 def test_a_drawn_map_is_a_map_to_localise_in(tmp_path):
-    drawn = run(RunSpec(logs=(RECORDINGS / "office.mcap",), mode="slam"))
+    drawn = run(RunRequest(logs=(RECORDINGS / "office.mcap",), mode="slam"))
     write_results(drawn, tmp_path / "out")
-    spec = RunSpec(logs=(RECORDINGS / "office.mcap",), map_path=tmp_path / "out" / "map.yaml", unknown_start=True)
+    spec = RunRequest(logs=(RECORDINGS / "office.mcap",), map_path=tmp_path / "out" / "map.yaml", unknown_start=True)
     found = run(spec)
     assert ape(found).rmse < 0.03
     assert found.localised.all()
 
 
 def test_without_odometry_the_scans_alone_must_do():
-    found = run(RunSpec(logs=(RECORDINGS / "office.mcap",), mode="slam", no_odometry=True))
+    found = run(RunRequest(logs=(RECORDINGS / "office.mcap",), mode="slam", no_odometry=True))
     assert len(found.odometry) == 0
     assert len(found.trajectory) == len(found.diagnostics)
     assert ape(found).rmse < 0.03
@@ -71,7 +70,7 @@ def test_a_log_that_has_no_odometry_at_all_is_mapped_and_written(tmp_path, capsy
 @pytest.mark.data
 def test_intel_is_mapped_as_well_as_by_the_best(data: Path):
     folder = data / "intel"
-    found = run(RunSpec(logs=(folder / "intel.clf.gz",)))
+    found = run(RunRequest(logs=(folder / "intel.clf.gz",)))
     result = evaluate_relations(found.trajectory, read_relations(folder / "intel.relations"))
     assert result.matched == 2984
     assert result.statistics.trans_part.mean <= 0.033
@@ -81,7 +80,7 @@ def test_intel_is_mapped_as_well_as_by_the_best(data: Path):
 @pytest.mark.data
 def test_aces_closes_its_loop(data: Path):
     folder = data / "aces"
-    found = run(RunSpec(logs=(folder / "aces.clf.gz",)))
+    found = run(RunRequest(logs=(folder / "aces.clf.gz",)))
     reference = np.loadtxt(folder / "aces.rbpf.txt")
     poses = found.trajectory.interpolated(np.round(reference[:, 0] * 1e9).astype(np.int64))
     moved = umeyama(reference[:, 1:3], poses[:, :2]) @ poses[:, :2]

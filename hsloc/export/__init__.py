@@ -1,0 +1,1 @@
+"""Results on disk: folder, run.mcap, provenance."""

@@ -1,0 +1,135 @@
+"""ROS 1 bags, and ROS 2 bags in SQLite, by way of rosbags."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+from hsloc.errors import HslocError, LogFormatError
+from hsloc.log.container import Channel, RawMessage, in_runs
+from hsloc.log.messages.definitions import long_name
+from hsloc.log.summary import Losses, TopicStatistics
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator
+    from pathlib import Path
+
+    class _Reader(Protocol):
+        connections: list[Any]
+        message_count: int
+
+        def __enter__(self) -> _Reader: ...
+        def __exit__(self, *error: object) -> object: ...
+        def messages(self, connections: Collection[Any]) -> Iterator[tuple[Any, int, bytes]]: ...
+
+
+_RUN = 1024
+"""Messages in one run."""
+
+
+class BagContainer:
+    """A `.bag`, a `.db3`, or a folder with `metadata.yaml` and compressed SQLite files.
+
+    The decoders get the definitions that the bag carries, as with MCAP; rosbags is asked for raw messages alone.
+    Raises LogFormatError, whatever rosbags, its databases and its decompressors raise.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.is_ros1 = path.suffix == ".bag"
+        self.format = "ROS 1 bag" if self.is_ros1 else "ROS 2 bag (SQLite)"
+        self.profile = "ros1" if self.is_ros1 else "ros2"
+        self.channels: dict[int, Channel] = {}
+        self.statistics: dict[int, TopicStatistics] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.losses_at_opening = Losses()
+        self.warnings: list[str] = []
+        with self._guarded(), self._reader() as reader:
+            for number, connection in enumerate(reader.connections):
+                self.channels[number] = self._channel(number, connection)
+            self._count(reader)
+
+    def runs(self, wanted: Collection[int], losses: Losses) -> Iterator[list[RawMessage]]:
+        """As `Container.runs`."""
+        return in_runs(self.messages(wanted, losses), _RUN)
+
+    def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
+        """As `Container.messages`; rosbags yields in the order of time."""
+        chosen = set(wanted)
+        with self._guarded(losses), self._reader() as reader:
+            numbers = self._numbers(reader)
+            connections = [c for c in reader.connections if numbers[self._key(c)] in chosen]
+            if not connections:
+                return
+            for position, (connection, log_time, data) in enumerate(reader.messages(connections)):
+                number = numbers[self._key(connection)]
+                if number in chosen:  # A damaged bag yields messages of connections that were not asked for.
+                    yield max(log_time, 0), position, number, data
+
+    def verify(self) -> Losses:
+        """Read everything and count what is damaged."""
+        losses = self.losses_at_opening.copy()
+        for _ in self.messages(self.channels, losses):
+            pass
+        return losses
+
+    def _reader(self) -> _Reader:
+        if self.is_ros1:
+            from rosbags.rosbag1 import Reader as Reader1
+
+            return cast("_Reader", Reader1(self.path))
+        from rosbags.rosbag2 import Reader as Reader2
+
+        return cast("_Reader", Reader2(self.path))
+
+    @staticmethod
+    def _key(connection: Any) -> tuple[int, int]:
+        # Connections are not hashable for both formats; ids alone repeat between the files of a folder.
+        return connection.id, id(connection.owner)
+
+    def _numbers(self, reader: _Reader) -> dict[tuple[int, int], int]:
+        return {self._key(connection): number for number, connection in enumerate(reader.connections)}
+
+    def _channel(self, number: int, connection: Any) -> Channel:
+        encoding = "ros1" if self.is_ros1 else "cdr"
+        definition = connection.msgdef
+        form = {0: "", 1: "ros1msg" if self.is_ros1 else "ros2msg", 2: "ros2idl"}[definition.format.value]
+        topic, typename = str(connection.topic), long_name(str(connection.msgtype))
+        return Channel(number, topic, typename, encoding, form, definition.data.encode())
+
+    def _count(self, reader: _Reader) -> None:
+        numbers = self._numbers(reader)
+        damage = Losses()
+        with self._guarded(damage):
+            for connection, log_time, _ in reader.messages(reader.connections):
+                number = numbers[self._key(connection)]
+                self.statistics.setdefault(number, TopicStatistics()).add(log_time, log_time, 1, 0)
+        # What is damaged further on is counted when it is read for its own sake.
+        if damage.reasons and not self.statistics:
+            raise LogFormatError(damage.reasons[0])
+        counted, promised = sum(item.count for item in self.statistics.values()), reader.message_count
+        if not damage.reasons and counted < promised:
+            self.losses_at_opening.truncated_files += 1
+            self.losses_at_opening.note(f"{self.path}: holds {counted} messages of {promised} that it speaks of")
+
+    @contextmanager
+    def _guarded(self, losses: Losses | None = None) -> Iterator[None]:
+        """One error for all that rosbags and what it stands on may raise.
+
+        Damage in the middle of reading is a loss, and what came before it stands; at opening it is an error.
+        """
+        try:
+            yield
+        except (HslocError, GeneratorExit):
+            raise
+        except Exception as error:
+            reason = (str(error).splitlines() or [""])[0][:160]
+            remedy = "rosbag reindex" if self.is_ros1 else f"sqlite3 {self.path.name} .recover"
+            line = (
+                f"{self.path}: cannot be read as a {self.format} ({reason}); if its recorder was stopped hard, "
+                f"`{remedy}` saves what is whole"
+            )
+            if losses is None:
+                raise LogFormatError(line) from error
+            losses.truncated_files += 1
+            losses.note(line)

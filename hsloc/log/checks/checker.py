@@ -1,0 +1,153 @@
+"""The validator: what is wrong with a recording, before it is blamed on an algorithm.
+
+The list is that of cartographer_rosbag_validate, with what users of 2D lidars ask for besides. One pass, in the order
+of the log, with a memory that does not grow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from hsloc.log.checks.findings import NANOSECONDS, Finding, Findings, Intervals, Severity
+from hsloc.log.checks.topics import OdometryCheck, ScanCheck, TopicCheck
+from hsloc.log.checks.transforms import TransformCheck
+from hsloc.log.messages.decode import OdometryMessage, ScanMessage
+from hsloc.log.session.event_builders import MAP_FRAME
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hsloc.log.reader import Log
+    from hsloc.log.summary import LogSummary, Losses
+
+
+@dataclass(frozen=True, slots=True)
+class CheckReport:
+    """All findings, the worst first; intervals between messages by topic; how many messages were looked at."""
+
+    findings: tuple[Finding, ...]
+    intervals: dict[str, Intervals]
+    messages: int
+    losses: Losses
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether results from this log are not to be trusted."""
+        return any(finding.severity is Severity.ERROR for finding in self.findings)
+
+
+def check_log(log: Log, progress: Callable[[int], None] | None = None) -> CheckReport:
+    """Read all scans, odometry and transforms of a log once, and everything else for damage.
+
+    `progress` is called with the log time (ns) every few thousand messages. Raises LogError where the log vanishes.
+    """
+    findings = Findings()
+    topics: dict[tuple[str, type], TopicCheck] = {}
+    transforms = TransformCheck(findings)
+    count = 0
+    for topic, log_time, message in log.observations():
+        count += 1
+        if isinstance(message, list):
+            for link in message:
+                transforms.add(topic, link, log_time)
+        else:
+            key = (topic, type(message))
+            if key not in topics:
+                topics[key] = _SCAN_OR_ODOMETRY[type(message)](topic, findings)
+            topics[key].add(message, log_time)
+        if progress is not None and count % 4096 == 0:
+            progress(log_time)
+    losses = log.losses.copy()
+    for check in topics.values():
+        check.finish()
+    scans = [check for check in topics.values() if isinstance(check, ScanCheck)]
+    odometry = [check for check in topics.values() if isinstance(check, OdometryCheck)]
+    _check_frames(scans, findings)
+    _check_coverage(scans, odometry, log.summary, findings)
+    for check in odometry:
+        if check.frame != MAP_FRAME:
+            transforms.compare_odometry(check.topic, check.frame, check.child)
+    _check_summary(log.summary, bool(scans), findings)
+    _check_damage(log, losses, findings)
+    intervals = {f"{check.topic} {check.what}": check.intervals for check in topics.values()}
+    return CheckReport(tuple(findings.sorted()), intervals, count, losses)
+
+
+_SCAN_OR_ODOMETRY: dict[type, type[TopicCheck]] = {ScanMessage: ScanCheck, OdometryMessage: OdometryCheck}
+
+
+def _check_frames(scans: list[ScanCheck], findings: Findings) -> None:
+    by_frame: dict[str, list[str]] = {}
+    for check in scans:
+        by_frame.setdefault(check.frame or "", []).append(check.topic)
+    for frame, topics in by_frame.items():
+        if len(topics) > 1:
+            findings.add(
+                Severity.WARNING, "frame_shared", ", ".join(topics), f"scan topics share the frame {frame!r}",
+                "give each laser its own frame; choose one with --scan-topic if they are the same laser",
+            )  # fmt: skip
+
+
+def _check_coverage(
+    scans: list[ScanCheck], odometry: list[OdometryCheck], summary: LogSummary, findings: Findings
+) -> None:
+    """Scans before the first odometry or after the last have to do without."""
+    chosen = next((check for check in odometry if check.topic == summary.odom_topic), None)
+    if chosen is None or chosen.first_ns is None or chosen.last_ns is None:
+        return
+    for check in scans:
+        if check.first_ns is None or check.last_ns is None:
+            continue
+        early, late = chosen.first_ns - check.first_ns, check.last_ns - chosen.last_ns
+        if max(early, late) > NANOSECONDS // 2:
+            findings.add(
+                Severity.WARNING, "odometry_short", check.topic,
+                f"scans begin {max(early, 0) / NANOSECONDS:.2f} s before {chosen.topic} and end "
+                f"{max(late, 0) / NANOSECONDS:.2f} s after it",
+                "cut the log with --start and --end to where it has both",
+            )  # fmt: skip
+
+
+def _check_summary(summary: LogSummary, has_scans: bool, findings: Findings) -> None:
+    """What was missing or had to be assumed when the log was opened."""
+    if not has_scans:
+        findings.add(
+            Severity.ERROR, "no_scan", "", "no scans (sensor_msgs/msg/LaserScan)",
+            "record the laser's topic; `hsloc info` lists what there is",
+        )  # fmt: skip
+    elif summary.scan_topic is None:
+        findings.add(
+            Severity.WARNING, "scan_ambiguous", "", "several scan topics", "choose with --scan-topic, or name them all"
+        )
+    if summary.odom_topic is None:
+        findings.add(
+            Severity.WARNING, "no_odometry", "", "no odometry on a topic of its own or in /tf that would be chosen",
+            "choose with --odom-topic, or map without it: --no-odom",
+        )  # fmt: skip
+    for laser in summary.lasers:
+        if laser.extrinsics == "identity":
+            findings.add(
+                Severity.WARNING, "no_extrinsic", laser.topic,
+                f"no transform from {summary.base_frame or 'the base'} to {laser.frame or 'the laser'}",
+                "record /tf_static, or give --laser-pose x,y,yaw",
+            )  # fmt: skip
+    told = ("no scan topic", "scan topics (", "no odometry topic", "no transform from")
+    for number, warning in enumerate(summary.warnings):
+        if not any(part in warning for part in told):
+            findings.add(Severity.WARNING, f"opening_{number}", "", warning, "see `hsloc info`")
+
+
+def _check_damage(log: Log, losses: Losses, findings: Findings) -> None:
+    """What could not be read: of the topics above, and, chunk by chunk, of everything."""
+    everything = log.verify()
+    for name in ("damaged_chunks", "unknown_compression", "bytes_lost", "truncated_files"):
+        setattr(losses, name, getattr(everything, name))
+    for reason in everything.reasons:
+        losses.note(reason)
+    if losses.data_lost:
+        first = f" ({losses.reasons[0]})" if losses.reasons else ""
+        findings.add(
+            Severity.DAMAGE, "damage", "", "; ".join(losses.lines()) + first,
+            "what is whole is used; `hsloc convert` writes it into a sound file",
+        )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Message payloads: definitions, decoding, encoding."""

@@ -1,0 +1,117 @@
+"""Poses in columns: messages of one topic that are laid out alike, decoded together.
+
+Odometry is most of a log's messages, and one topic's messages differ in nothing but their numbers: the same names, the
+same length, every number at the same place. So the numbers of many messages are taken out at once. What comes out
+is, to the last bit, what `hsloc.log.messages.decode` makes of them one by one, and where messages are not alike it has
+the word.
+"""
+
+from __future__ import annotations
+
+from math import atan2
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+
+from hsloc.log.messages import decode, definitions
+from hsloc.log.messages.decode import NANOSECONDS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from hsloc.log.messages.decode import Payload
+
+    class ColumnDecoder(Protocol):
+        """Many messages' poses; None where they are to be decoded one by one."""
+
+        def __call__(self, payloads: Sequence[Payload], *, covariances: bool) -> PoseColumns | None:
+            """Covariances are None where they are not asked for."""
+            ...
+
+
+_STAMP = slice(4, 12)
+"""Where the stamp is, the one field before the pose that differs from message to message."""
+
+
+class PoseColumns(NamedTuple):
+    """n messages with poses: stamps in nanoseconds (n,), x, y (metres) and theta (radians), n covariances.
+
+    A covariance is 3 x 3 over (x, y, theta), or None where a message states none.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    theta: list[float]
+    covariances: Sequence[NDArray[np.float64] | None]
+
+
+def odometry(payloads: Sequence[Payload], *, covariances: bool = True) -> PoseColumns | None:
+    """nav_msgs/Odometry from CDR; None where the messages are not laid out alike. Covariances are read if asked for."""
+    found = _rows(payloads, decode.odometry_pose_at, {"pose": "7<f8", "covariance": "36<f8"})
+    if found is None:
+        return None
+    return _poses(found, _covariances(found["covariance"]) if covariances else (None,) * len(found))
+
+
+def pose_stamped(payloads: Sequence[Payload], *, covariances: bool = False) -> PoseColumns | None:
+    """geometry_msgs/PoseStamped or PoseWithCovarianceStamped from CDR; None where they are not laid out alike."""
+    del covariances  # not read one by one either
+    found = _rows(payloads, decode.stamped_pose_at, {"pose": "7<f8"})
+    return None if found is None else _poses(found, (None,) * len(found))
+
+
+def _rows(
+    payloads: Sequence[Payload], pose_at: Callable[[Payload], int], fields: dict[str, str]
+) -> NDArray[np.void] | None:
+    """The stamps of the messages, and the fields from the pose on; None where the messages are not laid out alike."""
+    length = len(payloads[0])
+    try:
+        at = pose_at(payloads[0])
+    except decode.BAD_PAYLOAD:
+        return None
+    formats = ["<i4", "<u4", *fields.values()]
+    offsets = [4, 8, at, at + decode.POSE_BYTES][: len(formats)]
+    if offsets[-1] + np.dtype(formats[-1]).itemsize > length or set(map(len, payloads)) != {length}:
+        return None
+    joined = b"".join(payloads)
+    head = np.frombuffer(joined, np.uint8).reshape(len(payloads), length)[:, :at]
+    alike = head == head[0]
+    alike[:, _STAMP] = True
+    if not alike.all():
+        return None
+    names = ["seconds", "nanoseconds", *fields]
+    layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": length})
+    return np.frombuffer(joined, layout)
+
+
+def _poses(rows: NDArray[np.void], covariances: Sequence[NDArray[np.float64] | None]) -> PoseColumns:
+    x, y, _, qx, qy, qz, qw = np.ascontiguousarray(rows["pose"].T)
+    with np.errstate(all="ignore"):  # Damaged numbers overflow; the feed refuses them.
+        sines, cosines = 2.0 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz
+    # Not numpy's arctan2, whose last bit depends on the processor.
+    theta = list(map(atan2, sines.tolist(), cosines.tolist()))
+    stamps = rows["seconds"].astype(np.int64) * NANOSECONDS + rows["nanoseconds"]
+    return PoseColumns(stamps, x, y, theta, covariances)
+
+
+def _covariances(full: NDArray[np.float64]) -> Sequence[NDArray[np.float64] | None]:
+    """Of each row of 36 the part in the plane. Where the first is that of all, one for all."""
+    first = full[0].tobytes()
+    if full[-1].tobytes() == first and full.tobytes() == first * len(full):
+        return (decode.plane_covariance(first),) * len(full)
+    plane = full[:, decode.PLANE].reshape(-1, 3, 3)
+    plane.setflags(write=False)
+    if (plane[:, 0, 0] > 0.0).all():
+        return list(plane)
+    return [row if row.any() else None for row in plane]
+
+
+BY_HAND: dict[str, ColumnDecoder] = {
+    definitions.ODOMETRY: odometry,
+    definitions.POSE_STAMPED: pose_stamped,
+    definitions.POSE_WITH_COVARIANCE_STAMPED: pose_stamped,
+}
+"""Column decoders of the types whose definition is the known one (see `hsloc.log.messages.decode.BY_HAND`)."""

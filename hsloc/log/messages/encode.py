@@ -1,0 +1,175 @@
+"""Messages as ROS 2 CDR (little endian), for the types that hsloc writes.
+
+Offsets in CDR count from behind the four bytes of encapsulation; a field is aligned to its own size. What does
+not change between messages (frame names and their padding) is made once.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from struct import Struct
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.errors import OutputError
+from hsloc.log.messages.decode import PLANE
+from hsloc.log.transforms import Transform3
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from hsloc.model import OccupancyGrid, Pose2, Scan, Trajectory
+
+ENCAPSULATION = b"\x00\x01\x00\x00"
+NANOSECONDS = 1_000_000_000
+
+_STAMP = Struct("<iI")
+_COUNT = Struct("<I")
+_SCAN = Struct("<7f")
+_POSE = Struct("<7d")
+_MAP_INFO = Struct("<iIfII")
+
+"""Where the 3 x 3 of (x, y, yaw) stands in the 6 x 6 of (x, y, z, roll, pitch, yaw), both row by row."""
+
+
+def stamp_bytes(stamp_ns: int) -> bytes:
+    """builtin_interfaces/Time. Raises OutputError for a time that 32-bit seconds cannot hold."""
+    seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
+    if not -(2**31) <= seconds < 2**31:
+        raise OutputError(f"stamp {stamp_ns} ns does not fit ROS time (32-bit seconds)")
+    return _STAMP.pack(seconds, nanoseconds)
+
+
+@lru_cache(maxsize=1024)
+def padded_string(text: str, offset: int, alignment: int) -> bytes:
+    """A string at an offset, padded so that what follows is aligned."""
+    data = text.encode() + b"\0"
+    data = _COUNT.pack(len(data)) + data
+    return data + b"\0" * (-(offset + len(data)) % alignment)
+
+
+@lru_cache(maxsize=1024)
+def _two_strings(first: str, second: str, offset: int) -> bytes:
+    head = padded_string(first, offset, 4)
+    return head + padded_string(second, offset + len(head), 8)
+
+
+def laser_scan(scan: Scan, frame_id: str, scan_time: float) -> bytes:
+    """sensor_msgs/LaserScan."""
+    ranges = np.ascontiguousarray(scan.ranges, dtype="<f4")
+    count = len(ranges)
+    limits = _SCAN.pack(
+        scan.angle_min,
+        scan.angle_min + max(count - 1, 0) * scan.angle_increment,
+        scan.angle_increment,
+        scan.time_increment,
+        scan_time,
+        scan.range_min,
+        scan.range_max,
+    )
+    tail = b"\0\0\0\0"
+    if scan.intensities is not None and len(scan.intensities):
+        intensities = np.ascontiguousarray(scan.intensities, dtype="<f4")
+        tail = _COUNT.pack(len(intensities)) + intensities.tobytes()
+    return b"".join(
+        (
+            ENCAPSULATION,
+            stamp_bytes(scan.stamp_ns),
+            padded_string(frame_id, 8, 4),
+            limits,
+            _COUNT.pack(count),
+            ranges.tobytes(),
+            tail,
+        )
+    )
+
+
+def _pose(pose: Pose2) -> bytes:
+    return _POSE.pack(pose.x, pose.y, 0.0, *pose.to_quaternion())
+
+
+def _covariance(covariance: NDArray[np.float64] | None) -> bytes:
+    full = np.zeros(36, dtype="<f8")
+    if covariance is not None:
+        full[PLANE] = np.asarray(covariance, dtype=np.float64).reshape(9)
+    return full.tobytes()
+
+
+_NO_COVARIANCE = _covariance(None)
+_TWIST = Struct("<6d")
+
+
+def odometry(
+    stamp_ns: int,
+    pose: Pose2,
+    covariance: NDArray[np.float64] | None,
+    twist: tuple[float, float, float],
+    frames: tuple[str, str],
+) -> bytes:
+    """nav_msgs/Odometry; `frames` are (frame_id, child_frame_id), `twist` is (vx, vy, wz)."""
+    vx, vy, wz = twist
+    return b"".join(
+        (
+            ENCAPSULATION,
+            stamp_bytes(stamp_ns),
+            _two_strings(*frames, 8),
+            _pose(pose),
+            _NO_COVARIANCE if covariance is None else _covariance(covariance),
+            _TWIST.pack(vx, vy, 0.0, 0.0, 0.0, wz),
+            _NO_COVARIANCE,
+        )
+    )
+
+
+def transforms(stamp_ns: int, links: Sequence[tuple[str, str, Pose2 | Transform3]]) -> bytes:
+    """tf2_msgs/TFMessage; links are (parent, child, T_parent_child)."""
+    stamp = stamp_bytes(stamp_ns)
+    parts = [ENCAPSULATION, _COUNT.pack(len(links))]
+    offset = 4
+    for parent, child, link in links:
+        names = _two_strings(parent, child, offset % 8)
+        values = _POSE.pack(*link.translation, *link.rotation) if isinstance(link, Transform3) else _pose(link)
+        parts += (stamp, names, values)
+        offset += 8 + len(names) + len(values)
+    return b"".join(parts)
+
+
+def occupancy_grid(grid: OccupancyGrid, stamp_ns: int, frame_id: str) -> bytes:
+    """nav_msgs/OccupancyGrid; the map's load time is the stamp."""
+    height, width = grid.cells.shape
+    stamp = stamp_bytes(stamp_ns)
+    names = padded_string(frame_id, 8, 4)
+    seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
+    info = _MAP_INFO.pack(seconds, nanoseconds, grid.resolution, width, height)
+    padding = b"\0" * (-(8 + len(names) + len(info)) % 8)
+    cells = np.ascontiguousarray(grid.cells, dtype=np.int8).tobytes()
+    return b"".join((ENCAPSULATION, stamp, names, info, padding, _pose(grid.origin), _COUNT.pack(len(cells)), cells))
+
+
+def pose_stamped(stamp_ns: int, pose: Pose2, frame_id: str) -> bytes:
+    """geometry_msgs/PoseStamped."""
+    return ENCAPSULATION + stamp_bytes(stamp_ns) + padded_string(frame_id, 8, 8) + _pose(pose)
+
+
+def pose_with_covariance_stamped(
+    stamp_ns: int, pose: Pose2, covariance: NDArray[np.float64] | None, frame_id: str
+) -> bytes:
+    """geometry_msgs/PoseWithCovarianceStamped."""
+    return pose_stamped(stamp_ns, pose, frame_id) + _covariance(covariance)
+
+
+def path(stamp_ns: int, trajectory: Trajectory, frame_id: str) -> bytes:
+    """nav_msgs/Path; each pose has its own stamp."""
+    head = padded_string(frame_id, 8, 4)
+    parts = [ENCAPSULATION, stamp_bytes(stamp_ns), head, _COUNT.pack(len(trajectory))]
+    offset = 8 + len(head) + 4
+    cosines, sines = np.cos(trajectory.poses[:, 2] / 2.0), np.sin(trajectory.poses[:, 2] / 2.0)
+    rows = zip(trajectory.stamps_ns, trajectory.poses, sines, cosines, strict=True)
+    for stamp, (x, y, _), sine, cosine in rows:
+        name = padded_string(frame_id, offset % 8, 8)
+        parts += (stamp_bytes(int(stamp)), name, _POSE.pack(x, y, 0.0, 0.0, 0.0, sine, cosine))
+        offset += 8 + len(name) + _POSE.size
+    return b"".join(parts)

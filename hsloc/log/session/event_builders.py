@@ -1,0 +1,214 @@
+"""Feeds: from a decoded message of a chosen topic to events of the model."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from hsloc.log.messages import definitions
+from hsloc.log.session.ordering import Arrivals
+from hsloc.log.transforms import Transform3
+from hsloc.model import Odometry, Pose2, Scan, Truth
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from hsloc.log.messages.cdr_batch_decode import PoseColumns
+    from hsloc.log.messages.decode import LinkMessage, OdometryMessage, PoseMessage, ScanMessage
+    from hsloc.log.session.extrinsics import Extrinsics
+    from hsloc.log.session.ordering import TopicClock
+    from hsloc.log.summary import Losses
+    from hsloc.model import Event
+
+    Stamped = tuple[TopicClock, Event]
+
+MAP_FRAME = "map"
+MAX_ABS = 1e7
+"""Coordinates beyond (metres) are taken for damage; the Earth's circumference is 4e7."""
+
+
+class Feed(Protocol):
+    """Turns messages into events. What holds no usable values is counted as invalid and gives nothing."""
+
+    @property
+    def topic(self) -> str: ...  # noqa: D102
+    @property
+    def typename(self) -> str: ...  # noqa: D102
+    @property
+    def clocks(self) -> tuple[TopicClock, ...]: ...  # noqa: D102
+
+    def events(self, message: Any, log_time_ns: int) -> Iterable[Stamped]:
+        """The events of one message."""
+        ...
+
+
+def is_usable(pose: Pose2) -> bool:
+    """Whether a pose is finite and on this planet."""
+    return pose.is_finite() and abs(pose.x) < MAX_ABS and abs(pose.y) < MAX_ABS
+
+
+class ScanFeed:
+    """sensor_msgs/LaserScan to Scan, with the laser's mounting."""
+
+    typename = definitions.LASER_SCAN
+
+    def __init__(self, clock: TopicClock, mountings: Extrinsics, losses: Losses, deskew: bool = False) -> None:
+        """With `deskew`, a scan that does not say how long a beam takes gets an even part of its duration."""
+        self.topic = clock.topic
+        self.clocks = (clock,)
+        self._clock = clock
+        self._mountings = mountings
+        self._losses = losses
+        self._deskew = deskew
+
+    def events(self, message: ScanMessage, log_time_ns: int) -> Iterable[Stamped]:
+        """One scan."""
+        stamp = self._clock.stamp(message.stamp_ns, log_time_ns)
+        if stamp is None:
+            return ()
+        _, frame, angle_min, increment, time_increment, range_min, range_max, ranges, intensities, *_ = message
+        if (
+            not (isfinite(angle_min) and isfinite(increment) and range_max > 0.0)
+            or abs(angle_min) > 1e3
+            or abs(increment) > 1e3
+            or (increment == 0.0 and len(ranges) > 2)  # all beams in one direction: no scan of a place
+        ):
+            self._losses.invalid_messages[self.topic] += 1
+            return ()
+        mounting = self._mountings.of(frame, message.T_frame_laser)
+        if mounting.flipped:
+            angle_min, increment = -angle_min, -increment
+        if not isfinite(time_increment):
+            time_increment = 0.0
+        if self._deskew and time_increment == 0.0 and isfinite(message.scan_time):
+            time_increment = message.scan_time / max(len(ranges), 1)
+        scan = Scan(
+            stamp,
+            ranges,
+            angle_min,
+            increment,
+            range_min if isfinite(range_min) else 0.0,
+            range_max,
+            time_increment,
+            mounting.T_base_laser,
+            frame,
+            intensities,
+        )
+        return ((self._clock, scan),)
+
+
+class OdometryFeed:
+    """nav_msgs/Odometry to Odometry, or to Truth."""
+
+    typename = definitions.ODOMETRY
+
+    def __init__(self, clock: TopicClock, losses: Losses, is_truth: bool, T_child_base: Pose2 | None = None) -> None:
+        """`T_child_base` leads from the frame that the messages speak of to the base, where these differ."""
+        self.topic = clock.topic
+        self.clocks = (clock,)
+        self._clock = clock
+        self._losses = losses
+        self.is_truth = is_truth
+        self._T_child_base = T_child_base
+
+    def events(self, message: OdometryMessage | PoseMessage, log_time_ns: int) -> Iterable[Stamped]:
+        """One pose."""
+        stamp = self._clock.stamp(message.stamp_ns, log_time_ns)
+        if stamp is None:
+            return ()
+        if not is_usable(message.pose):
+            self._losses.invalid_messages[self.topic] += 1
+            return ()
+        pose = message.pose if self._T_child_base is None else message.pose @ self._T_child_base
+        if self.is_truth:
+            return ((self._clock, Truth(stamp, pose)),)
+        return ((self._clock, Odometry(stamp, pose, message.covariance)),)
+
+    def arrivals(self, columns: PoseColumns, places: Sequence[int], log_times: Sequence[int]) -> Arrivals | None:
+        """The events of many messages at once, as `events` gives them; None where one needs a closer look."""
+        x, y, theta = columns.x, columns.y, columns.theta
+        with np.errstate(invalid="ignore"):
+            usable = (np.abs(x) < MAX_ABS) & (np.abs(y) < MAX_ABS) & np.isfinite(theta)
+        if not (usable.all() and columns.stamps_ns.all()):
+            return None
+        stamps = columns.stamps_ns.tolist()
+        poses: Iterable[Pose2] = map(Pose2, x.tolist(), y.tolist(), theta)
+        T_child_base = self._T_child_base
+        if T_child_base is not None:
+            poses = [pose @ T_child_base for pose in poses]
+        if self.is_truth:
+            return Arrivals(self._clock, places, log_times, stamps, list(map(Truth, stamps, poses)))
+        events = list(map(Odometry, stamps, poses, columns.covariances))
+        return Arrivals(self._clock, places, log_times, stamps, events)
+
+
+class PoseFeed(OdometryFeed):
+    """geometry_msgs/PoseStamped and PoseWithCovarianceStamped to Truth, or to Odometry, whose covariance is unknown."""
+
+    def __init__(
+        self, clock: TopicClock, losses: Losses, typename: str, is_truth: bool, T_child_base: Pose2 | None = None
+    ) -> None:
+        """As `OdometryFeed`."""
+        super().__init__(clock, losses, is_truth, T_child_base)
+        self.typename = typename
+
+
+class TransformFeed:
+    """tf2_msgs/TFMessage to Odometry (odom -> base) and Truth (map -> odom -> base), as asked for."""
+
+    typename = definitions.TF_MESSAGE
+
+    def __init__(
+        self,
+        topic: str,
+        frames: tuple[str | None, str],
+        odometry: TopicClock | None,
+        truth: TopicClock | None,
+        losses: Losses,
+        T_child_base: Pose2 | None = None,
+    ) -> None:
+        """`frames` are the odometry's (None where the map is the base's parent) and its child's."""
+        self.topic = topic
+        self.clocks = tuple(clock for clock in (odometry, truth) if clock is not None)
+        self._odom_frame, self._base_frame = frames
+        self._odometry = odometry
+        self._truth = truth
+        self._losses = losses
+        self._T_child_base = T_child_base
+        self._T_map_odom: Transform3 | None = None
+
+    def events(self, message: list[LinkMessage], log_time_ns: int) -> Iterable[Stamped]:
+        """Events of the links that matter."""
+        found: list[Stamped] = []
+        for link in message:
+            if link.parent == MAP_FRAME and link.child == self._odom_frame:
+                self._T_map_odom = link.transform.normalised()
+            elif link.child == self._base_frame and link.parent == (self._odom_frame or MAP_FRAME):
+                found += self._base(link, log_time_ns)
+        return found
+
+    def _base(self, link: LinkMessage, log_time_ns: int) -> Iterable[Stamped]:
+        transform = link.transform.normalised()
+        if self._T_child_base is not None:
+            transform = transform @ Transform3.from_pose2(self._T_child_base)
+        pose = transform.to_pose2()
+        if not is_usable(pose):
+            self._losses.invalid_messages[self.topic] += 1
+            return
+        if self._odometry is not None:
+            stamp = self._odometry.stamp(link.stamp_ns, log_time_ns)
+            if stamp is not None:
+                yield self._odometry, Odometry(stamp, pose)
+        if self._truth is None:
+            return
+        stamp = self._truth.stamp(link.stamp_ns, log_time_ns)
+        if stamp is None:
+            return
+        if self._odom_frame is None:
+            yield self._truth, Truth(stamp, pose)
+        elif self._T_map_odom is not None:
+            T_map_base = (self._T_map_odom @ transform).to_pose2()
+            if is_usable(T_map_base):
+                yield self._truth, Truth(stamp, T_map_base)

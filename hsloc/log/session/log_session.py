@@ -1,0 +1,280 @@
+"""What a ROS log holds, and what of it is read: found out once, when it is opened."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from hsloc.log.messages import definitions, foxglove
+from hsloc.log.messages.decoders import Undecodable, canonical_type, decoder_for, is_decodable
+from hsloc.log.session.event_builders import MAP_FRAME
+from hsloc.log.session.extrinsics import BASE_FRAMES, Extrinsics, read_links
+from hsloc.log.session.split_recordings import check_parts
+from hsloc.log.session.topic_selection import TF, TRUTH_TYPES, carries, choose_topics, is_truth_name, of_type
+from hsloc.log.summary import LaserSummary, LogSummary, Losses, ReadOptions, TopicSummary
+from hsloc.model import IDENTITY
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from hsloc.log.container import Channel, Container
+    from hsloc.log.messages.decoders import Decoder
+    from hsloc.model import Pose2
+
+CONVERTED = "hsloc.convert"
+"""Metadata record of a converted log; `order` = `log` says that the order of the log is the true one."""
+
+_LINKS_AT_OPENING = 2000
+_STAMPS_AT_OPENING = 100
+_SAME_CLOCK_NS = 3600 * 1_000_000_000
+_CLOCKS_APART_NS = 5_000_000_000
+
+
+class FirstMessage(NamedTuple):
+    """The first message of a topic that has a stamp, and when the topic started by the log's clock."""
+
+    message: Any
+    stamp_ns: int
+    log_time_ns: int
+    start_log_ns: int
+    starts_unstamped: bool
+
+    @property
+    def shares_log_clock(self) -> bool:
+        """Whether a missing stamp may be replaced by the log time."""
+        return self.stamp_ns == 0 or abs(self.stamp_ns - self.log_time_ns) < _SAME_CLOCK_NS
+
+    @property
+    def origin_ns(self) -> int:
+        """The stamp of the topic's first event."""
+        return self.start_log_ns if self.starts_unstamped and self.shares_log_clock else self.stamp_ns
+
+
+class LogSession:
+    """Topics, their first messages, the laser's mounting, and a summary of it all.
+
+    `active` are the channels that have messages; `T_child_base` leads from the frame that the odometry speaks of to
+    the base, where the user named another. Raises as `RosSource`.
+    """
+
+    def __init__(self, containers: Sequence[Container], options: ReadOptions) -> None:
+        self.containers = containers
+        self.options = options
+        self._warnings = [warning for container in containers for warning in container.warnings]
+        self._decoders: dict[tuple[int, int], Decoder] = {}
+        self.active = [
+            channel
+            for container in containers
+            for channel in container.channels.values()
+            if (statistics := container.statistics.get(channel.id)) is not None and statistics.count
+        ]
+        links = {(link.parent, link.child) for link in read_links(containers, TF, _LINKS_AT_OPENING)}
+        self.tf_frames = _odometry_frames(links, options.base_frame)
+        self._has_map_to_odom = any(parent == MAP_FRAME for parent, _ in links)
+        where = str(containers[0].path)
+        if len(containers) > 1:
+            where += f" and {len(containers) - 1} more"
+        self.choice = choose_topics(where, self.active, options, self.tf_frames is not None)
+        self._warnings += self.choice.problems
+        frames = self.tf_frames if self.choice.odom == TF else None
+        self._parts, doubts = check_parts(containers, self.choice.scans, self.choice.odom, frames)
+        self._warnings += doubts
+        self.scans = {topic: self._first(topic, definitions.LASER_SCAN) for topic in self.choice.scans}
+        self.odom_type = self._pose_type(self.choice.odom)
+        self.odom = self._first(self.choice.odom, self.odom_type)
+        self.truth_type = self._pose_type(self.choice.truth)
+        self.truth = self._first(self.choice.truth, self.truth_type)
+        self.mountings = Extrinsics(containers, self._base_frame(), options.laser_pose)
+        self.T_child_base = self._child_to_base()
+        # A truth that speaks of the same frame as the odometry moves with it.
+        truth_child = getattr(self.truth.message, "child_frame_id", None) if self.truth is not None else None
+        self.T_truth_base = self.T_child_base if truth_child in (self.odometry_child, "") else None
+        self.summary = self._summarise()
+
+    def channels(self, topic: str, typename: str | None = None) -> Iterator[tuple[int, Channel]]:
+        """(number of the container, channel) of a topic, those that can be decoded."""
+        for number, container in enumerate(self.containers):
+            for channel in container.channels.values():
+                if carries(channel, topic) and is_decodable(channel):
+                    kind = canonical_type(channel.typename)
+                    if typename is None or kind == typename:
+                        yield number, channel
+
+    def decoder(self, number: int, channel: Channel) -> Decoder:
+        """The decoder of a channel of a container; made once. Raises LogFormatError."""
+        key = (number, channel.id)
+        if key not in self._decoders:
+            self._decoders[key] = decoder_for(channel)
+        return self._decoders[key]
+
+    def messages(self, topic: str, typename: str | None = None) -> Iterator[tuple[int, Any]]:
+        """(log time, message) of one topic, file by file; what cannot be decoded is passed over."""
+        chosen: dict[int, dict[int, Decoder]] = {}
+        for number, channel in self.channels(topic, typename):
+            chosen.setdefault(number, {})[channel.id] = self.decoder(number, channel)
+        for number, decoders in chosen.items():
+            for log_time, _, channel_id, data in self.containers[number].messages(decoders.keys(), Losses()):
+                try:
+                    yield log_time, decoders[channel_id](data)
+                except Undecodable:
+                    continue
+
+    def _first(self, topic: str | None, typename: str | None) -> FirstMessage | None:
+        """The first message of a topic; the first one with a stamp, if that is soon."""
+        if topic is None or topic == TF:
+            return None
+        first: FirstMessage | None = None
+        for count, (log_time, message) in enumerate(self.messages(topic, typename)):
+            stamp = message.stamp_ns
+            start, unstamped = (first[3], first[4]) if first is not None else (log_time, stamp == 0 < log_time)
+            first = FirstMessage(message, stamp, log_time, start, unstamped)
+            if stamp != 0 or count >= _STAMPS_AT_OPENING:
+                break
+        return first
+
+    def _pose_type(self, topic: str | None) -> str:
+        """In which of the types of a pose a topic tells it."""
+        if topic is None or topic == TF:
+            return definitions.ODOMETRY
+        kinds = {canonical_type(channel.typename) for _, channel in self.channels(topic)}
+        return next((kind for kind in TRUTH_TYPES if kind in kinds), definitions.ODOMETRY)
+
+    @property
+    def odometry_child(self) -> str | None:
+        """The frame whose pose the odometry tells."""
+        if self.odom is not None:
+            return str(getattr(self.odom.message, "child_frame_id", "")) or None
+        return self.tf_frames[1] if self.choice.odom == TF and self.tf_frames else None
+
+    def _base_frame(self) -> str | None:
+        child = self.odometry_child
+        if self.options.base_frame is not None or child is not None:
+            return self.options.base_frame or child
+        return self.tf_frames[1] if self.tf_frames else None
+
+    def _child_to_base(self) -> Pose2 | None:
+        """From the frame that the odometry speaks of to the base that the user named, where they differ."""
+        child = self.odometry_child
+        base = self.options.base_frame
+        if not child or base is None or child == base:
+            return None
+        transform = self.mountings.between(child, base)
+        if transform is None:
+            self._warnings.append(
+                f"no transform from {child}, which the odometry speaks of, to {base}: they are taken to be one"
+            )
+            return None
+        return transform.to_pose2()
+
+    def _summarise(self) -> LogSummary:
+        statistics = self._topics()
+        lasers = [self._laser(topic, first) for topic, first in self.scans.items() if first is not None]
+        if len(lasers) > 1 and self.options.laser_pose is not None:
+            self._warnings.append(f"--laser-pose is taken for all {len(lasers)} lasers")
+        laser = lasers[0] if lasers else LaserSummary("", "", IDENTITY, False, "identity")
+        converted = any(c.metadata.get(CONVERTED, {}).get("order") == "log" for c in self.containers)
+        self._warn_of_clocks()
+        starts = [topic.first_ns for topic in statistics if topic.first_ns is not None]
+        ends = [topic.last_ns for topic in statistics if topic.last_ns is not None]
+        formats = list(dict.fromkeys(container.format for container in self.containers))
+        return LogSummary(
+            paths=tuple(container.path for container in self.containers),
+            format=" + ".join(formats),
+            profile=self.containers[0].profile,
+            start_ns=min(starts, default=0),
+            end_ns=max(ends, default=0),
+            origin_ns=self._origin(in_log_time=converted),
+            topics=tuple(statistics),
+            scan_topic=",".join(self.choice.scans) or None,
+            odom_topic=self.choice.odom,
+            truth_topic=self.choice.truth,
+            reference_candidates=self._candidates(),
+            odom_frame=self._odom_frame(),
+            base_frame=self.mountings.base_frame,
+            laser_frame=laser.frame if lasers else None,
+            T_base_laser=laser.T_base_laser,
+            laser_flipped=laser.flipped,
+            extrinsics=laser.extrinsics,
+            lasers=tuple(lasers),
+            parts=self._parts,
+            order="log" if converted else "stamp",
+            metadata={name: dict(v) for c in self.containers for name, v in c.metadata.items()},
+            warnings=tuple(dict.fromkeys(self._warnings + self.mountings.warnings)),
+        )
+
+    def _laser(self, topic: str, first: FirstMessage) -> LaserSummary:
+        frame = first.message.frame_id
+        extrinsics = self.mountings.found(frame)[1]
+        mounting = self.mountings.of(frame, first.message.T_frame_laser)
+        return LaserSummary(topic, frame, mounting.T_base_laser, mounting.flipped, extrinsics)
+
+    def _topics(self) -> list[TopicSummary]:
+        """Statistics by topic and type, over all files."""
+        merged: dict[tuple[str, str, str], list[Any]] = {}
+        for container in self.containers:
+            for channel in container.channels.values():
+                name = channel.typename
+                kind = name if name.startswith(foxglove.PREFIX) else canonical_type(name)
+                key = (channel.topic, kind, channel.message_encoding)
+                statistics = container.statistics.get(channel.id)
+                merged.setdefault(key, []).extend([statistics] if statistics else [])
+        found = []
+        for (topic, typename, encoding), parts in sorted(merged.items()):
+            parts = sorted((p for p in parts if p.count), key=lambda part: part.first_ns)
+            gaps = [part.largest_gap_ns for part in parts]
+            gaps += [max(b.first_ns - a.last_ns, 0) for a, b in pairwise(parts)]
+            first, last = (parts[0].first_ns, max(p.last_ns for p in parts)) if parts else (None, None)
+            count, gap = sum(part.count for part in parts), max(gaps, default=0) / 1e9
+            found.append(TopicSummary(topic, typename, encoding, count, first, last, gap))
+        return found
+
+    def _candidates(self) -> tuple[str, ...]:
+        poses = [topic for typename in TRUTH_TYPES[1:] for topic in of_type(self.active, typename)]
+        truths = [topic for topic in of_type(self.active, definitions.ODOMETRY) if is_truth_name(topic)]
+        return tuple(
+            dict.fromkeys(truths + sorted({*poses} - {self.choice.odom}) + (["tf"] if self._has_map_to_odom else []))
+        )
+
+    def _odom_frame(self) -> str | None:
+        if self.odom is not None:
+            return self.odom.message.frame_id or None
+        return self.tf_frames[0] if self.choice.odom == TF and self.tf_frames else None
+
+    def _origin(self, in_log_time: bool) -> int:
+        """The first effective stamp."""
+        firsts = [first for first in (*self.scans.values(), self.odom) if first is not None]
+        stamps = [first.start_log_ns if in_log_time else first.origin_ns for first in firsts]
+        if self.choice.odom == TF:
+            stamps += self._first_transform(in_log_time)
+        if not stamps and self.truth is not None:
+            stamps.append(self.truth.start_log_ns if in_log_time else self.truth.origin_ns)
+        return min(stamps, default=0)
+
+    def _first_transform(self, in_log_time: bool) -> list[int]:
+        for log_time, message in self.messages(TF, definitions.TF_MESSAGE):
+            for link in message:
+                if (link.parent, link.child) == self.tf_frames:
+                    return [log_time if in_log_time or not link.stamp_ns else link.stamp_ns]
+        return []
+
+    def _warn_of_clocks(self) -> None:
+        if self.odom is None or not self.odom.stamp_ns:
+            return
+        for topic, first in self.scans.items():
+            if first is None or not first.stamp_ns:
+                continue
+            apart = (first.stamp_ns - first.log_time_ns) - (self.odom.stamp_ns - self.odom.log_time_ns)
+            if abs(apart) > _CLOCKS_APART_NS:
+                self._warnings.append(
+                    f"the stamps of {topic} and {self.choice.odom} are {apart / 1e9:.1f} s apart, measured by the "
+                    "log's clock: they may be of different clocks"
+                )
+
+
+def _odometry_frames(links: set[tuple[str, str]], base: str | None) -> tuple[str, str] | None:
+    """(odometry frame, base frame) of a dynamic link that is odometry, if there is one."""
+    children = sorted(child for parent, child in links if parent == "odom" and child != MAP_FRAME)
+    wanted = [name for name in (base, *BASE_FRAMES) if name in children]
+    if wanted:
+        return "odom", wanted[0] or ""
+    return ("odom", children[0]) if len(children) == 1 else None

@@ -1,0 +1,212 @@
+"""ROS logs: from containers of messages to events."""
+
+from __future__ import annotations
+
+import heapq
+from collections import defaultdict
+from operator import itemgetter
+from typing import TYPE_CHECKING
+
+from hsloc.log.container import in_runs
+from hsloc.log.messages import definitions
+from hsloc.log.messages.decoders import Undecodable, canonical_type, is_decodable
+from hsloc.log.session.event_builders import OdometryFeed, PoseFeed, ScanFeed, TransformFeed
+from hsloc.log.session.extrinsics import BASE_FRAMES
+from hsloc.log.session.log_session import FirstMessage, LogSession
+from hsloc.log.session.ordering import KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH, Reorder, TopicClock, one_by_one
+from hsloc.log.session.topic_reader import Route
+from hsloc.log.session.topic_selection import TF, of_type
+from hsloc.log.source import Observation
+from hsloc.log.summary import Losses
+from hsloc.model import Pose2
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from hsloc.log.container import Container, RawMessage
+    from hsloc.log.session.event_builders import Feed
+    from hsloc.log.summary import ReadOptions
+    from hsloc.model import Event, OccupancyGrid
+
+_CHANNELS = 1 << 32
+"""More channels than a file can have."""
+_FIRST_BATCH = 16
+_CUT_BATCH = 64
+"""Where the end of a log is left out: what is damaged there is not looked at."""
+_BATCH = 1024
+"""Messages that are decoded together."""
+
+INITIAL_POSE = "hsloc.initial_pose"
+"""Metadata record with x, y, theta (m, m, rad) and, if it is not the first stamp, stamp_ns."""
+
+
+class RosSource:
+    """Events of a recording that may be split into several files.
+
+    Raises TopicError where the topics cannot be chosen, LogFormatError where a chosen one cannot be decoded.
+    """
+
+    def __init__(self, containers: Sequence[Container], options: ReadOptions) -> None:
+        self._containers = containers
+        self._survey = LogSession(containers, options)
+        self.summary = self._survey.summary
+        self.losses_at_opening = _added(container.losses_at_opening for container in containers)
+
+    def events(self, losses: Losses) -> Iterator[tuple[int, Event]]:
+        """As `Source.events`."""
+        feeds = self._feeds(losses)
+        reorder = Reorder([clock for feed in feeds for clock in feed.clocks], losses)
+        routes = self._routes(feeds)
+        size = _BATCH if self._survey.options.end_s is None else _CUT_BATCH
+        for batch in _batches(self._stream(routes, losses), size):
+            arrivals = [
+                found
+                for route, places in _by_route(batch, routes)
+                for found in route.read([batch[place] for place in places], places, losses)
+            ]
+            if self.summary.order == "log":
+                for _, clock, log_time, event in one_by_one(arrivals):
+                    clock.effective(event.stamp_ns, log_time)  # counts stamps that run backwards
+                    yield log_time, event
+            else:
+                reorder.take(arrivals, len(batch))
+                yield from reorder.ready()
+        yield from reorder.rest()
+
+    def observations(self, losses: Losses) -> Iterator[Observation]:
+        """As `Source.observations`."""
+        kinds = (definitions.LASER_SCAN, definitions.ODOMETRY, definitions.TF_MESSAGE)
+        for number, container in enumerate(self._containers):
+            chosen = {
+                channel.id: (channel.topic, self._survey.decoder(number, channel))
+                for channel in container.channels.values()
+                if is_decodable(channel) and canonical_type(channel.typename) in kinds
+            }
+            for log_time, _, channel_id, data in container.messages(chosen.keys(), losses):
+                topic, decoder = chosen[channel_id]
+                try:
+                    yield Observation(topic, log_time, decoder(data))
+                except Undecodable as error:
+                    losses.undecodable_messages[topic] += 1
+                    losses.note(f"{topic}: a message cannot be decoded ({error})")
+
+    def _feeds(self, losses: Losses) -> list[Feed]:
+        survey = self._survey
+        choice = survey.choice
+        feeds: list[Feed] = []
+        tf_odometry = tf_truth = None
+        if choice.odom == TF:
+            tf_odometry = _clock(TF, KIND_ODOMETRY, None, losses)
+        elif choice.odom is not None:
+            clock = _clock(choice.odom, KIND_ODOMETRY, survey.odom, losses)
+            feeds.append(_pose_feed(clock, losses, survey.odom_type, False, survey.T_child_base))
+        for topic, first in survey.scans.items():
+            clock = _clock(topic, KIND_SCAN, first, losses)
+            feeds.append(ScanFeed(clock, survey.mountings, losses, survey.options.deskew))
+        if choice.truth == TF:
+            tf_truth = _clock(TF, KIND_TRUTH, None, losses)
+        elif choice.truth is not None:
+            clock = _clock(choice.truth, KIND_TRUTH, survey.truth, losses)
+            feeds.append(_pose_feed(clock, losses, survey.truth_type, True, survey.T_truth_base))
+        if tf_odometry is not None or tf_truth is not None:
+            frames = survey.tf_frames or (None, survey.mountings.base_frame or BASE_FRAMES[0])
+            feeds.append(TransformFeed(TF, frames, tf_odometry, tf_truth, losses, survey.T_child_base))
+        return feeds
+
+    def _routes(self, feeds: Sequence[Feed]) -> dict[int, Route]:
+        """The route of each channel that is read, by its key in `_stream`: one for all channels of a feed."""
+        routes: dict[int, Route] = {}
+        for feed in feeds:
+            channels = {
+                _key(number, channel.id): (channel, self._survey.decoder(number, channel))
+                for number, channel in self._survey.channels(feed.topic, feed.typename)
+            }
+            routes.update(dict.fromkeys(channels, Route(feed, channels)))
+        return routes
+
+    def _stream(self, routes: Iterable[int], losses: Losses) -> Iterator[list[RawMessage]]:
+        """Raw messages of all files in the order of the log, their channels told by keys."""
+        wanted: dict[int, list[int]] = {}
+        for key in routes:
+            number, channel = divmod(key, _CHANNELS)
+            wanted.setdefault(number, []).append(channel)
+        if [*wanted] == [0]:
+            return self._containers[0].runs(wanted[0], losses)
+        streams = [_keyed(self._containers[number], number, channels, losses) for number, channels in wanted.items()]
+        return in_runs(heapq.merge(*streams, key=itemgetter(0)), _CUT_BATCH)
+
+    def map(self) -> OccupancyGrid | None:
+        """The last map of /map, or of the only topic with maps."""
+        topics = of_type(self._survey.active, definitions.OCCUPANCY_GRID)
+        named = [t for t in topics if t.lstrip("/") == "map"] or [t for t in topics if t.endswith("/map")] or topics
+        if not named or (len(named) > 1 and len(topics) > 1):
+            return None
+        grid = None
+        for _, message in self._survey.messages(named[0], definitions.OCCUPANCY_GRID):
+            grid = message.grid
+        return grid
+
+    def initial_pose(self) -> tuple[int, Pose2] | None:
+        """The first message on /initialpose, else the metadata record `hsloc.initial_pose`."""
+        for log_time, message in self._survey.messages("/initialpose", definitions.POSE_WITH_COVARIANCE_STAMPED):
+            return message.stamp_ns or log_time, message.pose
+        values = self.summary.metadata.get(INITIAL_POSE)
+        if values is None:
+            return None
+        try:
+            pose = Pose2(float(values["x"]), float(values["y"]), float(values["theta"]))
+            stamp = int(values.get("stamp_ns", self.summary.origin_ns))
+        except (KeyError, ValueError):
+            return None
+        return (stamp, pose) if pose.is_finite() else None
+
+    def verify(self) -> Losses:
+        """As `Source.verify`."""
+        return _added(container.verify() for container in self._containers)
+
+
+def _key(number: int, channel: int) -> int:
+    return number * _CHANNELS + channel
+
+
+def _keyed(container: Container, number: int, channels: Sequence[int], losses: Losses) -> Iterator[RawMessage]:
+    for log_time, position, channel, data in container.messages(channels, losses):
+        yield log_time, position, _key(number, channel), data
+
+
+def _batches(runs: Iterator[list[RawMessage]], most: int) -> Iterator[list[RawMessage]]:
+    """Messages in short lists; a very short one first, for those who want to see the beginning alone."""
+    size = min(_FIRST_BATCH, most)
+    for run in runs:
+        at = 0
+        while at < len(run):
+            yield run[at : at + size]
+            at += size
+            size = most
+
+
+def _by_route(batch: list[RawMessage], routes: Mapping[int, Route]) -> Iterable[tuple[Route, list[int]]]:
+    """The places in a batch of the messages of each route, in the order of the log."""
+    found: defaultdict[Route, list[int]] = defaultdict(list)
+    for place, message in enumerate(batch):
+        found[routes[message[2]]].append(place)
+    return found.items()
+
+
+def _pose_feed(
+    clock: TopicClock, losses: Losses, typename: str, is_truth: bool, T_child_base: Pose2 | None
+) -> OdometryFeed:
+    if typename == definitions.ODOMETRY:
+        return OdometryFeed(clock, losses, is_truth, T_child_base)
+    return PoseFeed(clock, losses, typename, is_truth, T_child_base)
+
+
+def _clock(topic: str, kind: int, first: FirstMessage | None, losses: Losses) -> TopicClock:
+    return TopicClock(topic, kind, losses, first is None or first.shares_log_clock)
+
+
+def _added(parts: Iterable[Losses]) -> Losses:
+    total = Losses()
+    for part in parts:
+        total.add(part)
+    return total

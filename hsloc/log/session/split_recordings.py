@@ -1,0 +1,180 @@
+"""Whether several files are parts of one run: they follow each other, or hold different topics of the same time.
+
+Files of different drives would be interleaved by time into a robot that is in two places at once. What tells them: one
+topic recorded in two files at the same time, or odometry that is elsewhere when the next file goes on.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import combinations, islice, pairwise
+from math import hypot
+from typing import TYPE_CHECKING, NamedTuple
+
+from hsloc.errors import LogError
+from hsloc.log.messages.decode import OdometryMessage, PoseMessage
+from hsloc.log.messages.decoders import Undecodable, decoder_for, is_decodable
+from hsloc.log.session.topic_selection import carries
+from hsloc.log.summary import NANOSECONDS, Losses, PartSummary
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from hsloc.log.container import Container, RawMessage
+    from hsloc.log.messages.decoders import Decoder
+    from hsloc.model import Pose2
+
+SAME_TIME_NS = 2 * NANOSECONDS
+"""So long may two parts of one run overlap: a recorder that splits its files writes some messages late."""
+SHORT_PART = 0.5
+"""Or so large a part of the shorter one, whichever is less."""
+EDGE_NS = NANOSECONDS // 2
+"""But so long they always may: the last part may be hardly more than what was written late."""
+GAP_NS = 60 * NANOSECONDS
+"""A longer time without scan or odometry between two parts is told."""
+POSSIBLE_SPEED, LIKELY_SPEED = 15.0, 2.0
+"""m/s; faster between two parts no robot moves, and few robots with a lidar faster than the second."""
+POSSIBLE_JUMP, LIKELY_JUMP = 2.0, 1.0
+"""Metres besides: odometry may be late, and wheels slip."""
+_RESET, _AWAY = 0.01, 0.5
+"""Odometry within so many metres of zero has begun anew, if it was farther away than the second before."""
+_ENDS = 200
+"""Messages looked at on either end of a part."""
+
+
+class _Edge(NamedTuple):
+    """Odometry at one end of a part."""
+
+    log_time_ns: int
+    pose: Pose2
+
+
+def check_parts(
+    containers: Sequence[Container],
+    scan_topics: Iterable[str],
+    odom_topic: str | None,
+    tf_frames: tuple[str, str] | None,
+) -> tuple[tuple[PartSummary, ...], list[str]]:
+    """The files in the order of time, and what is doubtful about their being parts of one run.
+
+    `tf_frames` are the frames of the odometry where `odom_topic` is /tf. Raises LogError for files that are not.
+    """
+    topics = [*([] if odom_topic is None else [odom_topic]), *scan_topics]
+    found = [(part, container) for container in containers if (part := _span(container, topics)) is not None]
+    found.sort(key=lambda entry: (entry[0].start_ns, entry[0].end_ns))
+    parts = tuple(part for part, _ in found)
+    if len(found) < 2:
+        return parts, []
+    for topic in topics:
+        spans = [span for _, container in found if (span := _span(container, [topic])) is not None]
+        for a, b in combinations(spans, 2):
+            _refuse_same_time(a, b, topic)
+    return parts, _gaps(parts) + ([] if odom_topic is None else _jumps(found, odom_topic, tf_frames))
+
+
+def _span(container: Container, topics: Sequence[str]) -> PartSummary | None:
+    """Log times of these topics in a file; None where it has no messages of them.
+
+    Of these alone: recorders that split their files may repeat /tf_static and /map with the time of the beginning.
+    """
+    statistics = [
+        container.statistics[channel.id]
+        for channel in container.channels.values()
+        if channel.id in container.statistics and any(carries(channel, topic) for topic in topics)
+    ]
+    firsts = [item.first_ns for item in statistics if item.count and item.first_ns is not None]
+    lasts = [item.last_ns for item in statistics if item.count and item.last_ns is not None]
+    return PartSummary(container.path, min(firsts), max(lasts)) if firsts and lasts else None
+
+
+def _refuse_same_time(a: PartSummary, b: PartSummary, topic: str) -> None:
+    overlap = min(a.end_ns, b.end_ns) - max(a.start_ns, b.start_ns)
+    shorter = min(a.end_ns - a.start_ns, b.end_ns - b.start_ns)
+    if overlap > max(EDGE_NS, min(SAME_TIME_NS, SHORT_PART * shorter)):
+        raise LogError(
+            f"{a.path} and {b.path}: both hold {topic} of the same {overlap / NANOSECONDS:.1f} s, so they are of two "
+            f"drives, or of two recorders of one; run each by itself, or all with `hsloc sweep {a.path} {b.path}`"
+        )
+
+
+def _gaps(parts: Sequence[PartSummary]) -> list[str]:
+    warnings = []
+    last = parts[0]
+    for part in parts[1:]:
+        gap = part.start_ns - last.end_ns
+        if gap > GAP_NS:
+            warnings.append(
+                f"{part.path} begins {_duration(gap)} after {last.path} ends: if that is another drive, run each by "
+                "itself"
+            )
+        last = max(last, part, key=lambda item: item.end_ns)
+    return warnings
+
+
+def _duration(nanoseconds: int) -> str:
+    minutes, seconds = divmod(nanoseconds // NANOSECONDS, 60)
+    if minutes < 60:
+        return f"{minutes} min {seconds:02d} s"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min" if hours < 48 else f"{hours // 24} days"
+
+
+def _jumps(found: Sequence[tuple[PartSummary, Container]], topic: str, tf_frames: tuple[str, str] | None) -> list[str]:
+    ends = [(part, *_edges(container, topic, tf_frames)) for part, container in found]
+    told = [(part, first, last) for part, first, last in ends if first is not None and last is not None]
+    return [
+        doubt
+        for (before, _, end), (after, begin, _) in pairwise(sorted(told, key=lambda entry: entry[1].log_time_ns))
+        for doubt in _jump(before, end, after, begin)
+    ]
+
+
+def _jump(a: PartSummary, end: _Edge, b: PartSummary, begin: _Edge) -> list[str]:
+    """What the odometry says to one part following the other."""
+    # Where the edges overlap, too, the robot was at either end of so much time.
+    seconds = abs(begin.log_time_ns - end.log_time_ns) / NANOSECONDS
+    way = hypot(begin.pose.x - end.pose.x, begin.pose.y - end.pose.y)
+    if hypot(begin.pose.x, begin.pose.y) < _RESET and hypot(end.pose.x, end.pose.y) > _AWAY:
+        return [f"the odometry begins anew with {b.path}: if that is another drive, run each by itself"]
+    what = f"the odometry is {way:.1f} m away when {b.path} goes on, {seconds:.1f} s from the end of {a.path}"
+    if way > POSSIBLE_JUMP + POSSIBLE_SPEED * seconds:
+        raise LogError(
+            f"{what}, so they are not parts of one run; run each by itself, or all with `hsloc sweep {a.path} {b.path}`"
+        )
+    if way > LIKELY_JUMP + LIKELY_SPEED * seconds:
+        return [f"{what}: if that is another drive, run each by itself"]
+    return []
+
+
+def _edges(container: Container, topic: str, tf_frames: tuple[str, str] | None) -> tuple[_Edge | None, _Edge | None]:
+    """The first and the last odometry of a file. All of the topic is read, but little of it decoded."""
+    decoders = {
+        channel.id: decoder_for(channel)
+        for channel in container.channels.values()
+        if carries(channel, topic) and is_decodable(channel)
+    }
+    messages = container.messages(decoders.keys(), Losses())
+    # Copies: a view would hold on to the chunk that it is part of.
+    head = [(*message[:3], bytes(message[3])) for message in islice(messages, _ENDS)]
+    tail = deque(((*message[:3], bytes(message[3])) for message in messages), maxlen=_ENDS)
+    first = next(_odometry(decoders, head, tf_frames), None)
+    last = next(_odometry(decoders, [*reversed(tail), *reversed(head)], tf_frames), None)
+    return first, last
+
+
+def _odometry(
+    decoders: dict[int, Decoder], messages: Iterable[RawMessage], tf_frames: tuple[str, str] | None
+) -> Iterator[_Edge]:
+    """Odometry among messages, by the log's times."""
+    for log_time, _, channel, data in messages:
+        try:
+            message = decoders[channel](data)
+        except Undecodable:
+            continue
+        if not isinstance(message, list):
+            if isinstance(message, OdometryMessage | PoseMessage):
+                yield _Edge(log_time, message.pose)
+            continue
+        for link in message:
+            if (link.parent, link.child) == tf_frames:
+                yield _Edge(log_time, link.transform.normalised().to_pose2())

@@ -1,0 +1,185 @@
+"""Which topics to read: scans, odometry and, where there is one, the truth."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from hsloc.errors import TopicError
+from hsloc.log.messages import definitions, foxglove
+from hsloc.log.messages.decoders import canonical_type, is_decodable
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from hsloc.log.container import Channel
+    from hsloc.log.summary import ReadOptions
+
+TF, TF_STATIC = "/tf", "/tf_static"
+TF_NAMES = ("tf", "/tf")
+"""How a user names transforms in place of a topic."""
+TRUTH_TYPES = (definitions.ODOMETRY, definitions.POSE_STAMPED, definitions.POSE_WITH_COVARIANCE_STAMPED)
+_TRUTH_NAME = re.compile(r"ground_?truth|(^|/)truth($|/)|(^|/)gt($|/)")
+_ODOMETRY_NAME = re.compile(r"(^|/)odom(etry)?($|/)")
+_LISTED = 12
+
+
+@dataclass(slots=True)
+class TopicSelection:
+    """Topics to read; `TF` stands for transforms in place of a topic. `problems` are what stood in the way."""
+
+    scans: tuple[str, ...] = ()
+    odom: str | None = None
+    truth: str | None = None
+    problems: list[str] = field(default_factory=list)
+
+
+def has_name(channel: Channel, name: str) -> bool:
+    """Whether a channel's topic is the name, with or without the leading slash that ROS 1 leaves out."""
+    return channel.topic.lstrip("/") == name.lstrip("/")
+
+
+def carries(channel: Channel, topic: str) -> bool:
+    """Whether a channel belongs to a topic: Foxglove's transforms are found by their type, under any name."""
+    if has_name(channel, topic):
+        return True
+    is_transform = foxglove.TYPES.get(channel.typename) == definitions.TF_MESSAGE
+    return topic == TF and is_transform and not has_name(channel, TF_STATIC)
+
+
+def of_type(channels: Sequence[Channel], typename: str) -> list[str]:
+    """Topics of a type that can be decoded, sorted."""
+    return sorted({c.topic for c in channels if canonical_type(c.typename) == typename and is_decodable(c)})
+
+
+def choose_topics(
+    where: str, channels: Sequence[Channel], options: ReadOptions, tf_has_odometry: bool
+) -> TopicSelection:
+    """Take the topics that the options name, else the only ones of their type.
+
+    `channels` are those that have messages. Raises TopicError, naming the candidates and the flag to choose with,
+    where a required topic is missing or ambiguous, and always where a named one does not exist.
+    """
+    choice = TopicSelection()
+    choice.truth = _truth(where, channels, options)
+    choice.scans = _scans(where, channels, options, choice.problems)
+    if options.odom_topic in TF_NAMES:
+        choice.odom = TF
+    else:
+        others = [c for c in channels if c.topic != choice.truth and not is_truth_name(c.topic)]
+        named = options.odom_topic is not None
+        candidates = _odometry_candidates(channels if named else others, named)
+        if not named and tf_has_odometry and not candidates:
+            choice.odom = TF
+        else:
+            choice.odom = _pick(
+                where,
+                channels,
+                "odom",
+                definitions.ODOMETRY,
+                candidates,
+                options.odom_topic,
+                options.require_odometry,
+                choice.problems,
+            )
+    if choice.truth is not None and choice.truth == choice.odom != TF:
+        if options.truth_topic is not None:
+            raise TopicError(f"{where}: {choice.odom} cannot be both odometry and truth; leave out --truth-topic")
+        choice.truth = None
+    return choice
+
+
+def is_truth_name(topic: str) -> bool:
+    """Whether a topic's name says that it holds the truth."""
+    return _TRUTH_NAME.search(topic) is not None
+
+
+def _scans(where: str, channels: Sequence[Channel], options: ReadOptions, problems: list[str]) -> tuple[str, ...]:
+    """The scan topics: the only one, or those that are named, separated by commas."""
+    candidates = of_type(channels, definitions.LASER_SCAN)
+    names: list[str | None] = [None]
+    if options.scan_topic is not None:
+        names = [*dict.fromkeys(name.strip() for name in options.scan_topic.split(","))]
+    chosen = [
+        _pick(where, channels, "scan", definitions.LASER_SCAN, candidates, name, options.require_scan, problems)
+        for name in names
+    ]
+    return tuple(dict.fromkeys(topic for topic in chosen if topic is not None))
+
+
+def _odometry_candidates(channels: Sequence[Channel], named: bool) -> list[str]:
+    """Topics of odometry; poses count if they are named, or if their name speaks and nothing else is there."""
+    found = of_type(channels, definitions.ODOMETRY)
+    poses = [topic for typename in TRUTH_TYPES[1:] for topic in of_type(channels, typename)]
+    if named:
+        return found + sorted(poses)
+    return found or sorted(topic for topic in poses if _ODOMETRY_NAME.search(topic))
+
+
+def _pick(
+    where: str,
+    channels: Sequence[Channel],
+    kind: str,
+    typename: str,
+    candidates: list[str],
+    named: str | None,
+    required: bool,
+    problems: list[str],
+) -> str | None:
+    flag = f"--{kind}-topic"
+    if named is not None:
+        found = [topic for topic in candidates if topic.lstrip("/") == named.lstrip("/")]
+        if found:
+            return found[0]
+        raise TopicError(_not_there(where, channels, named, typename, candidates, flag))
+    if len(candidates) == 1:
+        return candidates[0]
+    what = {"scan": "scan", "odom": "odometry"}[kind]
+    if candidates:
+        listing = ", ".join(candidates[:_LISTED])
+        problem = f"{where}: {len(candidates)} {what} topics ({listing}); choose with {flag} {candidates[0]}"
+        problem += f", or take all with {flag} {','.join(candidates[:_LISTED])}" if kind == "scan" else ""
+    else:
+        problem = f"{where}: no {what} topic ({typename}); the log holds {listed(channels)}"
+        problem += "; without odometry a map can be drawn (--no-odom)" if kind == "odom" and required else ""
+    if required:
+        raise TopicError(problem)
+    problems.append(problem)
+    return None
+
+
+def _not_there(
+    where: str, channels: Sequence[Channel], named: str, typename: str, candidates: list[str], flag: str
+) -> str:
+    other = next((c for c in channels if has_name(c, named)), None)
+    if other is not None:
+        trouble = f"{named} is {other.typename or 'of no type'} ({other.message_encoding}), not {typename}"
+    else:
+        trouble = f"no topic {named}"
+    remedy = f"{flag} may be {', '.join(candidates[:_LISTED])}" if candidates else f"it holds {listed(channels)}"
+    return f"{where}: {trouble}; {remedy}"
+
+
+def _truth(where: str, channels: Sequence[Channel], options: ReadOptions) -> str | None:
+    candidates = sorted({topic for typename in TRUTH_TYPES for topic in of_type(channels, typename)})
+    named = options.truth_topic
+    if named is None:
+        speaking = [topic for topic in candidates if is_truth_name(topic)]
+        return speaking[0] if speaking else None
+    if named in TF_NAMES:
+        return TF
+    found = [topic for topic in candidates if topic.lstrip("/") == named.lstrip("/")]
+    if found:
+        return found[0]
+    remedy = ", ".join([*candidates, "tf"][:_LISTED])
+    raise TopicError(f"{where}: no topic {named} to take as truth; --truth-topic may be {remedy}")
+
+
+def listed(channels: Sequence[Channel]) -> str:
+    """Topics with their types, for a message."""
+    names = sorted({f"{c.topic} ({c.typename or c.message_encoding})" for c in channels})
+    if not names:
+        return "no messages"
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more

@@ -1,0 +1,1 @@
+"""Text logs: CARMEN and Wean Hall."""

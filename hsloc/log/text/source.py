@@ -1,0 +1,241 @@
+"""Logs that are lines of text: CARMEN and Wean, plain or gzipped, read twice, never held in memory."""
+
+from __future__ import annotations
+
+import gzip
+import zlib
+from dataclasses import replace
+from typing import TYPE_CHECKING, BinaryIO, cast
+
+from hsloc.errors import LogFormatError, TopicError
+from hsloc.log.messages.decode import OdometryMessage, ScanMessage
+from hsloc.log.source import Observation
+from hsloc.log.summary import LogSummary, Losses, ReadOptions, TopicStatistics, TopicSummary
+from hsloc.log.text.carmen import Carmen
+from hsloc.log.text.max_range_inference import RANGE_MIN, RangeRule
+from hsloc.log.text.wean import Wean
+from hsloc.model import IDENTITY, Odometry, Scan
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from hsloc.log.text.line_format import Line, LineFormat
+    from hsloc.model import Event, OccupancyGrid, Pose2
+
+MAX_LINE_BYTES = 1 << 20
+MAX_TOTAL_RATIO = 100
+FREE_UNPACKED_BYTES = 4 << 30
+"""Bytes that a gzipped log may unpack to: 100 times its size, and in any case 4 GiB."""
+_BYTES_TO_KNOW = 1 << 20
+_LINES_TO_KNOW = 200
+
+
+def _open(path: Path) -> BinaryIO:
+    stream = path.open("rb")
+    if stream.read(2) == b"\x1f\x8b":
+        stream.close()
+        return cast("BinaryIO", gzip.open(path, "rb"))
+    stream.seek(0)
+    return stream
+
+
+def _lines(path: Path, losses: Losses, limit: int | None = None) -> Iterator[list[str]]:
+    """Words of each line that is neither empty nor a comment, of the first `limit` bytes."""
+    try:
+        allowed = max(FREE_UNPACKED_BYTES, MAX_TOTAL_RATIO * path.stat().st_size) if limit is None else limit
+        with _open(path) as stream:
+            while line := stream.readline(MAX_LINE_BYTES):
+                allowed -= len(line)
+                if allowed < 0:
+                    if limit is None:
+                        raise LogFormatError(f"{path}: unpacks to more than {MAX_TOTAL_RATIO} times its size")
+                    return
+                words = line.decode("ascii", errors="replace").split()
+                if words and not words[0].startswith("#"):
+                    yield words
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        losses.truncated_files += 1
+        losses.note(f"{path}: its compression is damaged or ends too early ({error})")
+    except OSError as error:
+        raise LogFormatError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def find_format(path: Path) -> LineFormat | None:
+    """The format of a text log, by the first line that one of them can read; None for anything else."""
+    candidates: tuple[LineFormat, ...] = (Carmen(), Wean())
+    for number, words in enumerate(_lines(path, Losses(), _BYTES_TO_KNOW)):
+        for candidate in candidates:
+            if words[0] in candidate.keywords:
+                try:
+                    candidate.parse(words)
+                except (ValueError, IndexError):
+                    continue
+                return candidate
+        if number > _LINES_TO_KNOW:
+            break
+    return None
+
+
+class TextSource:
+    """A text log as events in the order of its lines: there the order is right even where the stamps are not."""
+
+    def __init__(self, path: Path, line_format: LineFormat, options: ReadOptions) -> None:
+        self._path = path
+        self._format = line_format
+        self._options = options
+        self._rule = RangeRule()
+        self._has_odometry_lines = False
+        self.losses_at_opening = Losses()
+        self.summary = self._survey()
+
+    def _parsed(self, losses: Losses) -> Iterator[tuple[str, Line]]:
+        keywords, parse = self._format.keywords, self._format.parse
+        for words in _lines(self._path, losses):
+            if words[0] not in keywords:
+                continue
+            try:
+                line = parse(words)
+            except (ValueError, IndexError, OverflowError) as error:
+                losses.undecodable_messages[words[0]] += 1
+                losses.note(f"{self._path}: a line {words[0]} cannot be read ({str(error)[:80]})")
+                continue
+            yield words[0], line
+
+    def _events_of(self, line: Line) -> Iterator[Event]:
+        if line.odometry is not None and (
+            line.scan is None or self._format.laser_odometry or not self._has_odometry_lines
+        ):
+            yield line.odometry
+        if line.scan is not None:
+            mounting = self._options.laser_pose or line.scan.T_base_laser
+            yield replace(
+                line.scan,
+                ranges=self._rule.apply(line.scan.ranges),
+                range_min=RANGE_MIN,
+                range_max=line.scan.range_max or self._rule.range_max,
+                T_base_laser=mounting,
+            )
+        if line.truth is not None:
+            yield line.truth
+
+    def observations(self, losses: Losses) -> Iterator[Observation]:
+        """As `Source.observations`; a text log has no clock beside its stamps."""
+        for keyword, line in self._parsed(losses):
+            for event in self._events_of(line):
+                if isinstance(event, Scan):
+                    limits = event.range_min, event.range_max
+                    values = event.angle_min, event.angle_increment, event.time_increment, *limits, event.ranges
+                    message = ScanMessage(event.stamp_ns, event.frame_id, *values, None)
+                    yield Observation(keyword, event.stamp_ns, message)
+                elif isinstance(event, Odometry):
+                    pose = OdometryMessage(event.stamp_ns, "", "", event.T_odom_base, None)
+                    yield Observation(keyword, event.stamp_ns, pose)
+
+    def _survey(self) -> LogSummary:
+        """First reading: counts, times, and what the end of the scale means."""
+        topics: dict[str, TopicStatistics] = {}
+        kinds: dict[str, dict[str, None]] = {"odometry": {}, "scan": {}, "truth": {}}
+        first_ns: int | None = None
+        latest = 0
+        first_scan: Scan | None = None
+        scan_keyword = ""
+        for keyword, line in self._parsed(Losses()):
+            for event in line:
+                if event is not None:
+                    first_ns = event.stamp_ns if first_ns is None else first_ns
+                    latest = max(latest, event.stamp_ns)
+            for kind, event in zip(kinds, line, strict=True):
+                if event is not None:
+                    kinds[kind][keyword] = None
+            if line.scan is not None:
+                self._rule.learn(line.scan.ranges)
+                if first_scan is None:
+                    first_scan, scan_keyword = line.scan, keyword
+            elif line.odometry is not None:
+                self._has_odometry_lines = True
+            topics.setdefault(keyword, TopicStatistics()).add(latest, latest, 1, 0)
+        self._check(bool(kinds["scan"]), bool(kinds["odometry"]))
+        return self._summary(topics, kinds, first_ns or 0, latest, first_scan, scan_keyword)
+
+    def _summary(
+        self,
+        topics: dict[str, TopicStatistics],
+        kinds: dict[str, dict[str, None]],
+        first_ns: int,
+        last_ns: int,
+        scan: Scan | None,
+        scan_keyword: str,
+    ) -> LogSummary:
+        extrinsics, warnings = "identity", []
+        if self._options.laser_pose is not None:
+            extrinsics = "option"
+        elif scan_keyword in self._format.states_mounting:
+            extrinsics = "file format"
+        elif scan is not None:
+            warnings.append(
+                f"{scan_keyword} lines do not say where the laser stands: it is taken to stand in the base's "
+                "place; give --laser-pose x,y,yaw"
+            )
+        mounting = self._options.laser_pose or (scan.T_base_laser if scan else IDENTITY)
+        odometry = kinds["odometry"]
+        if self._has_odometry_lines and not self._format.laser_odometry:
+            odometry = {keyword: None for keyword in odometry if keyword not in kinds["scan"]}
+        return LogSummary(
+            paths=(self._path,),
+            format=self._format.name,
+            start_ns=first_ns,
+            end_ns=last_ns,
+            origin_ns=first_ns,
+            topics=tuple(
+                TopicSummary(name, "", "text", s.count, s.first_ns, s.last_ns, s.largest_gap_ns / 1e9)
+                for name, s in sorted(topics.items())
+            ),
+            scan_topic=" + ".join(kinds["scan"]) or None,
+            odom_topic=" + ".join(odometry) or None,
+            truth_topic=" + ".join(kinds["truth"]) or None,
+            odom_frame="odom",
+            base_frame=self._options.base_frame or "base_link",
+            laser_frame=scan.frame_id if scan else None,
+            T_base_laser=mounting,
+            extrinsics=extrinsics,
+            order="log",
+            warnings=tuple(warnings),
+        )
+
+    def _check(self, has_scans: bool, has_odometry: bool) -> None:
+        for flag, name in (("scan", self._options.scan_topic), ("odom", self._options.odom_topic)):
+            if name is not None:
+                raise TopicError(f"{self._path}: a text log has no topics; leave out --{flag}-topic {name}")
+        if self._options.require_scan and not has_scans:
+            raise TopicError(f"{self._path}: no laser lines in this {self._format.name} log")
+        if self._options.require_odometry and not has_odometry:
+            raise TopicError(f"{self._path}: no odometry lines in this {self._format.name} log")
+
+    def events(self, losses: Losses) -> Iterator[tuple[int, Event]]:
+        """As `Source.events`: in the order of the lines; effective stamps are the running maximum."""
+        latest: int | None = None
+        last: dict[tuple[str, type], int] = {}
+        for keyword, line in self._parsed(losses):
+            for event in self._events_of(line):
+                key = (keyword, type(event))
+                if event.stamp_ns < last.get(key, event.stamp_ns):
+                    losses.stamps_backwards[keyword] += 1
+                last[key] = event.stamp_ns
+                latest = event.stamp_ns if latest is None else max(latest, event.stamp_ns)
+                yield latest, event
+
+    def map(self) -> OccupancyGrid | None:
+        """Text logs carry no map."""
+        return None
+
+    def initial_pose(self) -> tuple[int, Pose2] | None:
+        """Text logs state no start."""
+        return None
+
+    def verify(self) -> Losses:
+        """Read every line."""
+        losses = Losses()
+        for _ in self._parsed(losses):
+            pass
+        return losses

@@ -1,0 +1,90 @@
+"""Maps as users name them: a results folder, a map.yaml, or the map.npz of a mapping run."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+from hsloc.errors import MapError
+from hsloc.maps import read_map
+from hsloc.maps.metadata import read_metadata
+from hsloc.slam.map_state import STATE_FILE, fingerprint, read_state
+
+_MAP_TYPES = ("nav_msgs/msg/OccupancyGrid", "foxglove.Grid")
+_HEAD = 4096
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hsloc.log import LogSummary
+    from hsloc.model.occupancy_grid import OccupancyGrid
+    from hsloc.request import RunRequest
+    from hsloc.slam.map_state import MapState
+
+
+def map_file(path: Path) -> Path:
+    """The file meant by --map: in a folder of results its map.yaml."""
+    return path / "map.yaml" if path.is_dir() else path
+
+
+def map_files(path: Path) -> list[Path]:
+    """The files that a map consists of: its YAML and its picture, or its map.npz."""
+    file = map_file(path)
+    if file.suffix == ".npz":
+        return [file]
+    beside = file.with_suffix(".yaml")
+    # As read_map has it: an image may be named, too, with its YAML beside it.
+    return [file, read_metadata(file).image] if file.suffix in (".yaml", ".yml") else [beside, file]
+
+
+def state_file(path: Path) -> Path:
+    """The file meant by --resume: beside map.yaml, or in a folder of results."""
+    if path.is_dir():
+        return path / STATE_FILE
+    return path.with_name(STATE_FILE) if path.suffix == ".yaml" else path
+
+
+def maps_beside(log: Path) -> list[Path]:
+    """Maps of nav2 in the folder of a log, by name: what a user may have meant, but has not said."""
+    folder = log if log.is_dir() else log.parent
+    try:
+        return [path for path in sorted(folder.glob("*.yaml")) if _is_map(path)]
+    except OSError:
+        return []
+
+
+def _is_map(path: Path) -> bool:
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD).decode(errors="replace")
+    return all(re.search(rf"^{key}\s*:", head, re.MULTILINE) for key in ("image", "resolution", "origin"))
+
+
+def unread_maps(summary: LogSummary) -> list[str]:
+    """Topics of maps in a log that gave none: not to be decoded, or several without one being /map."""
+    topics = [f"{t.topic} ({t.typename})" for t in summary.topics if t.typename in _MAP_TYPES and t.count]
+    return topics if len(topics) < 2 else [f"any of {', '.join(topics)}, of which none is /map"]
+
+
+def load_grid(path: Path) -> tuple[OccupancyGrid, tuple[str, ...]]:
+    """The grid to localise in, and what there is to warn of. Raises MapError."""
+    file = map_file(path)
+    if file.suffix == ".npz":
+        return read_state(file).grid, ()
+    if path.is_dir() and not file.exists():
+        raise MapError(f"{path}: a folder without a map.yaml; name a map, or the folder of a mapping run")
+    loaded = read_map(file)
+    return loaded.grid, loaded.warnings
+
+
+def load_state(spec: RunRequest) -> tuple[MapState | None, tuple[str, ...]]:
+    """The saved map that is to be extended, if one is, and what there is to warn of. Raises MapError."""
+    path = spec.resume
+    if path is None:
+        return None, ()
+    file = state_file(path)
+    if not file.exists():
+        raise MapError(f"{path}: no {STATE_FILE} there; --resume wants the results of a run that drew its map")
+    state = read_state(file)
+    if state.fingerprint != fingerprint(spec.mapping()):
+        return state, (f"{file}: drawn with other parameters of the mapper; those of this run are used from here on",)
+    return state, ()

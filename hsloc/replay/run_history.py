@@ -1,0 +1,123 @@
+"""What a run leaves behind while it goes: a row for each odometry message, each scan and each truth."""
+
+from __future__ import annotations
+
+from array import array
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.model.estimate import ScanDiagnostics, Status
+from hsloc.model.events import Odometry, PairedScan, Truth
+from hsloc.model.pose2 import compose_poses
+from hsloc.model.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from hsloc.model.estimate import Estimate
+    from hsloc.model.pose2 import Pose2
+
+
+class RunHistory:
+    """Columns that grow with the log: the result itself, and all of the memory that does."""
+
+    def __init__(self) -> None:
+        self._odometry_stamps = array("q")
+        self._odometry = array("d")
+        self._poses = array("d")
+        self._localised = array("b")
+        self._truth_stamps = array("q")
+        self._truth = array("d")
+        self._scan_stamps = array("q")
+        self._status: list[str] = []
+        self._reason: list[str] = []
+        self._fitness = array("d")
+        self._sigma = array("d")
+        self._evaluations = array("q")
+        self._believed = 0
+        self._searching = False
+        self._revisions: list[tuple[int, tuple[tuple[int, Pose2], ...]]] = []
+
+    def add(self, event: Odometry | PairedScan | Truth, estimate: Estimate | None) -> None:
+        """Take an event and what the estimator said to it."""
+        if isinstance(event, Odometry):
+            if estimate is None:
+                return
+            pose, place = event.T_odom_base, estimate.T_map_base
+            self._odometry_stamps.append(event.stamp_ns)
+            self._odometry.extend((pose.x, pose.y, pose.theta))
+            self._poses.extend((place.x, place.y, place.theta))
+            self._localised.append(estimate.status is not Status.SEARCHING)
+        elif isinstance(event, Truth):
+            truth = event.T_map_base
+            self._truth_stamps.append(event.stamp_ns)
+            self._truth.extend((truth.x, truth.y, truth.theta))
+        elif estimate is not None:
+            self._add_scan(estimate)
+
+    def _add_scan(self, estimate: Estimate) -> None:
+        self._note_belief(estimate.status)
+        self._scan_stamps.append(estimate.stamp_ns)
+        self._status.append(estimate.status.value)
+        self._reason.append(estimate.reason)
+        self._fitness.append(float("nan") if estimate.fitness is None else estimate.fitness)
+        covariance = estimate.covariance
+        if covariance is None:
+            self._sigma.extend((float("nan"),) * 3)
+        else:
+            self._sigma.extend(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+        self._evaluations.append(estimate.evaluations)
+        if estimate.revision:
+            self._revisions.append((len(self._odometry_stamps), estimate.revision))
+
+    def _note_belief(self, status: Status) -> None:
+        """Whoever is lost now has been since the last match that was believed: in hindsight those poses are guesses."""
+        if status is Status.MATCHED or status is Status.RELOCALISED:
+            self._believed = len(self._localised)
+        elif status is Status.SEARCHING and not self._searching:
+            for k in range(self._believed, len(self._localised)):
+                self._localised[k] = 0
+        self._searching = status is Status.SEARCHING
+
+    @property
+    def scans(self) -> int:
+        """Scans so far."""
+        return len(self._scan_stamps)
+
+    def odometry(self) -> Trajectory:
+        """The odometry, one pose a message."""
+        return _trajectory(self._odometry_stamps, self._odometry)
+
+    def reference(self) -> Trajectory | None:
+        """The truth of the log, if it has any."""
+        return _trajectory(self._truth_stamps, self._truth) if self._truth_stamps else None
+
+    def trajectory(self) -> tuple[Trajectory, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+        """One pose for each odometry message, revised where the estimator knew better later; and which are believed."""
+        estimated = _trajectory(self._odometry_stamps, self._poses)
+        if not self._revisions:
+            return estimated, np.array(self._localised, dtype=np.bool_)
+        odometry = self.odometry().poses
+        poses = estimated.poses.copy()
+        localised = np.array(self._localised, dtype=np.bool_)
+        for end, revision in self._revisions:
+            bounds = [k for k, _ in revision[1:]] + [end]
+            for (first, T_map_odom), last in zip(revision, bounds, strict=True):
+                poses[first:last] = compose_poses(T_map_odom.to_array(), odometry[first:last])
+                localised[first:last] = True
+        return Trajectory(estimated.stamps_ns, poses), localised
+
+    def diagnostics(self) -> ScanDiagnostics:
+        """One row for each scan."""
+        return ScanDiagnostics(
+            stamps_ns=np.array(self._scan_stamps, dtype=np.int64),
+            status=tuple(self._status),
+            fitness=np.array(self._fitness, dtype=np.float64),
+            sigma=np.array(self._sigma, dtype=np.float64).reshape(-1, 3),
+            evaluations=np.array(self._evaluations, dtype=np.int64),
+            reason=tuple(self._reason),
+        )
+
+
+def _trajectory(stamps: array[int], poses: array[float]) -> Trajectory:
+    """A view of the columns, which can grow no more while it lives: an hour's would be large to copy."""
+    return Trajectory(np.frombuffer(stamps, dtype=np.int64), np.frombuffer(poses, dtype=np.float64).reshape(-1, 3))

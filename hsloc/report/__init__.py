@@ -1,0 +1,1 @@
+"""Reports of a run: report.png and report.html."""

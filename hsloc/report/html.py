@@ -1,0 +1,315 @@
+"""report.html: all that is known of a run in one file that needs no network, for the screen and for paper."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass, field
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.atomic_write import write_text_atomically
+from hsloc.evaluation.metrics import format_json
+from hsloc.model import Status
+from hsloc.report.data import Curve, prepare, reason_counts, status_counts
+from hsloc.report.notes import remarks_html, text_of
+from hsloc.report.svg_charts import Chart, chart_svg, timeline_html
+from hsloc.report.svg_map import map_svg
+from hsloc.report.table import DASH, summary, table_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from hsloc.model import OccupancyGrid, ScanDiagnostics, Trajectory
+    from hsloc.report.data import ReportData
+
+    Floats = NDArray[np.float64]
+
+STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "sse", "count")
+STATUS_COLOURS: dict[str, str] = {
+    Status.MATCHED: "green",
+    Status.PREDICTED: "sky",
+    Status.REJECTED: "vermillion",
+    Status.NO_RETURNS: "orange",
+    Status.SEARCHING: "purple",
+    Status.RELOCALISED: "blue",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """What it takes to repeat the run: the command as typed, the effective configuration as text, the versions
+    of the programs, and the sha256 of the input files, both by name.
+    """
+
+    command: str = ""
+    config: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    hashes: Mapping[str, str] = field(default_factory=dict)
+
+
+def write_report_html(
+    path: str | Path,
+    *,
+    title: str,
+    trajectory: Trajectory,
+    odometry: Trajectory | None = None,
+    reference: Trajectory | None = None,
+    grid: OccupancyGrid | None = None,
+    diagnostics: ScanDiagnostics | None = None,
+    metrics: Mapping[str, object] | None = None,
+    points: Floats | None = None,
+    provenance: Provenance | None = None,
+    convergence: Mapping[str, tuple[Floats, Floats]] | None = None,
+) -> None:
+    """Write the report of a run as one self-contained HTML file: the same run gives the same bytes.
+
+    Arguments as for `draw_report`; `convergence` holds, by name, curves of the best fitness over the number of
+    evaluations, two arrays of shape (n,). All text is escaped. Raises `OutputError` where it cannot be written.
+    """
+    metrics = {} if metrics is None else metrics
+    provenance = Provenance() if provenance is None else provenance
+    data = prepare(trajectory, odometry, reference, diagnostics, metrics)
+    drawing, extent = map_svg(data, grid, points)
+    charts, end = time_charts(data, drifts=text_of(metrics, "run", "mode") == "slam"), _end(data)
+    fragments = {
+        "title": escape(title),
+        "facts": "".join(f"<li>{escape(fact)}</li>" for fact in summary(data, metrics)),
+        "map": drawing,
+        "aspect": f"{min(max(extent.aspect, 0.7), 3.0):.4g}",
+        "legend": _legend(data, grid, points),
+        "headline": _headline(data, metrics),
+        "charts": "".join(_figure(chart, end) for chart in charts) + _convergence(convergence),
+        "remarks": remarks_html(metrics),
+        "scans": _scans(data, end),
+        "statistics": _statistics(metrics),
+        "provenance": _provenance(provenance),
+        "metrics": escape(format_json(metrics)) if metrics else "",
+        "data": _script_json(_page_data(data, charts)),
+        "style": _template("report.css"),
+        "script": _template("report.js"),
+    }
+    write_text_atomically(Path(path), _fill(_template("report.html"), fragments))
+
+
+def time_charts(data: ReportData, drifts: bool = False) -> list[Chart]:
+    """All that is known over time: errors where there is truth, fitness, standard deviations, effort.
+
+    With `drifts` the standard deviations are those of a map that is being drawn, before its loops are closed.
+    """
+    of = ", before loops are closed" if drifts else ""
+    charts = []
+    lost = () if data.scans is None else data.scans.lost
+    if data.errors is not None:
+        metres, angle = data.errors.translation_m, data.errors.rotation_deg
+        centimetres = Curve(metres.seconds, metres.values * 100.0)
+        charts.append(Chart("error_cm", "Translation error", "cm", centimetres, spans=lost))
+        charts.append(Chart("error_deg", "Rotation error", "deg", angle, spans=lost))
+    scans = data.scans
+    if scans is not None:
+        refused = scans.where(Status.REJECTED) & np.isfinite(scans.fitness)
+        fitness = Curve(scans.seconds, np.where(refused, np.nan, scans.fitness))
+        marks = Curve(scans.seconds[refused], scans.fitness[refused])
+        charts.append(Chart("fitness", "Fitness of the match", "", fitness, "green", 1.0, False, marks, lost))
+        sigma = Curve(scans.seconds, scans.sigma_m * 100.0)
+        charts.append(Chart("sigma_cm", f"Position, standard deviation{of}", "cm", sigma, "blue", spans=lost))
+        sigma = Curve(scans.seconds, scans.sigma_deg)
+        charts.append(Chart("sigma_deg", f"Heading, standard deviation{of}", "deg", sigma, "blue", spans=lost))
+        spent = Curve(scans.seconds, np.where(scans.evaluations > 0, scans.evaluations, np.nan))
+        charts.append(Chart("evaluations", "Fitness evaluations of the search", "", spent, "purple", spans=lost))
+    return [_without_gaps(chart) for chart in charts if np.isfinite(chart.curve.values).any()]
+
+
+def _without_gaps(chart: Chart) -> Chart:
+    """Without the NaN of scans that were not matched; where the pose was lost the line still breaks."""
+    curve = chart.curve
+    inside = np.zeros(len(curve.seconds), dtype=bool)
+    for begin, until in chart.spans:
+        inside |= (curve.seconds >= begin) & (curve.seconds < until)
+    keep = np.isfinite(curve.values) | inside
+    kept = Curve(curve.seconds[keep], curve.values[keep])
+    return Chart(
+        chart.name, chart.title, chart.unit, kept, chart.colour, chart.top, chart.from_zero, chart.marks, chart.spans
+    )
+
+
+def _end(data: ReportData) -> float:
+    scans = 0.0 if data.scans is None else float(data.scans.seconds.max(initial=0.0))
+    return max(data.duration_s, scans)
+
+
+def _figure(chart: Chart, end: float) -> str:
+    unit = f' <span class="muted">{escape(chart.unit)}</span>' if chart.unit else ""
+    return (
+        f"<figure><figcaption>{escape(chart.title)}{unit}"
+        f'<output data-for="{escape(chart.name)}"></output></figcaption>{chart_svg(chart, end)}</figure>'
+    )
+
+
+def _convergence(convergence: Mapping[str, tuple[Floats, Floats]] | None) -> str:
+    parts = []
+    for index, (name, (evaluations, fitness)) in enumerate((convergence or {}).items()):
+        curve = Curve(np.asarray(evaluations, dtype=np.float64), np.asarray(fitness, dtype=np.float64))
+        if len(curve.seconds):
+            title, unit = f"Convergence: {name}", "median best fitness over evaluations"
+            chart = Chart(f"convergence{index}", title, unit, curve, "green", 1.0, False, over_time=False)
+            parts.append(_figure(chart, float(curve.seconds.max())))
+    return "".join(parts)
+
+
+def _legend(data: ReportData, grid: OccupancyGrid | None, points: Floats | None) -> str:
+    entries = [
+        ("map", "map", grid is not None),
+        ("points", "map points", points is not None and len(points) > 0),
+        ("trajectory", "trajectory", len(data.path) > 0),
+        ("reference", "reference", data.reference is not None and len(data.reference) > 0),
+        ("odometry", "odometry alone", data.odometry is not None and len(data.odometry) > 0),
+    ]
+    if data.scans is not None:
+        for status, label in (
+            (Status.REJECTED, "scan rejected"),
+            (Status.NO_RETURNS, "scan without returns"),
+            (Status.RELOCALISED, "pose found"),
+        ):
+            entries.append((str(status), label, bool(data.scans.where(status).any())))
+    return (
+        "".join(
+            f'<label><input type="checkbox" checked data-toggle="{name}"><i class="key {name}"></i>{label}</label>'
+            for name, label, there in entries
+            if there
+        )
+        + (
+            '<span><i class="key start"></i>start</span><span><i class="key end"></i>end</span>'
+            if len(data.path)
+            else ""
+        )
+        + ('<span><i class="key guessed"></i>pose unknown</span>' if not data.believed.all() else "")
+    )
+
+
+def _headline(data: ReportData, metrics: Mapping[str, object]) -> str:
+    rows = []
+    paired = False
+    for row in table_rows(data, metrics):
+        if len(row.values) == 2 and not paired:
+            paired = True
+            rows.append('<tr><td></td><th scope="col">translation</th><th scope="col">rotation</th></tr>')
+        cells = "".join(f"<td>{escape(value)}</td>" for value in row.values)
+        if len(row.values) == 1:
+            cells = f'<td colspan="2">{escape(row.values[0])}</td>'
+        rows.append(f'<tr><th scope="row">{escape(row.label)}</th>{cells}</tr>')
+    return f'<table class="headline">{"".join(rows)}</table>' if rows else ""
+
+
+def _scans(data: ReportData, end: float) -> str:
+    scans = data.scans
+    if scans is None:
+        return ""
+    counts = status_counts(scans)
+    spacing = float(np.median(np.diff(scans.seconds))) if len(scans.seconds) > 1 else 1.0
+    rows = [
+        (name.replace("_", " "), count, STATUS_COLOURS.get(name, "blue"), scans.seconds[scans.where(name)])
+        for name, count in counts.items()
+    ]
+    table = "".join(
+        f'<tr><th scope="row">{escape(status.replace("_", " "))}</th>'
+        f'<td class="words">{escape(reason) or "no reason given"}</td><td>{count}</td></tr>'
+        for status, reason, count in reason_counts(scans)
+    )
+    why = (
+        f'<table><tr><th scope="col" class="words">status</th><th scope="col" class="words">why</th>'
+        f'<th scope="col">scans</th></tr>{table}</table>'
+        if table
+        else "<p>Every scan was used.</p>"
+    )
+    return f"<section><h2>Scans</h2>{timeline_html(rows, spacing, end)}{why}</section>"
+
+
+def _statistics(metrics: Mapping[str, object]) -> str:
+    rows = []
+    for key, entry in metrics.items():
+        if not isinstance(entry, dict):
+            continue
+        delta = f" per {entry['delta']:g} {entry.get('delta_unit', '')}" if "delta" in entry else ""
+        label = ("APE" if key == "ape" else "RPE" if key.startswith("rpe") else key) + delta
+        for name, unit in (("trans_part", "m"), ("angle_deg", "deg")):
+            values = entry.get(name)
+            if isinstance(values, dict):
+                cells = "".join(f"<td>{_cell(values.get(statistic))}</td>" for statistic in STATISTICS)
+                rows.append(f'<tr><th scope="row">{escape(label)} {name} ({unit})</th>{cells}</tr>')
+    if not rows:
+        return ""
+    head = "".join(f'<th scope="col">{name}</th>' for name in STATISTICS)
+    about = ", ".join(
+        f"{key.replace('_', ' ')} {metrics[key]}"
+        for key in ("alignment", "association", "t_max_diff", "matched", "unmatched_reference", "unmatched_estimate")
+        if key in metrics
+    )
+    return (
+        f'<section><h2>Errors</h2><p class="muted">{escape(about)}</p>'
+        f'<div class="scroll"><table><tr><td></td>{head}</tr>{"".join(rows)}</table></div></section>'
+    )
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return DASH
+    return str(value) if isinstance(value, int) else f"{value:.4f}" if value == value else DASH
+
+
+def _provenance(provenance: Provenance) -> str:
+    parts = []
+    if provenance.command:
+        parts.append(f"<h3>Command</h3><pre>{escape(provenance.command)}</pre>")
+    for heading, entries in (("Versions", provenance.versions), ("SHA-256 of the input", provenance.hashes)):
+        if entries:
+            rows = "".join(
+                f'<tr><th scope="row">{escape(name)}</th><td class="words"><code>{escape(value)}</code></td></tr>'
+                for name, value in entries.items()
+            )
+            parts.append(f'<h3>{heading}</h3><div class="scroll"><table>{rows}</table></div>')
+    if provenance.config:
+        parts.append(f"<h3>Configuration</h3><pre>{escape(provenance.config)}</pre>")
+    return f"<section><h2>To repeat this run</h2>{''.join(parts)}</section>" if parts else ""
+
+
+def _page_data(data: ReportData, charts: list[Chart]) -> dict[str, object]:
+    """What the script reads under the pointer: the curves, and where the robot was."""
+    order = np.argsort(data.seconds, kind="stable")
+    order = order[:: max(1, len(order) // 3000)]
+    thin = {chart.name: chart.curve.thinned(1500) for chart in charts}
+    return {
+        "charts": {
+            chart.name: {
+                "t": _short(thin[chart.name].seconds), "v": _short(thin[chart.name].values), "unit": chart.unit
+            }
+            for chart in charts
+        },
+        "path": {"t": _short(data.seconds[order]), "x": _short(data.path[order, 0]), "y": _short(data.path[order, 1])},
+    }  # fmt: skip
+
+
+def _short(values: Floats) -> list[float | None]:
+    """Seven figures are enough to read."""
+    return [float(f"{value:.7g}") if value == value else None for value in values.tolist()]
+
+
+def _script_json(values: dict[str, object]) -> str:
+    """JSON that cannot end the <script> element it stands in."""
+    text = json.dumps(values, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _template(name: str) -> str:
+    return (files("hsloc.report") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _fill(template: str, fragments: Mapping[str, str]) -> str:
+    """Put each fragment in the place of its {{name}}, in one pass: what a fragment holds is never a place."""
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: fragments[found[1]], template)

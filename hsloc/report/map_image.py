@@ -1,0 +1,178 @@
+"""Which part of the world a report shows, and the map as a picture of grey levels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import ceil
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.model import Pose2
+from hsloc.report import style
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hsloc.model import OccupancyGrid
+    from hsloc.report.data import ReportData
+
+    Floats = NDArray[np.float64]
+
+MARGIN = 0.05
+"""Free room around what is shown, as a part of the larger side."""
+
+LEAST_SIZE = 0.5
+"""Metres: a robot that stood still gets some ground to stand on."""
+
+SURROUNDINGS = 10.0
+"""Metres of map shown around the path at least, where there are so many; more around a path that is longer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """The rectangle of the map frame that the panel shows, metres."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+    @property
+    def width(self) -> float:
+        """Along x."""
+        return self.x1 - self.x0
+
+    @property
+    def height(self) -> float:
+        """Along y."""
+        return self.y1 - self.y0
+
+    @property
+    def aspect(self) -> float:
+        """Width by height."""
+        return self.width / self.height
+
+    def widened(self, aspect: float) -> Extent:
+        """The smallest rectangle around this one, with the same middle, that has another aspect."""
+        wider, higher = max(self.width, self.height * aspect), max(self.height, self.width / aspect)
+        x, y = (self.x0 + self.x1) / 2.0, (self.y0 + self.y1) / 2.0
+        return Extent(x - wider / 2.0, y - higher / 2.0, x + wider / 2.0, y + higher / 2.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """The known part of a map as RGBA (height, width, 4), row 0 at the bottom; unknown is clear.
+
+    `T_map_corner` is the pose of its lower left corner, `side` the side of a pixel in metres.
+    """
+
+    levels: NDArray[np.uint8]
+    T_map_corner: Pose2
+    side: float
+
+    @property
+    def width(self) -> float:
+        """In metres."""
+        return float(self.levels.shape[1] * self.side)
+
+    @property
+    def height(self) -> float:
+        """In metres."""
+        return float(self.levels.shape[0] * self.side)
+
+
+def picture_of(grid: OccupancyGrid, most_pixels: float) -> Picture | None:
+    """The map as a picture whose sides have at most `most_pixels`; None where nothing is known."""
+    bounds = _known_bounds(grid)
+    if bounds is None:
+        return None
+    row, column, last_row, last_column = bounds
+    cells = grid.cells[row : last_row + 1, column : last_column + 1]
+    factor = max(1, ceil(max(cells.shape) / most_pixels))
+    corner = grid.origin @ (np.array((column, row)) * grid.resolution)
+    return Picture(
+        grey_levels()[np.clip(darkest_of_blocks(cells, factor), -1, 100)],
+        Pose2(float(corner[0]), float(corner[1]), grid.origin.theta),
+        factor * grid.resolution,
+    )
+
+
+def shown_extent(data: ReportData, grid: OccupancyGrid | None, points: Floats | None) -> Extent:
+    """All of the trajectory and the reference, and the known map around them. Odometry may leave the picture.
+
+    Of a map that is far larger than the path only what lies within `SURROUNDINGS` of the path is shown.
+    """
+    ways = _finite(np.concatenate((data.path, np.zeros((0, 2)) if data.reference is None else data.reference)))
+    ground = _finite(
+        np.concatenate(
+            (np.zeros((0, 2)) if points is None else points, np.zeros((0, 2)) if grid is None else _known_corners(grid))
+        )
+    )
+    if len(ways) and len(ground):
+        low, high = ways.min(axis=0), ways.max(axis=0)
+        around = max(float((high - low).max()), SURROUNDINGS)
+        ground = np.clip(ground, low - around, high + around)
+    every = np.concatenate((ways, ground))
+    if len(every) == 0:
+        return Extent(-1.0, -1.0, 1.0, 1.0)
+    low, high = every.min(axis=0), every.max(axis=0)
+    size = max(float((high - low).max()), LEAST_SIZE)
+    middle, half = (low + high) / 2.0, np.maximum(high - low, 0.08 * size) / 2.0 + MARGIN * size
+    return Extent(*(middle - half).tolist(), *(middle + half).tolist())
+
+
+def line_width(data: ReportData, extent: Extent) -> float:
+    """Width of the trajectory in pixels: a path that goes to and fro for long must not bury the map."""
+    laps = data.length_m / max(extent.width, extent.height)
+    return float(np.clip(3.0 * np.sqrt(5.0 / max(laps, 1e-9)), 1.6, 3.0))
+
+
+def _finite(xy: Floats) -> Floats:
+    return xy[np.isfinite(xy).all(axis=1)]
+
+
+def _known_bounds(grid: OccupancyGrid) -> tuple[int, int, int, int] | None:
+    """First row and column, last row and column of the rectangle that holds all known cells."""
+    known = grid.cells >= 0
+    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    if len(rows) == 0:
+        return None
+    return int(rows[0]), int(columns[0]), int(rows[-1]), int(columns[-1])
+
+
+def _known_corners(grid: OccupancyGrid) -> Floats:
+    """Corners in the map frame of that rectangle, shape (4, 2); or of no cell, (0, 2)."""
+    bounds = _known_bounds(grid)
+    if bounds is None:
+        return np.zeros((0, 2))
+    y0, x0, y1, x1 = bounds
+    corners = np.array([(x0, y0), (x1 + 1, y0), (x1 + 1, y1 + 1), (x0, y1 + 1)], dtype=np.float64)
+    return grid.origin @ (corners * grid.resolution)
+
+
+def darkest_of_blocks(cells: NDArray[np.int8], factor: int) -> NDArray[np.int8]:
+    """The map made smaller: each block of factor x factor cells becomes its most occupied one.
+
+    A mean would let walls that are one cell thick fade away.
+    """
+    if factor == 1:
+        return cells
+    height, width = (-(-side // factor) * factor for side in cells.shape)
+    padded = np.full((height, width), -1, dtype=np.int8)
+    padded[: cells.shape[0], : cells.shape[1]] = cells
+    blocks = padded.reshape(height // factor, factor, width // factor, factor)
+    result: NDArray[np.int8] = blocks.max(axis=(1, 3))
+    return result
+
+
+def grey_levels() -> NDArray[np.uint8]:
+    """RGBA of the values 0 (free) .. 100 (wall), and clear as the last row, which -1 (unknown) finds: (102, 4)."""
+    free, wall = (np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) for colour in (style.FREE, style.WALL))
+    part = np.linspace(0.0, 1.0, 101)[:, None]
+    levels = np.zeros((102, 4), dtype=np.uint8)
+    levels[:101, :3] = np.round(free * (1.0 - part) + wall * part)
+    levels[:101, 3] = 255
+    # Clear, but of the colour of the ground: a scaled picture mixes the colours of neighbours.
+    levels[101, :3] = [int(style.UNKNOWN[i : i + 2], 16) for i in (1, 3, 5)]
+    return levels

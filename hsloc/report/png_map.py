@@ -1,0 +1,163 @@
+"""The large panel of report.png: the map, and where the robot went on it."""
+
+from __future__ import annotations
+
+from math import floor, log10
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.transforms import Affine2D
+
+from hsloc.model import Status
+from hsloc.report import style
+from hsloc.report.map_image import line_width, picture_of
+from hsloc.report.polyline import joined, pieces_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from numpy.typing import NDArray
+
+    from hsloc.model import OccupancyGrid
+    from hsloc.report.data import ReportData
+    from hsloc.report.map_image import Extent
+
+    Floats = NDArray[np.float64]
+
+HALO = [withStroke(linewidth=3.0, foreground="white")]
+
+
+def draw_map(
+    axes: Axes, data: ReportData, grid: OccupancyGrid | None, points: Floats | None, extent: Extent, pixels: float
+) -> None:
+    """Fill the panel, which is about `pixels` wide or high, whichever is more."""
+    axes.set_facecolor(style.UNKNOWN if grid is not None else style.PAPER)
+    if grid is not None:
+        _draw_grid(axes, grid, pixels)
+    if points is not None and len(points):
+        axes.plot(points[:, 0], points[:, 1], ".", color=style.WALL, markersize=2.2, label="map points", zorder=2)
+    _draw_paths(axes, data, line_width(data, extent), max(extent.width, extent.height) / pixels)
+    _draw_marks(axes, data)
+    _draw_ends(axes, data, extent)
+    _draw_scale_bar(axes, extent)
+    axes.set_xlim(extent.x0, extent.x1)
+    axes.set_ylim(extent.y0, extent.y1)
+    axes.set_aspect("equal", adjustable="box")
+    axes.tick_params(length=3, labelsize=style.SMALL, color=style.RULE, labelcolor=style.MUTED)
+    unit, metres = ("km", 1000.0) if max(extent.width, extent.height) > 5000.0 else ("m", 1.0)
+    for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y")):
+        axis.set_label_text(f"{name} [{unit}]", fontsize=style.SMALL, color=style.MUTED)
+        axis.labelpad = 2
+        axis.set_major_locator(MaxNLocator(9, steps=[1, 2, 5, 10]))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / metres:.10g}".replace("-", "−")))
+    if grid is None:
+        axes.grid(color=style.RULE, linewidth=0.7)
+        axes.set_axisbelow(True)
+    for spine in axes.spines.values():
+        spine.set_color(style.RULE)
+
+
+def _draw_grid(axes: Axes, grid: OccupancyGrid, pixels: float) -> None:
+    picture = picture_of(grid, pixels)
+    if picture is None:
+        return
+    image = axes.imshow(
+        picture.levels, origin="lower", zorder=1, interpolation="antialiased",
+        extent=(0.0, picture.width, 0.0, picture.height), aspect="equal",
+    )  # fmt: skip
+    pose = picture.T_map_corner
+    image.set_transform(Affine2D().rotate(pose.theta).translate(pose.x, pose.y) + axes.transData)
+
+
+def _draw_paths(axes: Axes, data: ReportData, width: float, pixel: float) -> None:
+    """In the order of the legend; what lies over what is said by zorder. Nothing finer than half a pixel is drawn."""
+
+    def seen(xy: Floats) -> Floats:
+        return joined(pieces_of(xy, 0.5 * pixel))
+
+    if len(data.path):
+        known = seen(np.where(data.believed[:, None], data.path, np.nan))
+        axes.plot(*known.T, color=style.BLUE, linewidth=width, label="trajectory", zorder=5, solid_capstyle="round")
+    if data.reference is not None and len(data.reference):
+        axes.plot(
+            *seen(data.reference).T, color="black", linewidth=1.0, linestyle=(0, (5, 3)), label="reference", zorder=6
+        )
+    if data.odometry is not None and len(data.odometry):
+        axes.plot(
+            *seen(data.odometry).T, color=style.VERMILLION, alpha=0.7, linewidth=1.3, linestyle=(0, (1, 1.2)),
+            label="odometry alone", zorder=3,
+        )  # fmt: skip
+    if not data.believed.all():
+        guessed = seen(np.where(data.believed[:, None], np.nan, data.path))
+        axes.plot(
+            *guessed.T, color=style.PURPLE, linewidth=2.0, linestyle=(0, (0.8, 1.2)), label="pose unknown", zorder=4
+        )
+
+
+def _draw_marks(axes: Axes, data: ReportData) -> None:
+    if data.scans is None:
+        return
+    for statuses, label, marker, colour, size, zorder in (
+        ((Status.NO_RETURNS,), "scan without returns", "v", style.ORANGE, 5.0, 7),
+        ((Status.REJECTED,), "scan rejected", "x", style.VERMILLION, 5.0, 8),
+        ((Status.RELOCALISED,), "pose found", "*", style.ORANGE, 13.0, 9),
+    ):
+        xy = data.scans.xy[data.scans.where(*statuses)]
+        if len(xy):
+            axes.plot(
+                *xy.T, linestyle="none", marker=marker, color=colour, markersize=size, label=label, zorder=zorder,
+                markeredgewidth=1.4 if marker == "x" else 0.7,
+                markeredgecolor=colour if marker == "x" else style.INK,
+            )  # fmt: skip
+
+
+def _draw_ends(axes: Axes, data: ReportData, extent: Extent) -> None:
+    if not len(data.path):
+        axes.text(
+            0.5, 0.5, "no pose", transform=axes.transAxes, ha="center", va="center", color=style.MUTED, fontsize=14
+        )
+        return
+    order = np.argsort(data.seconds, kind="stable")
+    start, end = data.path[order[0]], data.path[order[-1]]
+    together = np.hypot(*(end - start)) < 0.04 * max(extent.width, extent.height)
+    for xy, marker, colour, label in (
+        (end, "s", style.VERMILLION, "" if together else "end"),
+        (start, "o", style.GREEN, "start, end" if together else "start"),
+    ):
+        axes.plot(
+            *xy, marker=marker, color=colour, markersize=9, markeredgecolor="white", markeredgewidth=1.5, zorder=10
+        )
+        near_the_edge = xy[0] > extent.x1 - 0.1 * extent.width
+        axes.annotate(
+            label, xy, xytext=(-8 if near_the_edge else 8, 8), textcoords="offset points", fontsize=style.TEXT,
+            fontweight="bold", color=style.INK, path_effects=HALO, zorder=11, ha="right" if near_the_edge else "left",
+        )  # fmt: skip
+
+
+def _draw_scale_bar(axes: Axes, extent: Extent) -> None:
+    """A bar of a round length, up to a fifth of the width, in the lower left corner."""
+    length = round_length(extent.width / 5.0)
+    x, y = extent.x0 + 0.025 * extent.width, extent.y0 + 0.035 * extent.height
+    axes.plot(
+        (x, x + length), (y, y), color=style.INK, linewidth=3.0, solid_capstyle="butt", zorder=12,
+        path_effects=[withStroke(linewidth=6.0, foreground="white")],
+    )  # fmt: skip
+    axes.annotate(
+        format_round_length(length), (x + length / 2.0, y), xytext=(0, 5),
+        textcoords="offset points", ha="center", fontsize=style.TEXT, color=style.INK, path_effects=HALO, zorder=12,
+    )  # fmt: skip
+
+
+def round_length(metres: float) -> float:
+    """The nearest smaller 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** floor(log10(metres))
+    return float(next(step * power for step in (5.0, 2.0, 1.0) if step * power <= metres * (1.0 + 1e-12)))
+
+
+def format_round_length(metres: float) -> str:
+    """5 mm, 20 cm, 5 m, 2 km."""
+    for limit, factor, unit in ((0.0095, 1e3, "mm"), (0.95, 1e2, "cm"), (950.0, 1.0, "m")):
+        if metres < limit:
+            return f"{metres * factor:g} {unit}"
+    return f"{metres / 1000.0:g} km"

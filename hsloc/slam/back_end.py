@@ -1,0 +1,248 @@
+"""After the log: loops, graph, refinement and the map, from what the front end has gathered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.errors import MapError
+from hsloc.model.occupancy_grid import OccupancyGrid
+from hsloc.model.pose2 import Pose2, wrap_angles
+from hsloc.slam.calibration import OdometryCalibration
+from hsloc.slam.joint_registration import Registration, moved_scans, refine
+from hsloc.slam.loop_closer import Loop, LoopCloser
+from hsloc.slam.map_extension import connect, unconnected
+from hsloc.slam.map_session import from_front_end
+from hsloc.slam.map_state import MapState, fingerprint
+from hsloc.slam.occupancy_mapper import draw_grid
+from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
+from hsloc.slam.result import MappingQuality, MappingResult
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.random import Generator
+    from numpy.typing import NDArray
+
+    from hsloc.slam.front_end import LocalMatch
+    from hsloc.slam.keyscans import KeyScan, KeyScans
+    from hsloc.slam.map_session import MapSession
+    from hsloc.slam.parameters import GraphMapperParameters, Resume
+    from hsloc.slam.submaps import Submaps
+    from hsloc.slam.trajectory_correction import EventLog
+
+    F64 = NDArray[np.float64]
+    I64 = NDArray[np.int64]
+
+MAX_EDGE_CHI = 6.0
+"""A loop whose chi is larger than this once the graph is solved was wrong."""
+_MOST_TORN = 5
+"""So often at most the loops are looked for anew, each time without the worst wrong one."""
+_RESIDUAL_SCANS = 400
+"""Scans whose residuals are measured."""
+
+
+def finish(
+    scans: list[KeyScan],
+    stamps_ns: I64,
+    local: list[LocalMatch],
+    track: EventLog,
+    parameters: GraphMapperParameters,
+    rng: Generator,
+    progress: Callable[[float], None] | None = None,
+    resume: Resume | None = None,
+) -> MappingResult:
+    """Close loops, refine, draw; with `resume`, in and with a saved map.
+
+    Raises MapError if the log cannot be connected with the saved map.
+    """
+    tell = progress if progress is not None else _silent
+    if not scans:
+        if resume is not None:
+            raise MapError(unconnected(resume.state))
+        return _empty(track)
+    gathered = from_front_end(scans, stamps_ns, local, track, parameters)
+    if resume is not None:
+        gathered = connect(resume.state, gathered, parameters, rng, resume.T_map_first)
+    poses, loops, loop_edges = _close_loops(gathered, parameters, rng, lambda part: tell(0.5 * part))
+    if resume is not None and not any(loop.accepted and _connects(loop, gathered) for loop in loops):
+        raise MapError(unconnected(resume.state))
+    edges = Edges.concatenate([gathered.steps, loop_edges])
+    refined, passes = _refine(poses, gathered.scans, edges, parameters, lambda part: tell(0.5 + 0.4 * part))
+    grid = draw_grid(refined.poses, gathered.scans, parameters.occupancy)
+    tell(1.0)
+    of_log = refined.poses[gathered.first :]
+    calibration = track.calibrated(of_log) if parameters.use_odometry else OdometryCalibration()
+    odometry_poses, scan_poses = track.corrected(of_log, calibration)
+    return MappingResult(
+        odometry_poses=odometry_poses,
+        scan_poses=scan_poses,
+        revision=_revision(odometry_poses, track) if parameters.use_odometry else (),
+        keyscan_stamps_ns=gathered.stamps_ns,
+        keyscan_poses=refined.poses,
+        grid=grid,
+        graph=PoseGraph(gathered.stamps_ns, refined.poses, edges),
+        loops=tuple(loops),
+        quality=_quality(refined, passes, loops, loop_edges, grid, gathered.scans),
+        calibration=calibration,
+        state=_state(gathered, refined.poses, loop_edges, grid, parameters),
+    )
+
+
+def _connects(loop: Loop, gathered: MapSession) -> bool:
+    return loop.first < gathered.first_place <= loop.second
+
+
+def _state(
+    gathered: MapSession, poses: F64, loops: Edges, grid: OccupancyGrid, parameters: GraphMapperParameters
+) -> MapState:
+    return MapState(
+        scans=gathered.scans,
+        stamps_ns=gathered.stamps_ns,
+        poses=poses,
+        covariances=gathered.covariances,
+        refused=gathered.refused,
+        steps=gathered.steps,
+        loops=loops,
+        grid=grid,
+        fingerprint=fingerprint(parameters),
+    )
+
+
+def _close_loops(
+    gathered: MapSession, parameters: GraphMapperParameters, rng: Generator, progress: Callable[[float], None]
+) -> tuple[F64, list[Loop], Edges]:
+    """Poses of the keyscans with all loops closed, the loops, and those accepted as edges between keyscans."""
+    p, places, chain = parameters.loops, gathered.places, gathered.chain
+    torn: list[Loop] = []
+    while True:
+        banned = frozenset((loop.first, loop.second) for loop in torn)
+        closer = LoopCloser(places, gathered.scans, p, rng, banned, gathered.known, gathered.first_place)
+        closer.close(progress)
+        solved, edges, worst = _solved(closer, places, chain, p.robust)
+        if worst is None or len(torn) >= _MOST_TORN:
+            break
+        # What was searched for after a wrong loop was searched for in wrong places: all of it once more, without it.
+        torn.append(worst)
+    loops = closer.loops
+    while worst is not None:
+        loops = [loop if loop.first != worst.first or loop.second != worst.second else worst for loop in loops]
+        closer.loops = loops
+        solved, edges, worst = _solved(closer, places, chain, p.robust)
+    return solved, [*loops, *torn], edges
+
+
+def _solved(closer: LoopCloser, places: Submaps, chain: Edges, robust: float) -> tuple[F64, Edges, Loop | None]:
+    """The graph of keyscans solved with the loops, and the loop that tears worst, if any does, as refused."""
+    edges = _between_keyscans(closer.loops, places, robust)
+    solved = solve_edges(places.expand(closer.poses), Edges.concatenate([chain, edges]))
+    _, _, chi = edge_errors(solved, edges)
+    if not (chi > MAX_EDGE_CHI).any():
+        return solved, edges, None
+    loop = closer.accepted[int(np.argmax(chi))]
+    return solved, edges, replace(loop, accepted=False, reason=f"torn: {chi.max():.0f} sigma off, the graph solved")
+
+
+def _between_keyscans(loops: list[Loop], places: Submaps, robust: float) -> Edges:
+    accepted = [loop for loop in loops if loop.accepted]
+    if not accepted:
+        return Edges.none()
+    reference = places.reference
+    return Edges(
+        np.array([(reference[loop.first], reference[loop.second]) for loop in accepted], dtype=np.int64),
+        np.array([loop.T_first_second.to_array() for loop in accepted]),
+        np.array([np.linalg.inv(loop.covariance) for loop in accepted]),
+        np.full(len(accepted), robust),
+    )
+
+
+def _refine(
+    poses: F64, scans: KeyScans, edges: Edges, parameters: GraphMapperParameters, progress: Callable[[float], None]
+) -> tuple[Registration, int]:
+    """Passes over the whole log, each with partners chosen anew, until nothing moves."""
+    most, p = parameters.passes, parameters.joint_registration
+    # Later passes begin near their end: no wide gates, and fewer rounds.
+    later = replace(p, gates=p.gates[-1:], rounds=max(p.rounds // 2, 1))
+    refined = refine(poses, scans, edges, p, lambda part: progress(part / most))
+    passes = 1
+    while passes < most:
+        begin = refined.poses
+        done = passes
+        refined = refine(begin, scans, edges, later, lambda part: progress((done + part) / most))  # noqa: B023
+        passes += 1
+        change = refined.poses - begin
+        change[:, 2] = wrap_angles(change[:, 2])
+        if moved_scans(change) < p.convergence_tolerance:
+            break
+    return refined, passes
+
+
+def _revision(odometry_poses: F64, track: EventLog) -> tuple[tuple[int, Pose2], ...]:
+    return tuple(
+        (k, Pose2.from_array(pose) @ Pose2.from_array(odometry).inverse())
+        for k, (pose, odometry) in enumerate(zip(odometry_poses, track.odometry(), strict=True))
+    )
+
+
+def _quality(
+    refined: Registration, passes: int, loops: list[Loop], edges: Edges, grid: OccupancyGrid, scans: KeyScans
+) -> MappingQuality:
+    nan = float("nan")
+    distance, angle, _ = edge_errors(refined.poses, edges)
+    residuals = _residuals(refined.poses, scans, grid)
+    median, p95 = np.percentile(residuals, (50.0, 95.0)) if len(residuals) else (nan, nan)
+    return MappingQuality(
+        residual_median=float(median),
+        residual_p95=float(p95),
+        scan_rms=refined.rms,
+        conflict=refined.conflict,
+        loops=len(edges),
+        loops_refused=sum(not loop.accepted for loop in loops),
+        loop_median=float(np.median(distance)) if len(edges) else nan,
+        loop_max=float(distance.max()) if len(edges) else nan,
+        loop_angle_median_deg=float(np.degrees(np.median(angle))) if len(edges) else nan,
+        loop_angle_max_deg=float(np.degrees(angle.max())) if len(edges) else nan,
+        keyscans=len(scans),
+        passes=passes,
+        moved=refined.moved,
+    )
+
+
+def _residuals(poses: F64, scans: KeyScans, grid: OccupancyGrid) -> F64:
+    """Distances (m) of points to the nearest occupied cell's centre, of scans evenly chosen."""
+    from scipy.spatial import cKDTree
+
+    walls = grid.centres(grid.occupied())
+    if len(walls) == 0:
+        return np.zeros(0)
+    tree = cKDTree(walls)
+    chosen = np.unique(np.linspace(0, len(scans) - 1, _RESIDUAL_SCANS).astype(np.int64))
+    parts = [Pose2.from_array(poses[k]) @ scans.hits(int(k)).astype(np.float64) for k in chosen]
+    distances: F64 = np.asarray(tree.query(np.concatenate(parts))[0], dtype=np.float64)
+    return distances
+
+
+def _empty(track: EventLog) -> MappingResult:
+    """No scan had a return: odometry is all there is."""
+    nan = float("nan")
+    odometry_poses, scan_poses = track.corrected(np.zeros((0, 3)))
+    none = np.zeros(0, dtype=np.int64)
+    return MappingResult(
+        odometry_poses=odometry_poses,
+        scan_poses=scan_poses,
+        revision=(),
+        keyscan_stamps_ns=none,
+        keyscan_poses=np.zeros((0, 3)),
+        grid=OccupancyGrid(np.full((1, 1), -1, dtype=np.int8), 0.05),
+        graph=PoseGraph(none, np.zeros((0, 3)), Edges.none()),
+        loops=(),
+        quality=MappingQuality(nan, nan, nan, nan, 0, 0, nan, nan, nan, nan, 0, 0, 0.0),
+        calibration=OdometryCalibration(),
+        state=None,
+    )
+
+
+def _silent(_: float) -> None:
+    """Nobody is told."""

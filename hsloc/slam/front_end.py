@@ -1,0 +1,298 @@
+"""The front end: each scan against the scans just before it.
+
+Odometry predicts, HIDE searches the box of the prediction on a field drawn from the recent keyscans, and prediction
+and match are weighed by their covariances. A scan that moved far enough becomes a keyscan. Drift is left to the loop
+closer, precision to the refinement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import hypot, radians
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.errors import ConfigError
+from hsloc.localisation.motion import OdometryNoise
+from hsloc.matching.hide import Hide
+from hsloc.matching.window import Window
+from hsloc.model.estimate import Status
+from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle
+from hsloc.slam.keyscans import KeyScan
+from hsloc.slam.local_map import LocalMap
+from hsloc.slam.recent_scans import SURPRISE, MovingScan, RecentScans, ScanRegistration, fused_covariance
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+    from numpy.typing import NDArray
+
+    from hsloc.model.events import PairedScan
+
+    F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrontEndParameters:
+    """When a scan becomes a keyscan, what it is matched against and in which window."""
+
+    keyscan_min_d: float = 0.1
+    """A scan becomes a keyscan after so many metres (m)."""
+    keyscan_min_a: float = 0.05
+    """Or after so much turning (rad)."""
+    min_points: int = 20
+    """A scan with fewer hits is not matched."""
+    local_range: float = 30.0
+    """Hits farther away are neither drawn nor matched here (m)."""
+    resolution: float = 0.05
+    """Of the local field (m)."""
+    sigma: float = 0.1
+    """Decay of the score with the distance from a wall (m)."""
+    max_distance: float = 0.4
+    """Beyond it the score is zero (m)."""
+    submap_length: float = 4.0
+    """A local map begins after so many metres of the way, and another one later it takes over (m)."""
+    turn_length: float = 0.3
+    """A turn of one radian counts as so many metres of the way (m)."""
+    window_sigmas: float = 3.0
+    """Half-width of the window in standard deviations of the prediction."""
+    window_min: float = 0.1
+    """But at least so many metres (m)."""
+    window_min_angle: float = radians(4.0)
+    """And so much of an angle (rad)."""
+    wide_window: float = 0.6
+    """Half-width [m] of the window that is searched where the match in the first window is doubtful."""
+    wide_window_angle: float = radians(90.0)
+    """Half-width [rad] of that window: turns are missed by odometry more often than translations."""
+    min_fitness: float = 0.35
+    """A match that contradicts the odometry is refused below this fitness."""
+    min_fitness_ratio: float = 0.9
+    """A match that contradicts the odometry is refused below this part of the usual fitness."""
+    restart_after: int = 3
+    """A new local map begins after so many refused matches in a row."""
+    hide: Hide = field(default_factory=lambda: Hide(restarts=6, agreement=2, budget=200, memory_size=20))
+    hide_wide: Hide = field(default_factory=lambda: Hide(restarts=16, agreement=3, budget=400))
+    """The search of the wide window."""
+    odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
+    no_odometry_window: float = 0.6
+    """Without odometry: half-width of the window around the constant-velocity prediction (m)."""
+    no_odometry_window_angle: float = radians(45.0)
+    """And in theta (rad)."""
+
+    def __post_init__(self) -> None:
+        for name in ("keyscan_min_d", "keyscan_min_a"):
+            if not getattr(self, name) >= 0.0:
+                raise ConfigError(f"front_end: {name} is {getattr(self, name)}; it must be 0 or more")
+        for name in (
+            "local_range",
+            "resolution",
+            "sigma",
+            "max_distance",
+            "submap_length",
+            "window_min",
+            "window_min_angle",
+        ):
+            if not getattr(self, name) > 0.0:
+                raise ConfigError(f"front_end: {name} is {getattr(self, name)}; it must be positive")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalMatch:
+    """What the front end made of a scan.
+
+    `pose` is in the drifting frame of the front end. `motion` and `covariance` (3, 3, in the frame of the last
+    keyscan) tell the motion since the last keyscan. `is_keyscan`: the scan is to be kept.
+    """
+
+    pose: Pose2
+    motion: Pose2
+    covariance: F64
+    status: Status
+    is_keyscan: bool
+    fitness: float | None = None
+    evaluations: int = 0
+    reason: str = ""
+    is_doubtful: bool = False
+
+
+FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
+"""No motion is known better than this (m^2, rad^2)."""
+_FORGET = 0.05
+"""Weight of a new match in the usual fitness."""
+_KNOWN = 0.85
+"""A point is spared whose nearest node scores as much: the local map has one within a part of a cell."""
+_CONVINCING = 0.9
+"""A pose that contradicts the odometry must be this consistent."""
+_CONVINCING_PAIRED = 0.35
+"""And this part of the points that both sides could see must be paired."""
+
+
+class FrontEnd:
+    """State: the last keyscan's pose and odometry, and two local maps that overlap."""
+
+    def __init__(self, parameters: FrontEndParameters, rng: Generator, use_odometry: bool = True) -> None:
+        self._parameters = parameters
+        self._rng = rng
+        self._use_odometry = use_odometry
+        self._T_map_key = IDENTITY
+        self._T_odom_key: Pose2 | None = None
+        self._maps: list[tuple[LocalMap, float]] = []
+        self._recent = RecentScans()
+        self._hidden = np.zeros((3, 3))
+        self._way = 0.0
+        self._usual: float | None = None
+        self._refused = 0
+        self._last: tuple[int, Pose2] | None = None
+        self._velocity = np.zeros(3)
+
+    def update(self, paired: PairedScan, points: F64) -> LocalMatch:
+        """Take a scan and its hits (n, 2) in the base's frame."""
+        p = self._parameters
+        enough = len(points) >= p.min_points
+        if self._T_odom_key is None:
+            if not enough:
+                return LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.NO_RETURNS, False, reason=f"{len(points)} returns")
+            return self._keep(paired, points, LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.MATCHED, True, 1.0))
+        motion, covariance = self._predict(paired)
+        predicted = self._T_map_key @ motion
+        small = hypot(motion.x, motion.y) < p.keyscan_min_d and abs(motion.theta) < p.keyscan_min_a
+        if small and self._use_odometry:
+            return LocalMatch(predicted, motion, covariance, Status.PREDICTED, False, reason="motion gate")
+        if not enough:
+            found = LocalMatch(predicted, motion, covariance, Status.NO_RETURNS, False, reason=f"{len(points)} returns")
+        else:
+            scans = _moving(paired)
+            near = points[np.hypot(points[:, 0], points[:, 1]) < p.local_range]
+            found = self._matched(near, scans, motion, covariance)
+        if not self._use_odometry:
+            found = self._without_odometry(paired, found)
+        return self._keep(paired, points, found) if found.is_keyscan else found
+
+    def _predict(self, paired: PairedScan) -> tuple[Pose2, F64]:
+        """The motion since the last keyscan and its covariance in the keyscan's frame."""
+        p = self._parameters
+        if self._use_odometry and self._T_odom_key is not None:
+            motion = self._T_odom_key.between(paired.T_odom_base)
+            return motion, p.odometry_noise.covariance(motion) + FLOOR
+        stamp, pose = self._last if self._last is not None else (paired.scan.stamp_ns, self._T_map_key)
+        seconds = min(max((paired.scan.stamp_ns - stamp) * 1e-9, 0.0), 1.0)
+        # A clock that jumps makes wild velocities: no step is predicted longer than the window is wide.
+        most = np.array((p.no_odometry_window, p.no_odometry_window, p.no_odometry_window_angle))
+        step = np.clip(self._velocity * seconds, -most, most)
+        motion = self._T_map_key.between(pose @ Pose2(float(step[0]), float(step[1]), float(step[2])))
+        return motion, np.diag((most / p.window_sigmas) ** 2)
+
+    def _matched(self, points: F64, scans: tuple[MovingScan, ...], motion: Pose2, covariance: F64) -> LocalMatch:
+        key = self._T_map_key
+        predicted = key @ motion
+        turn = _turn(key.theta)
+        in_map = turn @ covariance @ turn.T
+        found, evaluations = self._search(points, scans, predicted, in_map)
+        fitness = self._maps[0][0].field.fitness(points, found.pose)
+        reason = found.refusal()
+        if reason:
+            self._refused += 1
+            return LocalMatch(predicted, motion, covariance, Status.REJECTED, True, fitness, evaluations, reason, True)
+        # What is measured is the pose in the local map; the step to it also holds what the refused steps may hide.
+        after_refusal = self._refused > 0
+        self._refused = 0
+        self._usual = fitness if self._usual is None else self._usual + _FORGET * (fitness - self._usual)
+        fused = turn.T @ fused_covariance(found, in_map) @ turn + FLOOR
+        return LocalMatch(
+            found.pose,
+            key.between(found.pose),
+            fused + self._hidden if after_refusal else fused,
+            Status.MATCHED,
+            True,
+            fitness,
+            evaluations,
+            is_doubtful=found.is_doubtful() or after_refusal,
+        )
+
+    def _search(
+        self, points: F64, scans: tuple[MovingScan, ...], predicted: Pose2, covariance: F64
+    ) -> tuple[ScanRegistration, int]:
+        """ScanRegistration from the prediction; where that is refused, from what HIDE finds in a narrow and a wide window."""
+        p = self._parameters
+        best = self._recent.register(scans, predicted, predicted, covariance)
+        evaluations = 1
+        if not best.refusal():
+            return best, evaluations
+        local = self._maps[0][0].field
+        window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
+        wide = Window(
+            predicted,
+            max(window.half_x, p.wide_window),
+            max(window.half_y, p.wide_window),
+            max(window.half_theta, p.wide_window_angle),
+        )
+        usual = p.min_fitness if self._usual is None else max(p.min_fitness, p.min_fitness_ratio * self._usual)
+        for hide, box in ((p.hide, window), (p.hide_wide, wide)):
+            match = hide.match(points, local, box, self._rng)
+            evaluations += match.evaluations
+            found = self._recent.register(scans, match.pose, predicted, covariance)
+            surprising = found.chi > SURPRISE
+            convincing = not surprising or (
+                found.paired >= _CONVINCING_PAIRED
+                and found.consistency >= _CONVINCING
+                and local.fitness(points, found.pose) >= usual
+            )
+            if convincing and not found.refusal():
+                return found, evaluations
+        return best, evaluations
+
+    def _without_odometry(self, paired: PairedScan, found: LocalMatch) -> LocalMatch:
+        """Remember the velocity, and apply the motion gate to the match."""
+        p = self._parameters
+        stamp = paired.scan.stamp_ns
+        if found.status is Status.MATCHED and self._last is not None and stamp > self._last[0]:
+            step = self._last[1].between(found.pose).to_array()
+            self._velocity = step / ((stamp - self._last[0]) * 1e-9)
+        elif found.status is not Status.MATCHED:
+            self._velocity = np.zeros(3)
+        self._last = (stamp, found.pose)
+        motion = found.motion
+        moved = hypot(motion.x, motion.y) >= p.keyscan_min_d or abs(motion.theta) >= p.keyscan_min_a
+        keep = found.is_keyscan and (moved or self._refused >= p.restart_after)
+        return LocalMatch(
+            found.pose,
+            motion,
+            found.covariance,
+            found.status,
+            keep,
+            found.fitness,
+            found.evaluations,
+            found.reason,
+            found.is_doubtful,
+        )
+
+    def _keep(self, paired: PairedScan, points: F64, found: LocalMatch) -> LocalMatch:
+        """Make the scan a keyscan: draw it into the local maps."""
+        p = self._parameters
+        self._way += hypot(found.motion.x, found.motion.y) + p.turn_length * abs(wrap_angle(found.motion.theta))
+        if self._refused >= p.restart_after:
+            self._maps, self._refused = [], 0
+            self._recent.clear()
+        if not self._maps or self._way - self._maps[-1][1] > p.submap_length:
+            self._maps = [*self._maps[-1:], (LocalMap(p.resolution, p.sigma, p.max_distance), self._way)]
+        self._hidden = self._hidden + found.covariance if found.status is not Status.MATCHED else np.zeros((3, 3))
+        self._T_map_key, self._T_odom_key = found.pose, paired.T_odom_base
+        if self._last is None:
+            self._last = (paired.scan.stamp_ns, found.pose)
+        moved = found.pose @ points[np.hypot(points[:, 0], points[:, 1]) < p.local_range]
+        if found.status is Status.MATCHED or len(self._maps) == 1:
+            for local, _ in self._maps:
+                local.draw(moved, _KNOWN)
+            self._recent.add(found.pose, _moving(paired))
+        return found
+
+
+def _moving(paired: PairedScan) -> tuple[MovingScan, ...]:
+    """The scan and its companions, as seen from the base at the scan's stamp."""
+    parts = ((paired.scan, IDENTITY), *((other.scan, paired.to(other)) for other in paired.companions))
+    return tuple(MovingScan.of(KeyScan.of(scan), pose) for scan, pose in parts)
+
+
+def _turn(theta: float) -> F64:
+    c, s = np.cos(theta), np.sin(theta)
+    return np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))

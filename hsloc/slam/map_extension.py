@@ -1,0 +1,99 @@
+"""Where in a saved map a further log was driven: its first place is searched for on the whole map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.errors import MapError
+from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
+from hsloc.matching.hide import Hide
+from hsloc.matching.likelihood_field import LikelihoodField
+from hsloc.model.events import PairedScan
+from hsloc.model.pose2 import Pose2
+from hsloc.slam.loop_closer import LoopCloser
+from hsloc.slam.map_session import concatenate, from_map_state
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.random import Generator
+
+    from hsloc.slam.loop_closer import Loop
+    from hsloc.slam.map_session import MapSession
+    from hsloc.slam.map_state import MapState
+    from hsloc.slam.parameters import GraphMapperParameters
+
+_ATTEMPTS = 10
+"""Places of the log, evenly chosen, from which the map is searched: it may begin outside of what was drawn."""
+_LOOKED = 60
+"""Keyscans looked at from each of them, at most."""
+_AROUND = 2
+"""Places compared before and after the one that was found."""
+_AGREE = 2
+"""So many places must be connected by a loop, where the log has so many."""
+
+
+def connect(
+    state: MapState,
+    log: MapSession,
+    parameters: GraphMapperParameters,
+    rng: Generator,
+    T_map_first: Pose2 | None = None,
+) -> MapSession:
+    """The saved map and the log in its frame, connected by loops; `T_map_first` is the log's start, if it is known.
+
+    A place that is found is believed if loops between it and the old places around it pass all that is asked of a
+    loop. Raises MapError if there is none.
+    """
+    old = from_map_state(state, parameters)
+    found = _relocalised(state, log, parameters, rng) if T_map_first is None else iter([(T_map_first, 0)])
+    for T_map_front, scan in found:
+        both = concatenate(old, log.moved(T_map_front))
+        loops = _verified(both, both.first + scan, parameters, rng)
+        if loops:
+            return replace(both, known=(*both.known, *loops))
+    raise MapError(unconnected(state))
+
+
+def unconnected(state: MapState) -> str:
+    """For whom no connection was found."""
+    return (
+        f"{state.name}: no place of the log was recognised in this map, so it is not extended; "
+        "give --initial-pose, or a log that begins or passes where the map is known"
+    )
+
+
+def _relocalised(
+    state: MapState, log: MapSession, parameters: GraphMapperParameters, rng: Generator
+) -> Iterator[tuple[Pose2, int]]:
+    """T_map_front by the relocaliser, and the keyscan of the log at which it was sure."""
+    field = LikelihoodField.from_grid(state.grid)
+    noise = parameters.front_end.odometry_noise
+    relocaliser = Relocaliser(state.grid, field, Hide(), RelocaliserParameters(), noise, rng)
+    starts = log.places.start[:-1]
+    for begin in starts[np.unique(np.linspace(0, len(starts) - 1, _ATTEMPTS).astype(np.int64))]:
+        relocaliser.start()
+        for scan in range(int(begin), min(int(begin) + _LOOKED, len(log.poses))):
+            T_front_base = Pose2.from_array(log.poses[scan])
+            verdict = relocaliser.update(PairedScan(log.scans.scan(scan), T_front_base), 0)
+            if verdict.is_sure and verdict.pose is not None:
+                yield verdict.pose @ T_front_base.inverse(), scan
+                break
+
+
+def _verified(both: MapSession, scan: int, parameters: GraphMapperParameters, rng: Generator) -> list[Loop]:
+    """Accepted loops between the places around a keyscan and those of the old map; none if too few are."""
+    first_place = both.first_place
+    closer = LoopCloser(both.places, both.scans, parameters.loops, rng, first=first_place)
+    place = int(np.searchsorted(both.places.start, scan, side="right")) - 1
+    tried = range(max(place - _AROUND, first_place), min(place + _AROUND + 1, len(both.places)))
+    loops: list[Loop] = []
+    connected = 0
+    for near in tried:
+        accepted = [loop for loop in closer.connections(near) if loop.accepted]
+        loops += accepted[:1]
+        connected += bool(accepted)
+    return loops if connected >= min(_AGREE, len(tried)) else []

@@ -1,0 +1,37 @@
+"""Parameters of the graph mapper, composed of those of its parts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from hsloc.slam.front_end import FrontEndParameters
+from hsloc.slam.joint_registration import JointRegistrationParameters
+from hsloc.slam.loop_closer import LoopParameters
+from hsloc.slam.occupancy_mapper import OccupancyMapperParameters
+
+if TYPE_CHECKING:
+    from hsloc.model.pose2 import Pose2
+    from hsloc.slam.map_state import MapState
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GraphMapperParameters:
+    """All of the graph mapper's, one default for all logs."""
+
+    front_end: FrontEndParameters = field(default_factory=FrontEndParameters)
+    loops: LoopParameters = field(default_factory=LoopParameters)
+    joint_registration: JointRegistrationParameters = field(default_factory=JointRegistrationParameters)
+    occupancy: OccupancyMapperParameters = field(default_factory=OccupancyMapperParameters)
+    use_odometry: bool = True
+    """Otherwise a constant velocity predicts, and the log's odometry is not looked at."""
+    passes: int = 3
+    """The whole log is gone over again at most so often, until nothing moves."""
+
+
+@dataclass(frozen=True, slots=True)
+class Resume:
+    """A saved map to go on from, and where in it the log begins, if that is known."""
+
+    state: MapState
+    T_map_first: Pose2 | None = None

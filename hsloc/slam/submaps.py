@@ -1,0 +1,138 @@
+"""Stretches of the way, each with its keyscans: what loops are closed between."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.localisation.motion import predict_covariance
+from hsloc.model.pose2 import IDENTITY, Pose2, compose_poses, relative_poses
+from hsloc.slam.local_map import LocalMap
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hsloc.slam.keyscans import KeyScans
+
+    F64 = NDArray[np.float64]
+    I64 = NDArray[np.int64]
+
+
+REFUSED_WAY = 5.0
+"""A refused match may hide a slip: loops are looked for as if so many metres more had been driven."""
+
+UNKNOWN_STEP = 1e6 * np.eye(3)
+"""Covariance of a step of which nothing is known (m^2, rad^2)."""
+_FAR = 1e4
+"""Two logs count as so many metres of the way apart, until a loop connects them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Submaps:
+    """Place k holds keyscans start[k] to start[k + 1]; its frame is that of its middle one, `reference[k]`.
+
+    `poses` (n, 3) are the front end's, of the keyscans; within a few places they are taken to be rigid. `steps`
+    (m - 1, 3) and `covariances` (m - 1, 3, 3) tell each place's reference in the frame of the one before.
+    """
+
+    start: I64
+    reference: I64
+    poses: F64
+    steps: F64
+    covariances: F64
+    doubted: NDArray[np.bool_]
+    """Steps (m - 1,) on which a match was refused: odometry alone, which may have slipped."""
+    way: F64
+    """Metres driven until each reference, shape (m,), a refused match counting as `REFUSED_WAY` more."""
+    piece: I64
+    """Shape (m,): where one log ends and the next begins the number changes; nothing is rigid across that."""
+
+    def __len__(self) -> int:
+        return len(self.reference)
+
+    @staticmethod
+    def along(
+        poses: F64,
+        motions: F64,
+        covariances: F64,
+        length: float,
+        turn_length: float,
+        refused: NDArray[np.bool_] | None = None,
+    ) -> Submaps:
+        """Cut the way of keyscans into places of `length` metres; `motions` and `covariances` lead to each keyscan."""
+        refused = np.zeros(len(poses), dtype=bool) if refused is None else refused
+        way = np.cumsum(np.hypot(motions[:, 0], motions[:, 1]) + turn_length * np.abs(motions[:, 2]))
+        index = np.floor(way / length).astype(np.int64)
+        start = np.concatenate((np.flatnonzero(np.diff(index, prepend=-1)), [len(poses)])).astype(np.int64)
+        reference = (start[:-1] + start[1:]) // 2
+        steps = relative_poses(poses[reference[:-1]], poses[reference[1:]])
+        chained = np.zeros((max(len(reference) - 1, 0), 3, 3))
+        for k in range(len(chained)):
+            pose, covariance = IDENTITY, np.zeros((3, 3))
+            for scan in range(reference[k] + 1, reference[k + 1] + 1):
+                motion = Pose2.from_array(motions[scan])
+                covariance = predict_covariance(covariance, pose, motion, covariances[scan])
+                pose = pose @ motion
+            chained[k] = covariance
+        count = np.cumsum(refused)
+        doubted = np.diff(count[reference]) > 0
+        piece = np.zeros(len(reference), dtype=np.int64)
+        return Submaps(start, reference, poses, steps, chained, doubted, (way + REFUSED_WAY * count)[reference], piece)
+
+    @staticmethod
+    def concatenate(first: Submaps, second: Submaps) -> Submaps:
+        """Those of two logs in one map; the step from the first's last to the second's first says nothing."""
+        scans = len(first.poses)
+        seam = relative_poses(first.poses[None, first.reference[-1]], second.poses[None, second.reference[0]])
+        return Submaps(
+            np.concatenate((first.start[:-1], scans + second.start)),
+            np.concatenate((first.reference, scans + second.reference)),
+            np.concatenate((first.poses, second.poses)),
+            np.concatenate((first.steps, seam, second.steps)),
+            np.concatenate((first.covariances, UNKNOWN_STEP[None], second.covariances)),
+            np.concatenate((first.doubted, [False], second.doubted)),
+            np.concatenate((first.way, first.way[-1] + _FAR + second.way)),
+            np.concatenate((first.piece, first.piece[-1] + 1 + second.piece)),
+        )
+
+    def members(self, place: int, around: int) -> range:
+        """Keyscans of a place and of `around` places before and after."""
+        same = np.flatnonzero(self.piece[max(place - around, 0) : place + around + 1] == self.piece[place])
+        low = max(place - around, 0)
+        return range(int(self.start[low + same[0]]), int(self.start[low + same[-1] + 1]))
+
+    def cloud(self, place: int, around: int, scans: KeyScans, max_range: float, cell: float) -> F64:
+        """Hits of a place and its neighbours in its frame, one for each cell of side `cell` (m), shape (n, 2)."""
+        members = self.members(place, around)
+        relative = relative_poses(
+            np.broadcast_to(self.poses[self.reference[place]], (len(members), 3)),
+            self.poses[members.start : members.stop],
+        )
+        parts = []
+        for row, scan in enumerate(members):
+            hits = scans.hits(scan).astype(np.float64)
+            parts.append(Pose2.from_array(relative[row]) @ hits[np.hypot(hits[:, 0], hits[:, 1]) < max_range])
+        points = np.concatenate(parts)
+        if len(points) == 0:
+            return points
+        keys = np.floor(points / cell).astype(np.int64)
+        _, first = np.unique(keys[:, 0] * 4000037 + keys[:, 1], return_index=True)
+        thinned: F64 = points[np.sort(first)]
+        return thinned
+
+    def field(
+        self, place: int, around: int, scans: KeyScans, max_range: float, resolution: float, sigma: float
+    ) -> LocalMap:
+        """The field of a place and its neighbours, in its frame."""
+        drawn = LocalMap(resolution, sigma, 3.0 * sigma)
+        drawn.draw(self.cloud(place, around, scans, max_range, 0.5 * resolution), saturation_score=0.95)
+        return drawn
+
+    def expand(self, places: F64) -> F64:
+        """Poses of all keyscans (n, 3) from poses of the places (m, 3), each keyscan rigid with its place."""
+        owner = np.repeat(np.arange(len(self)), np.diff(self.start))
+        relative = relative_poses(self.poses[self.reference[owner]], self.poses)
+        poses: F64 = compose_poses(places[owner], relative)
+        return poses

@@ -1,0 +1,1 @@
+"""Many runs: logs x configurations x seeds."""

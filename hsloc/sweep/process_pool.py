@@ -1,0 +1,104 @@
+"""A sweep in processes of its own: survives runs that take their process with them, and Ctrl-C."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from hsloc.sweep.runs import BROKEN, FAILED, STOP, Outcome, SweepRun, sweep
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+_THREADS = "NUMBA_NUM_THREADS"
+
+
+def sweep_in_processes(
+    runs: Sequence[SweepRun], folder: Path, jobs: int, progress: Callable[[Outcome], None] | None = None
+) -> list[Outcome]:
+    """As `sweep`, in `jobs` processes.
+
+    If one dies, the executor loses all that were under way: these are run again, each in a process of its own, so
+    that only the guilty one fails. On KeyboardInterrupt the processes are told, and end without leaving halves.
+    """
+
+    def tell(outcome: Outcome) -> None:
+        if progress is not None and not _is_broken(outcome):
+            progress(outcome)
+
+    with _threads(jobs), _interruptible(ProcessPoolExecutor(jobs, **_options())) as pool:
+        outcomes = sweep(runs, folder, pool, tell)
+    again = [index for index, outcome in enumerate(outcomes) if _is_broken(outcome)]
+    if again:
+        with _threads(jobs), _interruptible(_OneEach(jobs)) as each:
+            repeated = sweep([runs[index] for index in again], folder, each, progress)
+        for index, outcome in zip(again, repeated, strict=True):
+            outcomes[index] = outcome
+    return outcomes
+
+
+def _is_broken(outcome: Outcome) -> bool:
+    return outcome.state == FAILED and outcome.error.startswith(BROKEN)
+
+
+def _options() -> dict[str, Any]:
+    # A fork would copy the compiler's threads in any state.
+    return {"mp_context": multiprocessing.get_context("spawn"), "initializer": _note_interrupts}
+
+
+def _note_interrupts() -> None:
+    """Ctrl-C ends a worker's run at its next scan: an exception out of the blue would leave halves behind."""
+    signal.signal(signal.SIGINT, lambda *_: STOP.set())
+
+
+class _OneEach(Executor):
+    """Every call in a process of its own, `jobs` at a time."""
+
+    def __init__(self, jobs: int) -> None:
+        self._threads = ThreadPoolExecutor(jobs)
+
+    def submit(self, call: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        return self._threads.submit(self._alone, call, *arguments, **named)
+
+    @staticmethod
+    def _alone(call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        with ProcessPoolExecutor(1, **_options()) as pool:
+            return pool.submit(call, *arguments, **named).result()
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        self._threads.shutdown(wait, cancel_futures=cancel_futures)
+
+
+@contextmanager
+def _interruptible(pool: Executor) -> Iterator[Executor]:
+    """The pool, shut down at the end; on KeyboardInterrupt its workers are interrupted first."""
+    before = set(multiprocessing.active_children())
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in set(multiprocessing.active_children()) - before:
+            if process.pid is not None and process.is_alive():
+                os.kill(process.pid, signal.SIGINT)
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _threads(jobs: int) -> Iterator[None]:
+    """The processes share the processors among them: each gets its part of the threads."""
+    before = os.environ.get(_THREADS)
+    share = max((os.cpu_count() or 1) // jobs, 1)
+    if before is None:
+        os.environ[_THREADS] = str(share)
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(_THREADS, None)

@@ -1,0 +1,236 @@
+"""Many runs: logs x configurations x seeds, side by side, each with its own folder of results.
+
+A finished run is known by the hash of everything that decides it, and is not done again. A run that fails, or takes
+its process with it, is a row of the table like the others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+import traceback
+from concurrent.futures import BrokenExecutor, CancelledError, as_completed
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hsloc.config import to_dict
+from hsloc.errors import HslocError
+from hsloc.export.results_folder import timings, write_results
+from hsloc.log import open_log
+from hsloc.replay.map_sources import map_file, state_file
+from hsloc.replay.run import run
+from hsloc.request import RunRequest
+from hsloc.version import __version__
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from concurrent.futures import Executor, Future
+
+    from hsloc.config import Config
+
+KEY_FILE = "sweep_key.json"
+"""In a run's folder: what it was made of."""
+STOP = threading.Event()
+"""Set in a process, it has the runs there end at the next scan, in good order, with KeyboardInterrupt."""
+DONE, SKIPPED, FAILED = "done", "skipped", "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class SweepRun:
+    """One run: the name of its folder, the labels of its row, and what to run."""
+
+    name: str
+    log: str
+    config: str
+    spec: RunRequest
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a run: `done`, `skipped` (it was done before) or `failed` with the reason in `error`.
+
+    `metrics` and `timings` are the contents of the files of these names; None where the run failed.
+    """
+
+    run: SweepRun
+    state: str
+    folder: Path
+    metrics: dict[str, Any] | None = None
+    timings: dict[str, Any] | None = None
+    error: str = ""
+
+    @property
+    def data_lost(self) -> bool:
+        """Whether part of the input could not be read."""
+        return self.metrics is not None and bool(self.metrics["losses"]["data_lost"])
+
+
+def plan(
+    logs: Sequence[Path | Sequence[Path]],
+    configs: Mapping[str, Config],
+    seeds: Iterable[int] = (0,),
+    **common: Any,
+) -> list[SweepRun]:
+    """All combinations; a sequence of paths is one log in parts. `common` are further fields of `RunRequest`."""
+    runs: list[SweepRun] = []
+    seeds = list(seeds)
+    labels: dict[str, int] = {}
+    for paths in logs:
+        parts = (paths,) if isinstance(paths, Path) else tuple(paths)
+        label = parts[0].name.split(".")[0] or "log"
+        labels[label] = labels.get(label, 0) + 1
+        if labels[label] > 1:
+            label = f"{label}-{labels[label]}"
+        for name, config in configs.items():
+            for seed in seeds:
+                spec = RunRequest(logs=parts, config=config, seed=seed, **common)
+                runs.append(SweepRun(f"{label}-{name}-seed{seed}".replace("/", "_"), label, name, spec))
+    return runs
+
+
+def sweep(
+    runs: Sequence[SweepRun],
+    folder: Path,
+    executor: Executor,
+    progress: Callable[[Outcome], None] | None = None,
+) -> list[Outcome]:
+    """Do all runs that are not done yet, in an executor of any kind; outcomes in the order of `runs`.
+
+    `progress` is called with each outcome as it comes. Nothing that happens in a run is raised; where the executor
+    itself breaks, the runs it did not finish have failed. On KeyboardInterrupt the waiting runs are cancelled, and
+    what is finished stays.
+    """
+    outcomes: dict[int, Outcome] = {}
+    hashes: dict[Path, str] = {}
+    waiting: dict[Future[Outcome], int] = {}
+
+    def settle(index: int, outcome: Outcome) -> None:
+        outcomes[index] = outcome
+        if progress is not None:
+            progress(outcome)
+
+    try:
+        for index, item in enumerate(runs):
+            try:
+                key = run_key(item.spec, hashes)
+            except HslocError as error:
+                settle(index, Outcome(item, FAILED, folder / item.name, error=str(error)))
+                continue
+            known = finished(item, folder, key)
+            if known is not None:
+                settle(index, known)
+                continue
+            try:
+                waiting[executor.submit(do_run, item, folder, key)] = index
+            except RuntimeError as error:  # The executor broke, or was shut down.
+                settle(index, _broken(item, folder, error))
+        for future in as_completed(waiting):
+            item = runs[waiting[future]]
+            try:
+                settle(waiting[future], future.result())
+            except (BrokenExecutor, CancelledError) as error:
+                settle(waiting[future], _broken(item, folder, error))
+    except BaseException:
+        for future in waiting:
+            future.cancel()
+        raise
+    return [outcomes[index] for index in range(len(runs))]
+
+
+BROKEN = "the process ended: "
+
+
+def _broken(item: SweepRun, folder: Path, error: Exception) -> Outcome:
+    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    return Outcome(item, FAILED, folder / item.name, error=f"{BROKEN}{reason}")
+
+
+def do_run(item: SweepRun, folder: Path, key: str) -> Outcome:
+    """One run, in whatever process the executor chose; raises nothing but BaseException."""
+    target = folder / item.name
+    try:
+        result = run(item.spec, _heed_stop)
+        # Only what looks like a run of ours is replaced.
+        values = write_results(result, target, overwrite=(target / "metrics.json").exists(), progress=_heed_stop)
+        (target / KEY_FILE).write_text(json.dumps({"key": key}) + "\n", encoding="utf-8")
+        return Outcome(item, DONE, target, values, timings(result))
+    except HslocError as error:
+        return Outcome(item, FAILED, target, error=str(error))
+    except Exception as error:  # A defect of ours must not end the sweep; its trace is kept for the report of it.
+        reason = (str(error).splitlines() or [""])[0]
+        trace = folder / f"{item.name}.error.txt"
+        trace.write_text(traceback.format_exc(), encoding="utf-8")
+        return Outcome(item, FAILED, target, error=f"{type(error).__name__}: {reason} (see {trace})")
+
+
+def _heed_stop(_: object) -> None:
+    if STOP.is_set():
+        raise KeyboardInterrupt
+
+
+def finished(item: SweepRun, folder: Path, key: str) -> Outcome | None:
+    """The outcome of a run that was done before with the same key."""
+    target = folder / item.name
+    try:
+        if json.loads((target / KEY_FILE).read_text(encoding="utf-8"))["key"] != key:
+            return None
+        metrics = json.loads((target / "metrics.json").read_text(encoding="utf-8"))
+        times = json.loads((target / "timings.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return Outcome(item, SKIPPED, target, metrics, times)
+
+
+def run_key(spec: RunRequest, hashes: dict[Path, str] | None = None) -> str:
+    """Hash of all that decides a run: version, options, and the bytes of log and map.
+
+    `hashes` remembers those of files between calls. Raises HslocError where a file cannot be read.
+    """
+    hashes = {} if hashes is None else hashes
+    values: dict[str, Any] = {"hsloc": __version__}
+    for item in fields(spec):
+        value = getattr(spec, item.name)
+        values[item.name] = to_dict(value) if item.name != "logs" else [path.name for path in value]
+    if spec.map_path is not None:
+        values["map_path"] = [
+            spec.map_path.name,
+            *(_digest(part, hashes) for part in _map_files(spec.map_path)),
+        ]
+    if spec.resume is not None:
+        values["resume"] = [spec.resume.name, _digest(state_file(spec.resume), hashes)]
+    values["input"] = [_log_digest(path, hashes) for path in spec.logs]
+    return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _map_files(path: Path) -> list[Path]:
+    """The YAML, and the images beside it that it may mean."""
+    path = map_file(path)
+    images = [part for part in path.parent.glob("*") if part.suffix.lower() in (".pgm", ".png", ".bmp")]
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        text = ""
+    return [path, *sorted(part for part in images if part.name in text)]
+
+
+def _digest(path: Path, hashes: dict[Path, str]) -> str:
+    if path not in hashes:
+        try:
+            with path.open("rb") as stream:
+                hashes[path] = hashlib.file_digest(stream, "sha256").hexdigest()
+        except OSError as error:
+            raise HslocError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return hashes[path]
+
+
+def _log_digest(path: Path, hashes: dict[Path, str]) -> str:
+    """Of a file's bytes; of a folder by the log that it is."""
+    if not path.is_dir():
+        return _digest(path, hashes)
+    if path not in hashes:
+        from hsloc.log import ReadOptions
+
+        hashes[path] = open_log(path, ReadOptions(require_scan=False, require_odometry=False)).sha256()
+    return hashes[path]

@@ -1,0 +1,116 @@
+"""The table that a sweep ends with: a row for each run, as text, CSV or JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from hsloc.sweep.runs import Outcome
+
+COLUMNS = (
+    "run",
+    "log",
+    "config",
+    "seed",
+    "state",
+    "ape_m",
+    "ape_deg",
+    "rpe_m",
+    "rpe_deg",
+    "relations_m",
+    "relations_deg",
+    "scans",
+    "used",
+    "localised",
+    "residual_m",
+    "seconds",
+    "times_real_time",
+    "data_lost",
+    "error",
+)
+"""APE and RPE (per metre) are root mean squares, `residual_m` is the median distance from scan to map."""
+
+
+def rows(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
+    """One dictionary of `COLUMNS` for each run; None where a run has no such value."""
+    return [_row(outcome) for outcome in outcomes]
+
+
+def _row(outcome: Outcome) -> dict[str, Any]:
+    metrics, times = outcome.metrics or {}, outcome.timings or {}
+
+    def value(*path: str, of: Any = metrics) -> Any:
+        for name in path:
+            of = of.get(name) if isinstance(of, dict) else None
+        return of
+
+    values = {
+        "run": outcome.run.name,
+        "log": outcome.run.log,
+        "config": outcome.run.config,
+        "seed": outcome.run.spec.seed,
+        "state": outcome.state,
+        "ape_m": value("ape", "trans_part", "rmse"),
+        "ape_deg": value("ape", "angle_deg", "rmse"),
+        "rpe_m": value("rpe_1m", "trans_part", "rmse"),
+        "rpe_deg": value("rpe_1m", "angle_deg", "rmse"),
+        "relations_m": value("relations", "trans_part", "mean"),
+        "relations_deg": value("relations", "angle_deg", "mean"),
+        "scans": value("scans", "total"),
+        "used": value("scans", "used"),
+        "localised": value("localised", "share_of_odometry"),
+        "residual_m": value("map", "residuals", "median"),
+        "seconds": value("seconds", "replay", of=times),
+        "times_real_time": value("times_real_time", of=times),
+        "data_lost": outcome.data_lost,
+        "error": outcome.error,
+    }
+    assert tuple(values) == COLUMNS
+    return values
+
+
+def as_json(outcomes: Sequence[Outcome]) -> str:
+    """A list of rows."""
+    return json.dumps(rows(outcomes), indent=2) + "\n"
+
+
+def as_csv(outcomes: Sequence[Outcome]) -> str:
+    """A header and a line for each run."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows(outcomes))
+    return stream.getvalue()
+
+
+_SHOWN = (
+    ("run", "run", "{}"),
+    ("state", "state", "{}"),
+    ("ape_m", "APE [m]", "{:.4f}"),
+    ("ape_deg", "APE [deg]", "{:.3f}"),
+    ("rpe_m", "RPE [m]", "{:.4f}"),
+    ("relations_m", "rel. [m]", "{:.4f}"),
+    ("used", "used", "{}"),
+    ("localised", "localised", "{:.1%}"),
+    ("times_real_time", "x real time", "{:.0f}"),
+)
+
+
+def as_text(outcomes: Sequence[Outcome]) -> str:
+    """For people; columns that no run has a value for are left out, and reasons of failures stand below."""
+    found = rows(outcomes)
+    shown = [item for item in _SHOWN if any(row[item[0]] is not None for row in found)]
+    lines = [[title for _, title, _ in shown]]
+    lines += [["-" if row[key] is None else form.format(row[key]) for key, _, form in shown] for row in found]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(shown))]
+    text = [
+        "  ".join(c.ljust(w) if n < 2 else c.rjust(w) for n, (c, w) in enumerate(zip(line, widths, strict=True)))
+        for line in lines
+    ]
+    text += [f"{row['run']}: {row['error']}" for row in found if row["error"]]
+    return "\n".join(line.rstrip() for line in text) + "\n"

@@ -1,0 +1,1 @@
+"""Trajectories as files: TUM, and evo's result archives."""

@@ -1,0 +1,122 @@
+"""Who asks, and the tokens that say so."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import secrets
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from sqlalchemy import select, update
+
+from hsloc_service.db.tables import TokenRow
+from hsloc_service.errors import ServiceError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from hsloc_service.db.database import Database
+
+SCOPES = ("read", "write", "admin")
+"""read: look and download; write: upload, submit, cancel, delete; admin: metrics of all tenants."""
+
+
+@dataclass(frozen=True, slots=True)
+class Principal:
+    """A tenant and what it may do."""
+
+    tenant: str
+    scopes: frozenset[str]
+    token: str | None = None
+
+    def need(self, scope: str) -> None:
+        """Raises ServiceError 403 unless the scope is there."""
+        if scope not in self.scopes:
+            raise ServiceError(403, "scope", f"this token lacks the scope {scope!r}")
+
+
+OPERATORS = "operator's"
+"""Label of the token of HSLOC_TOKEN."""
+
+ANYBODY = Principal("local", frozenset(SCOPES))
+"""Who asks where no token is required: a server on loopback."""
+
+
+class Tokens:
+    """Tokens: 256 random bits, of which only the SHA-256 is kept (so much entropy needs no slow hash)."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def issue(
+        self,
+        tenant: str,
+        scopes: tuple[str, ...] = SCOPES,
+        *,
+        label: str = "",
+        expires: float | None = None,
+        secret: str | None = None,
+    ) -> str:
+        """A new token; shown this once. `expires` in seconds since 1970."""
+        for scope in scopes:
+            if scope not in SCOPES:
+                raise ValueError(f"scope {scope!r} is none of {', '.join(SCOPES)}")
+        ident = secrets.token_hex(4)
+        token = secret or f"hsl_{ident}_{secrets.token_urlsafe(32)}"
+        row = TokenRow(
+            id=ident,
+            tenant=tenant,
+            label=label,
+            scopes=" ".join(scopes),
+            sha256=_sha256(token),
+            created=time.time(),
+            expires=expires,
+        )
+        with self._database.write() as session:
+            known = session.scalar(select(TokenRow).where(TokenRow.sha256 == row.sha256))
+            if known is None:
+                session.add(row)
+        return token
+
+    def issue_operators(self, tenant: str, secret: str) -> None:
+        """The token that the operator chose; the one that he chose before is worth nothing from now on."""
+        self.issue(tenant, label=OPERATORS, secret=secret)
+        digest = _sha256(secret)
+        with self._database.write() as session:
+            older = (TokenRow.label == OPERATORS, TokenRow.sha256 != digest, TokenRow.revoked.is_(None))
+            session.execute(update(TokenRow).where(*older).values(revoked=time.time()))
+
+    def revoke(self, ident: str) -> bool:
+        """Whether there was such a token."""
+        with self._database.write() as session:
+            row = session.get(TokenRow, ident)
+            if row is not None:
+                row.revoked = time.time()
+            return row is not None
+
+    def rows(self) -> Sequence[TokenRow]:
+        """All tokens, oldest first; the secrets are not among what is kept."""
+        with self._database.read() as session:
+            return session.scalars(select(TokenRow).order_by(TokenRow.created)).all()
+
+    def any(self) -> bool:
+        """Whether a token was ever issued."""
+        with self._database.read() as session:
+            return session.scalar(select(TokenRow.id).limit(1)) is not None
+
+    def principal(self, token: str) -> Principal | None:
+        """Who the token speaks for; None if it is unknown, revoked or expired."""
+        digest = _sha256(token)
+        with self._database.read() as session:
+            row = session.scalar(select(TokenRow).where(TokenRow.sha256 == digest))
+        if row is None or not hmac.compare_digest(row.sha256, digest) or row.revoked is not None:
+            return None
+        if row.expires is not None and row.expires <= time.time():
+            return None
+        return Principal(row.tenant, frozenset(row.scopes.split()), row.id)
+
+
+def _sha256(token: str) -> str:
+    return hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()

@@ -1,0 +1,1 @@
+"""Running jobs: dispatcher, supervised processes, the worker."""

@@ -1,0 +1,74 @@
+"""The folder of one attempt: what the job's process finds there."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from typing import TYPE_CHECKING, Any
+
+from hsloc_service.results.store import BLOCK
+from hsloc_service.storage import safe_name
+from hsloc_service.stored_request import MAP_STATE, logs_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hsloc_service.jobs.leases import Claim, Source
+    from hsloc_service.results.store import ResultStore
+    from hsloc_service.settings import Settings
+    from hsloc_service.storage import Storage
+
+
+def prepare(folder: Path, claim: Claim, storage: Storage, settings: Settings) -> None:
+    """`job.json`, the input under its own names (read-only), and an empty folder for temporary files.
+
+    The logs are in `input`, `input-2`, …: two parts of a run may have one name. A saved map is to be put beside
+    `job.json` as `map.npz`.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    for name in ("map", "tmp"):
+        (folder / name).mkdir(parents=True, mode=0o700)
+    request = claim.request
+
+    def link(place: str, file_id: str, default: str) -> str:
+        name = safe_name(claim.names.get(file_id, ""), default)
+        (folder / place).mkdir(exist_ok=True, mode=0o700)
+        (folder / place / name).symlink_to(storage.upload_path(file_id).absolute())
+        return name
+
+    places = [("input" if k == 0 else f"input-{k + 1}", ident) for k, ident in enumerate(logs_of(request))]
+    logs = [f"{place}/{link(place, ident, 'log')}" for place, ident in places]
+    job: dict[str, Any] = {
+        "request": request,
+        "log": logs[0].partition("/")[2],
+        "logs": logs,
+        "limits": {
+            "memory_bytes": settings.job_memory_bytes,
+            "cpu_s": settings.job_cpu_s,
+            "output_bytes": settings.job_output_bytes,
+            "open_files": settings.job_open_files,
+        },
+    }
+    if request.get("map") is not None:
+        job["map"] = link("map", request["map"]["yaml"], "map.yaml")
+        # Any name but those that the YAML may ask for; the worker links the one it does ask for.
+        (folder / "map" / ".image").symlink_to(storage.upload_path(request["map"]["image"]).absolute())
+        job["map_image"] = ".image"
+    if request.get("relations") is not None:
+        job["relations"] = link("relations", request["relations"], "relations")
+    if claim.source is not None:
+        job["resume"] = MAP_STATE
+    (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
+
+
+def fetch(store: ResultStore, source: Source, folder: Path) -> None:
+    """Copy the saved map of an earlier job into the folder. Raises OSError if it is not what its manifest says."""
+    digest = hashlib.sha256()
+    with (folder / MAP_STATE).open("wb") as file:
+        for start in range(0, source.size, BLOCK):
+            block = store.read(source.folder, MAP_STATE, start, min(BLOCK, source.size - start))
+            digest.update(block)
+            file.write(block)
+    if digest.hexdigest() != source.sha256:
+        raise OSError(f"{MAP_STATE} of {source.folder} is not what was stored")

@@ -1,0 +1,90 @@
+"""What the routes share, and how they get at it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+from fastapi import Depends, Request
+
+from hsloc_service.auth import Principal
+from hsloc_service.call_timeout import BoundedExecutor
+from hsloc_service.execution.dispatcher import Dispatcher
+from hsloc_service.http.schemas import Problem
+from hsloc_service.jobs.repository import Jobs
+from hsloc_service.results.deletion_queue import Removals
+from hsloc_service.results.stores import ResultStores
+from hsloc_service.settings import Settings
+from hsloc_service.uploads.repository import Files
+from hsloc_service.uploads.upload_stream import Receiver
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from hsloc_service.db.database import Database
+    from hsloc_service.storage import Storage
+
+
+@dataclass(slots=True)
+class Context:
+    """The parts of a running service."""
+
+    settings: Settings
+    database: Database
+    storage: Storage
+    files: Files
+    jobs: Jobs
+    receiver: Receiver
+    dispatcher: Dispatcher
+    stores: ResultStores
+    removals: Removals
+    desk: BoundedExecutor
+    stopping: asyncio.Event = field(default_factory=asyncio.Event)
+    """Set when the server begins to shut down: event streams end."""
+    streams: Counter[str] = field(default_factory=Counter)
+    """Open event streams of each tenant."""
+
+
+def _context(request: Request) -> Context:
+    return cast("Context", request.app.state.context)
+
+
+def _principal(scope: str) -> Callable[[Request], Principal]:
+    def principal(request: Request) -> Principal:
+        who: Principal = request.state.principal  # the guard has put it there
+        who.need(scope)
+        return who
+
+    return principal
+
+
+Ctx = Annotated[Context, Depends(_context)]
+Reader = Annotated[Principal, Depends(_principal("read"))]
+Writer = Annotated[Principal, Depends(_principal("write"))]
+Admin = Annotated[Principal, Depends(_principal("admin"))]
+
+_MEANINGS = {
+    400: "the request cannot be understood",
+    401: "no token, or one that is unknown, expired or revoked",
+    403: "the token lacks the scope, or the request comes from another site",
+    404: "not there, or not yours",
+    409: "the state of the thing does not allow it",
+    412: "Tus-Resumable is missing, or of another version",
+    413: "too large",
+    415: "wrong content type",
+    421: "this Host is not served here",
+    422: "the request does not fit its schema",
+    423: "another request is writing to this upload",
+    429: "too many; see Retry-After",
+    460: "the checksum does not match",
+    503: "not now; see Retry-After",
+    507: "the disk or your part of it is full",
+}
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The answers other than success, for the OpenAPI."""
+    common = (400, 401, 403, 421, 422, 429, 503)
+    return {s: {"model": Problem, "description": _MEANINGS.get(s, "refused")} for s in sorted({*common, *statuses})}

@@ -1,0 +1,187 @@
+"""What every request passes before a byte of its body is read: host, origin, token, rate, size.
+
+Plain ASGI, around the whole application: FastAPI reads bodies before it asks its dependencies.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import secrets
+import time
+from typing import TYPE_CHECKING, Any
+
+from anyio import to_thread
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.types import Message
+
+from hsloc_service.auth import ANYBODY
+from hsloc_service.errors import ServiceError, busy
+from hsloc_service.http import metrics
+from hsloc_service.logs import log, request_id
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Receive, Scope, Send
+
+    from hsloc_service.auth import Principal, Tokens
+    from hsloc_service.settings import Settings
+
+PUBLIC = ("/", "/healthz", "/readyz", "/openapi.json", "/favicon.ico")
+PUBLIC_PREFIX = "/web/"
+UPLOADS = ("/v1/files", "/v1/tus", "/v1/run")
+"""Paths whose bodies may be large; they count their bytes themselves."""
+METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
+SMALL_BODY = 256 << 10
+SECURITY = {
+    "content-security-policy": "default-src 'self'; img-src 'self' blob: data:; object-src 'none'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "permissions-policy": "camera=(), microphone=(), geolocation=()",
+}
+
+
+class Guard:
+    """The outermost layer."""
+
+    def __init__(self, app: ASGIApp, settings: Settings, tokens: Tokens) -> None:
+        self._app, self._settings, self._tokens = app, settings, tokens
+        self._rates = Rates(settings.requests_per_s)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let a request pass, or answer it."""
+        if scope["type"] != "http":
+            if scope["type"] == "lifespan":
+                await self._app(scope, receive, send)
+            return
+        begin, status = time.perf_counter(), 0
+        ident = secrets.token_hex(8)
+        request_id.set(ident)
+
+        async def answer(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                headers = MutableHeaders(scope=message)
+                for name, value in SECURITY.items():
+                    headers.setdefault(name, value)
+                headers.setdefault("cache-control", "no-store")
+                headers["x-request-id"] = ident
+            await send(message)
+
+        try:
+            try:
+                scope.setdefault("state", {})["principal"] = await self._admit(scope)
+            except ServiceError as error:
+                await refuse(error, answer)
+                return
+            await self._app(scope, self._counted(scope, receive), answer)
+        finally:
+            route = getattr(scope.get("route"), "path", "other")
+            seconds = time.perf_counter() - begin
+            # A method is any word that a client makes up: each would be a series of its own, kept for ever.
+            method = scope["method"] if scope["method"] in METHODS else "other"
+            metrics.REQUESTS.labels(method, route, str(status)).inc()
+            if not route.endswith("/events"):
+                metrics.LATENCY.labels(route).observe(seconds)
+            if status >= 400 or not route.startswith(("/healthz", "/readyz", "/metrics")):
+                log("request", method=scope["method"], route=route, status=status, ms=round(seconds * 1000, 1))
+
+    async def _admit(self, scope: Scope) -> Principal | None:
+        headers = Headers(scope=scope)
+        self._need_host(scope, headers)
+        path = scope["path"]
+        if path in PUBLIC or path.startswith(PUBLIC_PREFIX):
+            return None
+        client = (scope.get("client") or ("unknown", 0))[0]
+        who = await self._principal(headers)
+        if who is None:
+            slow = self._settings.refusals_per_s
+            self._rates.take(("refused", client), slow, 20.0 * slow)
+            missing = "authorization" not in headers
+            raise ServiceError(
+                401,
+                "token",
+                "send a token: Authorization: Bearer hsl_…" if missing else "this token is unknown, expired or revoked",
+                {"WWW-Authenticate": 'Bearer realm="hsloc"'},
+            )
+        self._rates.take(("tenant", who.tenant), self._settings.requests_per_s, 2.0 * self._settings.requests_per_s)
+        if random.random() < self._settings.fault_fail_requests:
+            raise ServiceError(503, "fault_injection", "this server fails requests on purpose", {"Retry-After": "1"})
+        return who
+
+    def _need_host(self, scope: Scope, headers: Headers) -> None:
+        """A page of another site must not speak to us: not by rebinding its name, not by a form or a script."""
+        host = headers.get("host", "")
+        allowed = self._settings.allowed_hosts
+        name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
+        if "*" not in allowed and name.lower() not in allowed:
+            raise ServiceError(421, "host", "this Host is not served here; see --allowed-host")
+        origin = headers.get("origin")
+        if origin is not None and origin.split("://", 1)[-1].lower() != host.lower():
+            raise ServiceError(403, "origin", "requests from other sites are refused")
+        if scope["method"] not in ("GET", "HEAD") and headers.get("sec-fetch-site") == "cross-site":
+            raise ServiceError(403, "origin", "requests from other sites are refused")
+
+    async def _principal(self, headers: Headers) -> Principal | None:
+        kind, _, token = headers.get("authorization", "").partition(" ")
+        if kind.lower() == "bearer" and token:
+            return await to_thread.run_sync(self._tokens.principal, token.strip())
+        if "authorization" in headers or self._settings.require_token:
+            return None
+        return ANYBODY
+
+    def _counted(self, scope: Scope, receive: Receive) -> Receive:
+        """Bodies other than uploads are small; counted as received, whatever Content-Length says."""
+        if scope["path"].startswith(UPLOADS):
+            return receive
+        count = 0
+
+        async def counted() -> Message:
+            nonlocal count
+            message = await receive()
+            count += len(message.get("body", b""))
+            if count > SMALL_BODY:
+                # FastAPI passes on its own kind of exception only.
+                raise HTTPException(413, f"at most {SMALL_BODY} bytes are taken here")
+            return message
+
+        return counted
+
+
+class Rates:
+    """Token buckets in memory: a guard against floods, not a quota (those are in the database)."""
+
+    def __init__(self, default: float) -> None:
+        self._default = default
+        self._buckets: dict[tuple[str, str], tuple[float, float]] = {}
+
+    def take(self, who: tuple[str, str], per_s: float, burst: float) -> None:
+        """Raises ServiceError 429 if the bucket is empty."""
+        now = time.monotonic()
+        level, at = self._buckets.get(who, (burst, now))
+        level = min(burst, level + (now - at) * per_s)
+        if level < 1.0:
+            raise busy("too many requests", (1.0 - level) / per_s)
+        if len(self._buckets) > 10_000:
+            self._buckets.clear()
+        self._buckets[who] = (level - 1.0, now)
+
+
+async def refuse(error: ServiceError, send: Send) -> None:
+    """Answer without reading the body; the connection ends, so that nobody has to read the rest of it."""
+    body = problem(error.code, error.message)
+    headers = {"content-type": "application/json", "content-length": str(len(body)), "connection": "close"}
+    headers |= {name.lower(): value for name, value in error.headers.items()}
+    raw = [(name.encode(), value.encode()) for name, value in headers.items()]
+    await send({"type": "http.response.start", "status": error.status, "headers": raw})
+    await send({"type": "http.response.body", "body": body})
+
+
+def problem(code: str, message: str, details: Any = None) -> bytes:
+    """The body of every answer that is not a success."""
+    return json.dumps({"code": code, "message": message, "details": details}).encode()

@@ -1,0 +1,113 @@
+"""Jobs."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Body, Header, Path, Query, Response
+
+from hsloc_service import config_schema as options
+from hsloc_service.http.context import Ctx, Reader, Writer, problems
+from hsloc_service.http.schemas import (
+    UUID_PATTERN,
+    DeliveryList,
+    JobList,
+    JobRequest,
+    JobView,
+    RerunRequest,
+    State,
+    checked,
+)
+from hsloc_service.http.views import delivery_view, job_view
+from hsloc_service.stored_request import plain
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+JobId = Annotated[str, Path(pattern=UUID_PATTERN, description="id of a job")]
+Key = Annotated[
+    str | None,
+    Header(
+        min_length=1,
+        max_length=200,
+        pattern=r"^[\x21-\x7e]+$",
+        description="a text that you choose: the same request sent again with it makes no second job",
+    ),
+]
+
+
+@router.post("", status_code=201, responses={200: {"model": JobView}, **problems(404, 409, 413, 507)})
+def submit(ctx: Ctx, who: Writer, response: Response, request: JobRequest, idempotency_key: Key = None) -> JobView:
+    """Queue a job. The answer comes when the job is safe on the disk; 200 if it was there already (Idempotency-Key)."""
+    if request.config is not None:
+        request.config = options.check(request.config)
+    job, created = ctx.jobs.submit(who, plain(request.model_dump()), idempotency_key)
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    if created:
+        ctx.dispatcher.enqueue(job.id)
+    else:
+        response.status_code = 200
+    return job_view(job)
+
+
+@router.get("", responses=problems())
+def list_jobs(
+    ctx: Ctx,
+    who: Reader,
+    state: Annotated[State | None, Query()] = None,
+    before: Annotated[int | None, Query(ge=1, le=2**62, description="`next` of the page before")] = None,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+) -> JobList:
+    """Your jobs, newest first."""
+    rows = ctx.jobs.list(who, state=state, before=before, limit=limit)
+    return JobList(jobs=[job_view(row) for row in rows], next=rows[-1].seq if len(rows) == limit else None)
+
+
+@router.get("/{job_id}", responses=problems(404))
+def get(ctx: Ctx, who: Reader, job_id: JobId) -> JobView:
+    """One job."""
+    return job_view(ctx.jobs.get(who, job_id))
+
+
+@router.post("/{job_id}/cancel", status_code=202, responses=problems(404))
+def cancel(ctx: Ctx, who: Writer, job_id: JobId) -> JobView:
+    """End a job: `cancelling` until its processes are dead, then `cancelled`. One that has ended stays as it is."""
+    job = ctx.jobs.cancel(who, job_id)
+    ctx.dispatcher.cancel(job.id)
+    return job_view(job)
+
+
+@router.post("/{job_id}/rerun", status_code=201, responses=problems(404, 409, 413, 507))
+def rerun(
+    ctx: Ctx,
+    who: Writer,
+    response: Response,
+    job_id: JobId,
+    changes: Annotated[RerunRequest | None, Body()] = None,
+) -> JobView:
+    """The same job again, with the same seed, but for what the body changes."""
+    changed: dict[str, Any] = {} if changes is None else changes.model_dump(exclude_unset=True)
+    if changed.get("config") is not None:
+        changed["config"] = options.check(changed["config"])
+    for name in ("mode", "preset", "seed", "unknown_start"):
+        if changed.get(name, ...) is None:
+            del changed[name]
+    old = ctx.jobs.get(who, job_id)
+    job = ctx.jobs.rerun(who, job_id, plain(checked(JobRequest, {**old.request, **changed}).model_dump()))
+    ctx.dispatcher.enqueue(job.id)
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    return job_view(job)
+
+
+@router.delete("/{job_id}", status_code=204, responses=problems(404, 409))
+def delete(ctx: Ctx, who: Writer, job_id: JobId) -> None:
+    """Remove a job that has ended, and its results. The upload stays.
+
+    Results in an object store are unreachable at once, and removed within a minute, or when the store is there again.
+    """
+    ctx.storage.with_room(lambda: ctx.jobs.delete(who, job_id))
+    ctx.removals.clear_folder()
+
+
+@router.get("/{job_id}/webhooks", responses=problems(404))
+def webhooks(ctx: Ctx, who: Reader, job_id: JobId) -> DeliveryList:
+    """The webhooks of a job, and what became of them."""
+    return DeliveryList(deliveries=[delivery_view(row) for row in ctx.jobs.deliveries(who, job_id)])

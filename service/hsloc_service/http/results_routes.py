@@ -1,0 +1,202 @@
+"""Results: named files of a manifest, never paths."""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from typing import TYPE_CHECKING, Annotated, Any
+
+from anyio import to_thread
+from fastapi import APIRouter, Header, HTTPException, Path, Query, Request
+from fastapi.responses import FileResponse, Response, StreamingResponse
+
+from hsloc_service.errors import ServiceError, not_found
+from hsloc_service.http.context import Context, Ctx, Reader, problems
+from hsloc_service.http.jobs_routes import JobId
+from hsloc_service.http.schemas import AssetView, Manifest
+from hsloc_service.results.store import BLOCK, MEDIA_TYPES
+from hsloc_service.storage import safe_name
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator, Sequence
+
+    from hsloc_service.auth import Principal
+    from hsloc_service.db.tables import AssetRow, JobRow
+    from hsloc_service.results.store import ResultStore
+
+router = APIRouter(prefix="/v1/jobs", tags=["results"])
+AssetName = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$", examples=["trajectory.tum"])]
+SANDBOX = (
+    "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
+)
+"""A report may run its own script, but in an origin of its own and without the network."""
+_KINDS = sorted({kind.partition(";")[0] for kind in MEDIA_TYPES.values()} | {"application/octet-stream"})
+_BINARY: dict[str, Any] = {"description": "the bytes", "content": {kind: {"schema": {}} for kind in _KINDS}}
+
+
+@router.get("/{job_id}/results", responses=problems(404, 409))
+def manifest(ctx: Ctx, who: Reader, job_id: JobId) -> Manifest:
+    """Names, sizes and SHA-256 of all files of the results."""
+    _, rows = _assets(ctx, who, job_id)
+    base = f"/v1/jobs/{job_id}/results"
+    views = [
+        AssetView(name=r.name, size=r.size, sha256=r.sha256, media_type=r.media_type, href=f"{base}/{r.name}")
+        for r in rows
+    ]
+    return Manifest(job=job_id, assets=views)
+
+
+@router.get(
+    "/{job_id}/results.zip",
+    response_class=StreamingResponse,
+    responses={
+        200: {"description": "the archive", "content": {"application/zip": {"schema": {"type": "string"}}}},
+        **problems(404, 409),
+    },
+)
+async def archive(ctx: Ctx, who: Reader, job_id: JobId) -> StreamingResponse:
+    """All files of the results in one archive, not compressed."""
+    job, rows = await to_thread.run_sync(_assets, ctx, who, job_id)
+    name = safe_name(job.log_name.rsplit(".", 1)[0], "results")
+    headers = {"Content-Disposition": f'attachment; filename="{name}-results.zip"'}
+    parts = _paced(ctx, _zip(ctx.stores.of(job.store), job, rows))
+    return StreamingResponse(await _begun(parts, job_id), media_type="application/zip", headers=headers)
+
+
+@router.get(
+    "/{job_id}/results/{name}",
+    response_class=FileResponse,
+    responses={
+        200: _BINARY,
+        206: {**_BINARY, "description": "the range that was asked for"},
+        304: {"description": "you have it (If-None-Match)"},
+        416: {"description": "there is no such range", "content": {"text/plain": {"schema": {"type": "string"}}}},
+        **problems(404, 409),
+    },
+)
+async def asset(
+    request: Request,
+    ctx: Ctx,
+    who: Reader,
+    job_id: JobId,
+    name: AssetName,
+    download: Annotated[bool, Query(description="as attachment")] = True,
+    if_none_match: Annotated[str | None, Header(max_length=4096)] = None,
+) -> Response:
+    """One file; ranges, ETag (its SHA-256) and If-None-Match work."""
+    job, rows = await to_thread.run_sync(_assets, ctx, who, job_id)
+    row = next((row for row in rows if row.name == name), None)
+    if row is None:
+        raise not_found("asset", name)
+    tag = f'"{row.sha256}"'
+    headers = {"ETag": tag, "Cache-Control": "private, no-cache", "Content-Security-Policy": SANDBOX}
+    if if_none_match is not None and (tag in if_none_match or if_none_match.strip() == "*"):
+        return Response(status_code=304, headers=headers)
+    kind = "attachment" if download else "inline"
+    store = ctx.stores.of(job.store)
+    path = store.path(job.folder or "", row.name)
+    if path is not None:
+        if not await to_thread.run_sync(path.is_file):
+            raise not_found("asset", name)
+        return FileResponse(
+            path, headers=headers, media_type=row.media_type, filename=row.name, content_disposition_type=kind
+        )
+    headers |= {"Accept-Ranges": "bytes", "Content-Disposition": f'{kind}; filename="{row.name}"'}
+    fits = request.headers.get("if-range") in (None, tag)
+    span = parse_range(request.headers.get("range"), row.size) if fits else None
+    if span is not None:
+        headers["Content-Range"] = f"bytes {span.start}-{span.stop - 1}/{row.size}"
+    status, wanted = (200, range(row.size)) if span is None else (206, span)
+    headers["Content-Length"] = str(len(wanted))
+    parts = _paced(ctx, _blocks(store, job.folder or "", row.name, wanted))
+    return StreamingResponse(await _begun(parts, name), status, headers, row.media_type)
+
+
+def parse_range(text: str | None, size: int) -> range | None:
+    """The bytes that a Range header asks for; None for all of them: no header, several ranges, another unit.
+
+    Raises HTTPException 416 where there is no such byte.
+    """
+    found = re.fullmatch(r"\s*bytes\s*=\s*(\d{0,18})\s*-\s*(\d{0,18})\s*", text or "")
+    if found is None or found[1] == found[2] == "":
+        return None
+    if found[1] == "":
+        start, stop = max(size - int(found[2]), 0), size
+    else:
+        start, stop = int(found[1]), size if found[2] == "" else min(int(found[2]) + 1, size)
+        if found[2] != "" and int(found[2]) < start:
+            return None
+    if start >= stop:
+        raise HTTPException(416, "there is no such range", {"Content-Range": f"bytes */{size}"})
+    return range(start, stop)
+
+
+def _assets(ctx: Context, who: Principal, job_id: str) -> tuple[JobRow, Sequence[AssetRow]]:
+    job, rows = ctx.jobs.assets(who, job_id)
+    if job.state != "succeeded":
+        raise ServiceError(409, "no_results", f"the job is {job.state}; only succeeded jobs have results")
+    return job, rows
+
+
+class _Sink(io.RawIOBase):
+    """What was written since the last look."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: object) -> int:
+        block = bytes(data)  # type: ignore[call-overload]
+        self.parts.append(block)
+        return len(block)
+
+    def take(self) -> bytes:
+        block = b"".join(self.parts)
+        self.parts.clear()
+        return block
+
+
+def _zip(store: ResultStore, job: JobRow, rows: Sequence[AssetRow]) -> Iterator[bytes]:
+    sink = _Sink()
+    with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED, allowZip64=True) as target:
+        for row in rows:
+            info = zipfile.ZipInfo(row.name)
+            info.external_attr = 0o644 << 16
+            with target.open(info, "w", force_zip64=row.size > 1 << 31) as entry:
+                for block in _blocks(store, job.folder or "", row.name, range(row.size)):
+                    entry.write(block)
+                    yield sink.take()
+    yield sink.take()
+
+
+def _blocks(store: ResultStore, folder: str, name: str, span: range) -> Iterator[bytes]:
+    """The bytes of a span, some at a time; one empty block for an empty file."""
+    for start in range(span.start, max(span.stop, span.start + 1), BLOCK):
+        yield store.read(folder, name, start, min(BLOCK, span.stop - start))
+
+
+async def _paced(ctx: Context, blocks: Iterator[bytes]) -> AsyncIterator[bytes]:
+    """The blocks, each waited for outside the event loop and not for ever."""
+    while (block := await ctx.desk.ask(lambda: next(blocks, None))) is not None:
+        yield block
+
+
+async def _begun(parts: AsyncIterator[bytes], what: str) -> AsyncIterator[bytes]:
+    """The same parts, the first of which is there: a store that does not answer is an error before the answer begins.
+
+    One that fails later breaks the connection off, so that the client sees that it has not got everything.
+    """
+    try:
+        first = await anext(parts)
+    except FileNotFoundError as error:
+        raise not_found("asset", what) from error
+
+    async def all_parts() -> AsyncIterator[bytes]:
+        yield first
+        async for block in parts:
+            yield block
+
+    return all_parts()

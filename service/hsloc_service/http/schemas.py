@@ -1,0 +1,316 @@
+"""What goes over the wire. Strict: `false` is not a number, an unknown key is an error."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import (
+    AwareDatetime,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from hsloc_service.config_schema import whole
+from hsloc_service.errors import ServiceError
+
+UUID_PATTERN = r"^[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}$"
+Ident = Annotated[str, Field(pattern=UUID_PATTERN, examples=["3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f"])]
+PoseList = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3, examples=[[1.0, 2.0, 0.0]])]
+MAX_LOGS = 64
+UNIQUE: dict[str, Any] = {"uniqueItems": True}
+Label = Annotated[str, Field(max_length=255)]
+Seed = Annotated[int, Field(ge=0, le=2**53 - 1), BeforeValidator(whole)]
+Config = dict[str, Any]
+"""Parameters; `hsloc_service.config_schema` knows their schema, which the application puts into the OpenAPI."""
+
+
+class Strict(BaseModel):
+    """No conversions, no unknown keys."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+
+class Problem(BaseModel):
+    """Every answer that is not a success."""
+
+    code: str = Field(description="a word for programs", examples=["not_found"])
+    message: str = Field(description="a sentence for people", examples=["there is no job '…'"])
+    details: list[dict[str, Any]] | None = Field(default=None, description="where a request did not fit the schema")
+
+
+class FileView(BaseModel):
+    """An upload: a log, or a file of a map."""
+
+    id: Ident
+    name: str
+    state: Literal["receiving", "complete"]
+    size: int | None = Field(description="bytes; null while not known")
+    received: int = Field(description="bytes that are safe on the server's disk")
+    sha256: str | None
+    created: AwareDatetime
+    expires: AwareDatetime | None = Field(description="an unfinished upload is removed then")
+
+
+class FileList(BaseModel):
+    """Uploads, newest first; pass `next` as `before` for more."""
+
+    files: list[FileView]
+    next: Ident | None
+
+
+class MapFiles(Strict):
+    """The two uploads of a map as nav2 writes it."""
+
+    yaml: Ident
+    image: Ident
+
+
+class ReadRequest(Strict):
+    """How to read the log; what is left out is found out."""
+
+    scan_topic: Label | None = None
+    odom_topic: Label | None = None
+    truth_topic: Label | None = None
+    base_frame: Label | None = None
+    laser_pose: PoseList | None = None
+    start_s: FiniteFloat | None = None
+    end_s: FiniteFloat | None = None
+    deskew: bool = False
+
+
+class RunRequest(Strict):
+    """How to run: the same as the options of `hsloc replay`."""
+
+    mode: Literal["auto", "localise", "slam"] = Field(
+        default="auto", description="auto: localise if there is a map, else draw one"
+    )
+    matcher: Literal["hide", "harmony_search", "icp"] | None = None
+    mapper: Literal["graph", "point"] | None = None
+    preset: Literal["default", "paper", "paper-literal"] = "default"
+    seed: Seed = Field(default=0, description="at most what a browser counts exactly")
+    initial_pose: PoseList | None = Field(default=None, description="start: x, y (m), yaw (rad)")
+    unknown_start: bool = Field(default=False, description="search the whole map, whatever the log says")
+    no_odometry: bool = Field(default=False, description="do not look at the log's odometry (slam alone)")
+    alignment: Literal["none", "origin", "se2"] | None = Field(
+        default=None, description="of the trajectory with the truth; default: none on a given map, se2 on a drawn one"
+    )
+    read: ReadRequest | None = None
+    config: Config | None = Field(default=None, description="parameters, on top of the preset; see /v1/options")
+    resume: Ident | None = Field(
+        default=None, description="id of a job of yours that drew a map, which is extended: the new one is in its frame"
+    )
+    webhook: Annotated[str, Field(max_length=2000, pattern=r"^https?://[^\s]+$")] | None = Field(
+        default=None, description="URL that is told when the job has ended"
+    )
+
+
+class JobRequest(RunRequest):
+    """What to run, and how. Either `log` or `logs`."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [
+                {"required": ["log"], "properties": {"log": {"type": "string"}}},
+                {"required": ["logs"], "properties": {"logs": {"type": "array"}}},
+            ],
+            "if": {"required": ["resume"], "properties": {"resume": {"type": "string"}}},
+            "then": {
+                "properties": {
+                    "map": {"type": "null"},
+                    "mode": {"enum": ["auto", "slam"]},
+                    "mapper": {"enum": ["graph", None]},
+                }
+            },
+            "examples": [
+                {"log": "3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f", "seed": 7},
+                {
+                    "logs": ["3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f", "9b1f2c8e-4a0d-4f7e-8a55-2c7d9e0f1a2b"],
+                    "relations": "5d2e8b90-1c3f-4b6a-9d77-e4f5a6b7c8d9",
+                    "resume": "c7a1d3e5-6f80-4912-b3c4-d5e6f7a8b9c0",
+                    "mode": "slam",
+                },
+            ],
+        }
+    )
+
+    log: Ident | None = Field(default=None, description="id of the uploaded log")
+    logs: Annotated[list[Ident], Field(min_length=1, max_length=MAX_LOGS, json_schema_extra=UNIQUE)] | None = Field(
+        default=None, description="ids of several uploaded logs that are parts of one run, as `hsloc replay a b`"
+    )
+    relations: Ident | None = Field(
+        default=None, description="id of an uploaded file of relations to score by: `t1 t2 x y z roll pitch yaw`"
+    )
+    map: MapFiles | None = Field(default=None, description="map; default: the one in the log")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> JobRequest:
+        """What contradicts itself is refused before it is queued."""
+        if (self.log is None) == (self.logs is None):
+            raise PydanticCustomError("logs", "give either `log`, or `logs` for several parts of one run")
+        if self.logs is not None and len(set(self.logs)) < len(self.logs):
+            raise PydanticCustomError("logs", "logs: a log is named twice; several logs must be parts of one run")
+        if self.resume is not None and (self.map is not None or self.mode == "localise"):
+            raise PydanticCustomError(
+                "resume", "a map is either localised in (`map`) or extended (`resume`); leave out one of them"
+            )
+        if self.resume is not None and self.mapper == "point":
+            raise PydanticCustomError("resume", "a map is extended by the graph mapper; leave out `resume` or `mapper`")
+        return self
+
+
+class RerunRequest(Strict):
+    """What to change in a job that is run again; the rest, and the seed, stay."""
+
+    mode: Literal["auto", "localise", "slam"] | None = None
+    matcher: Literal["hide", "harmony_search", "icp"] | None = None
+    mapper: Literal["graph", "point"] | None = None
+    preset: Literal["default", "paper", "paper-literal"] | None = None
+    seed: Seed | None = None
+    initial_pose: PoseList | None = None
+    unknown_start: bool | None = None
+    alignment: Literal["none", "origin", "se2"] | None = None
+    relations: Ident | None = None
+    config: Config | None = None
+
+
+State = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
+
+
+class ProgressView(BaseModel):
+    """How far a running job is."""
+
+    phase: str = Field(description="fetch, open, prepare, replay, refine, write, store", examples=["replay"])
+    done: float = Field(description="seconds of the log (replay), or the part of the work from 0 to 1 (others)")
+    total: float
+    fraction: float = Field(ge=0.0, le=1.0)
+    speed: float | None = Field(description="done per second of wall time since the attempt began")
+    scans: int | None
+    age_s: float = Field(description="seconds since the job's process said so")
+
+
+class JobView(BaseModel):
+    """A job.
+
+    `reason` of a failed job: invalid_input, out_of_memory, cpu_limit, wall_limit, output_limit, disk_full, store (the
+    map to extend is in a store that this server is not set to), fault_injection; of a crashed one: signal, exit,
+    internal_error, protocol, attempts.
+    """
+
+    id: Ident
+    seq: int = Field(description="number of the job on this server; the cursor of the list")
+    state: State
+    reason: str | None
+    message: str | None
+    log: str = Field(description="what the client called the log")
+    request: dict[str, Any]
+    rerun_of: str | None
+    attempt: int
+    created: AwareDatetime
+    started: AwareDatetime | None
+    ended: AwareDatetime | None
+    progress: ProgressView | None
+    heartbeat_age_s: float | None = Field(description="seconds since the job's supervisor said that it lives")
+    summary: dict[str, Any] | None
+
+
+class JobList(BaseModel):
+    """Jobs, newest first; pass `next` as `before` for more."""
+
+    jobs: list[JobView]
+    next: int | None
+
+
+class AssetView(BaseModel):
+    """A file of the results."""
+
+    name: str
+    size: int
+    sha256: str
+    media_type: str
+    href: str
+
+
+class Manifest(BaseModel):
+    """All files of the results of a job."""
+
+    job: Ident
+    assets: list[AssetView]
+
+
+class DeliveryView(BaseModel):
+    """A webhook and what became of it."""
+
+    event_id: str
+    url: str
+    state: Literal["pending", "delivered", "given_up"]
+    attempts: int
+    last_status: int | None
+    last_error: str | None
+
+
+class DeliveryList(BaseModel):
+    """The webhooks of a job."""
+
+    deliveries: list[DeliveryView]
+
+
+class SecretView(BaseModel):
+    """The key of the webhooks' HMAC-SHA256."""
+
+    secret: str
+
+
+class Info(BaseModel):
+    """About this server, for whoever asks."""
+
+    version: str
+    tenant: str
+    scopes: list[str]
+    slots: int
+    busy: int
+    queued: int
+    max_upload_bytes: int
+    free_bytes: int
+
+
+class Options(BaseModel):
+    """The parameters that a job may set in `config`."""
+
+    config_schema: dict[str, Any] = Field(description="JSON Schema of `config`")
+    presets: dict[str, Any] = Field(description="the effective configuration of each preset")
+
+
+class Health(BaseModel):
+    """Alive, or ready to work."""
+
+    status: Literal["ok"]
+
+
+Request = TypeVar("Request", bound=RunRequest)
+
+
+def checked(kind: type[Request], values: Any) -> Request:
+    """A request that did not come as the body. Raises ServiceError 422 with the place of what is wrong."""
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = "".join(f".{part}" for part in first["loc"])
+        raise ServiceError(422, "invalid", f"request{where}: {first['msg']}") from error
+
+
+def moment(seconds: float | None) -> datetime | None:
+    """Seconds since 1970 as a moment in UTC."""
+    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
+
+
+def known_moment(seconds: float) -> datetime:
+    """The same for a time that is there."""
+    return datetime.fromtimestamp(seconds, UTC)

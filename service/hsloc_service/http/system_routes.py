@@ -1,0 +1,98 @@
+"""Health, metrics, options: for operators and programs."""
+
+from __future__ import annotations
+
+import time
+
+from fastapi import APIRouter
+from fastapi.responses import Response
+from prometheus_client import generate_latest
+from sqlalchemy import func, select, text
+
+from hsloc.version import __version__
+from hsloc_service import config_schema as job_options
+from hsloc_service.db.tables import DeliveryRow, JobRow
+from hsloc_service.errors import ServiceError
+from hsloc_service.http import metrics
+from hsloc_service.http.context import Admin, Context, Ctx, Reader, problems
+from hsloc_service.http.schemas import Health, Info, Options, Problem, SecretView
+from hsloc_service.webhooks import secret_of
+
+router = APIRouter(tags=["system"])
+_TEXT = {"description": "the metrics", "content": {"text/plain": {"schema": {"type": "string"}}}}
+
+
+@router.get("/healthz")
+def healthz() -> Health:
+    """The process answers."""
+    return Health(status="ok")
+
+
+@router.get("/readyz", responses={503: {"model": Problem, "description": "not ready"}})
+def readyz(ctx: Ctx) -> Health:
+    """The database answers and the disk has room: jobs can be taken."""
+    if ctx.stopping.is_set():
+        raise ServiceError(503, "stopping", "the server is shutting down", {"Retry-After": "5"})
+    with ctx.database.read() as session:
+        session.execute(text("select 1"))
+    if ctx.storage.free_bytes() < ctx.storage.min_free_bytes:
+        raise ServiceError(503, "no_space", "the server's disk is full", {"Retry-After": "60"})
+    return Health(status="ok")
+
+
+@router.get("/metrics", response_class=Response, responses={200: _TEXT, **problems()})
+def prometheus(ctx: Ctx, who: Admin) -> Response:
+    """Metrics of all tenants in Prometheus' text format; needs the scope `admin`."""
+    del who
+    _measure(ctx)
+    return Response(generate_latest(metrics.REGISTRY), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+@router.get("/v1/info", responses=problems())
+def info(ctx: Ctx, who: Reader) -> Info:
+    """This server, and who you are to it."""
+    capacity = ctx.dispatcher.capacity()
+    with ctx.database.read() as session:
+        queued = session.scalar(
+            select(func.count()).select_from(JobRow).where(JobRow.state == "queued", JobRow.tenant == who.tenant)
+        )
+    return Info(
+        version=__version__,
+        tenant=who.tenant,
+        scopes=sorted(who.scopes),
+        slots=capacity.slots,
+        busy=capacity.busy,
+        queued=queued or 0,
+        max_upload_bytes=ctx.settings.max_upload_bytes,
+        free_bytes=ctx.storage.free_bytes(),
+    )
+
+
+@router.get("/v1/options", responses=problems())
+def options(who: Reader) -> Options:
+    """JSON Schema of a job's `config`, and the presets."""
+    del who
+    return Options(**job_options.options())
+
+
+@router.get("/v1/webhook-secret", responses=problems())
+def webhook_secret(ctx: Ctx, who: Admin) -> SecretView:
+    """The key that signs your webhooks; made when first asked for. Needs the scope `admin`."""
+    with ctx.database.write() as session:
+        return SecretView(secret=secret_of(session, who.tenant))
+
+
+def _measure(ctx: Context) -> None:
+    with ctx.database.read() as session:
+        rows = session.execute(select(JobRow.state, func.count()).group_by(JobRow.state)).all()
+        counts = {row[0]: row[1] for row in rows}
+        oldest = session.scalar(select(func.min(JobRow.created)).where(JobRow.state == "queued"))
+        pending = session.scalar(select(func.count()).select_from(DeliveryRow).where(DeliveryRow.state == "pending"))
+    for state in ("queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"):
+        metrics.JOBS.labels(state).set(counts.get(state, 0))
+    capacity = ctx.dispatcher.capacity()
+    metrics.SLOTS.set(capacity.slots)
+    metrics.BUSY.set(capacity.busy)
+    metrics.FREE.set(ctx.storage.free_bytes())
+    metrics.OLDEST.set(0.0 if oldest is None else time.time() - oldest)
+    metrics.DELIVERIES.set(pending or 0)

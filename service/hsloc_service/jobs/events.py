@@ -1,0 +1,22 @@
+"""The history of a job: states are kept, of progress only the newest, of the log's lines a bounded number."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+from sqlalchemy import delete
+
+from hsloc_service.db.tables import EventRow
+
+if TYPE_CHECKING:
+    from sqlalchemy.orm import Session
+
+    from hsloc_service.db.tables import JobRow
+
+
+def record(session: Session, job: JobRow, kind: str, data: dict[str, Any]) -> None:
+    """Append an event; an older event of progress is replaced by a newer one."""
+    if kind == "progress":
+        session.execute(delete(EventRow).where(EventRow.job_id == job.id, EventRow.kind == "progress"))
+    session.add(EventRow(tenant=job.tenant, job_id=job.id, at=time.time(), kind=kind, data=data))

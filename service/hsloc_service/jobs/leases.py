@@ -1,0 +1,222 @@
+"""Who runs a job: leases with a fence.
+
+A worker owns a job by (owner, attempt) until its lease ends. Each of its writes names both; when another has taken the
+job meanwhile, the write finds no row and the worker must throw its work away. So a job may be started twice (a server
+was killed), but it ends once.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from sqlalchemy import func, select
+
+from hsloc_service.db.tables import AssetRow, FileRow, JobRow
+from hsloc_service.jobs.events import record
+from hsloc_service.jobs.repository import finish_job
+from hsloc_service.stored_request import MAP_STATE, files_of
+
+if TYPE_CHECKING:
+    from sqlalchemy.orm import Session
+
+    from hsloc_service.db.database import Database
+    from hsloc_service.results.store import Asset
+
+
+class Source(NamedTuple):
+    """The saved map that a job extends."""
+
+    store: str | None
+    folder: str
+    size: int
+    sha256: str
+
+
+class Claim(NamedTuple):
+    """A job in somebody's hands."""
+
+    job_id: str
+    tenant: str
+    owner: str
+    attempt: int
+    log_name: str
+    request: dict[str, Any]
+    names: dict[str, str]
+    """Labels of the files of the request."""
+    source: Source | None = None
+
+
+class HeartbeatReply(NamedTuple):
+    """What a worker learns when it says that it lives."""
+
+    mine: bool
+    cancel: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Leases:
+    """The queue as the workers see it."""
+
+    database: Database
+    lease_s: float
+    max_attempts: int
+
+    def claim(self, owner: str) -> Claim | None:
+        """Take the oldest waiting job of the tenant whose turn it is; None if none waits."""
+        with self.database.write() as session:
+            job = session.scalar(_next())
+            if job is None:
+                return None
+            now = time.time()
+            job.state, job.owner, job.attempt = "running", owner, job.attempt + 1
+            job.lease_until, job.heartbeat = now + self.lease_s, now
+            job.started = job.started or now
+            job.phase = job.done = job.total = job.scans = job.speed = job.progressed = None
+            record(session, job, "state", {"state": "running", "attempt": job.attempt})
+            names, source = _names(session, job.request), _source(session, job)
+            return Claim(job.id, job.tenant, owner, job.attempt, job.log_name, job.request, names, source)
+
+    def beat(self, claim: Claim, progress: dict[str, Any] | None) -> HeartbeatReply:
+        """Prolong the lease, and note the progress."""
+        with self.database.write() as session:
+            job = _held(session, claim)
+            if job is None:
+                return HeartbeatReply(mine=False, cancel=False)
+            now = time.time()
+            job.lease_until, job.heartbeat = now + self.lease_s, now
+            if progress is not None:
+                job.phase, job.done, job.total = progress["phase"], progress["done"], progress["total"]
+                job.scans, job.speed, job.progressed = progress["scans"], progress["speed"], now
+                record(session, job, "progress", progress)
+            return HeartbeatReply(mine=True, cancel=job.cancel)
+
+    def succeed(
+        self, claim: Claim, folder: str, assets: list[Asset], summary: dict[str, Any], store: str | None = None
+    ) -> bool:
+        """End a job well; False if it was taken away or cancelled, and the results must go.
+
+        The results, which the store has already, become visible by this commit.
+        """
+        with self.database.write() as session:
+            job = _held(session, claim)
+            if job is None or job.cancel:
+                return False
+            job.folder, job.store, job.summary = folder, store, summary
+            job.bytes = sum(asset.size for asset in assets)
+            for asset in assets:
+                session.add(
+                    AssetRow(
+                        job_id=job.id,
+                        name=asset.name,
+                        size=asset.size,
+                        sha256=asset.sha256,
+                        media_type=asset.media_type,
+                    )
+                )
+            finish_job(session, job, "succeeded", None, None)
+            return True
+
+    def fail(self, claim: Claim, state: str, reason: str, message: str) -> bool:
+        """End a job otherwise: failed, crashed or cancelled."""
+        with self.database.write() as session:
+            job = _held(session, claim)
+            if job is None:
+                return False
+            finish_job(
+                session, job, "cancelled" if job.cancel else state, "cancelled" if job.cancel else reason, message
+            )
+            return True
+
+    def release(self, claim: Claim, reason: str, counts: bool = True) -> None:
+        """Put a job back into the queue: its process or its server was ended from outside."""
+        with self.database.write() as session:
+            job = _held(session, claim)
+            if job is not None:
+                self._again(session, job, reason, counts)
+
+    def recover(self, owner: str | None = None) -> list[str]:
+        """Requeue the jobs whose lease has ended; with `owner` also those of every other owner.
+
+        At start-up the data folder's lock says that every other owner is dead.
+        """
+        now = time.time()
+        with self.database.write() as session:
+            running = session.scalars(select(JobRow).where(JobRow.state.in_(("running", "cancelling")))).all()
+            found = []
+            for job in running:
+                if (job.lease_until or 0.0) <= now or (owner is not None and job.owner != owner):
+                    self._again(session, job, "the server was gone", counts=True)
+                    found.append(job.id)
+            return found
+
+    def _again(self, session: Session, job: JobRow, reason: str, counts: bool) -> None:
+        if job.cancel:
+            finish_job(session, job, "cancelled", "cancelled", "cancelled")
+        elif counts and job.attempt >= self.max_attempts:
+            finish_job(session, job, "crashed", "attempts", f"given up after {job.attempt} attempts: {reason}")
+        else:
+            job.state = "queued"
+            job.owner = job.lease_until = None
+            record(session, job, "state", {"state": "queued", "reason": "requeued", "message": reason})
+
+
+def _next() -> Any:
+    """The next job, tenants in turn: who has least running comes first, then who was served longest ago.
+
+    One statement, so portable as it stands. A tenant's jobs are begun in the order of `seq`, so that its last start is
+    found at the end of its index, whatever number of jobs it has.
+    """
+    from sqlalchemy.orm import aliased
+
+    other = aliased(JobRow)
+    running = (
+        select(func.count())
+        .where(other.tenant == JobRow.tenant, other.state.in_(("running", "cancelling")))
+        .correlate(JobRow)
+        .scalar_subquery()
+    )
+    served = (
+        select(other.started)
+        .where(other.tenant == JobRow.tenant, other.started.is_not(None))
+        .order_by(other.seq.desc())
+        .limit(1)
+        .correlate(JobRow)
+        .scalar_subquery()
+    )
+    return (
+        select(JobRow)
+        .where(JobRow.state == "queued")
+        .order_by(running, func.coalesce(served, 0.0), JobRow.seq)
+        .limit(1)
+        .with_for_update(skip_locked=True)
+    )
+
+
+def _held(session: Session, claim: Claim) -> JobRow | None:
+    return session.scalar(
+        select(JobRow).where(
+            JobRow.id == claim.job_id,
+            JobRow.owner == claim.owner,
+            JobRow.attempt == claim.attempt,
+            JobRow.state.in_(("running", "cancelling")),
+        )
+    )
+
+
+def _names(session: Session, request: dict[str, Any]) -> dict[str, str]:
+    rows = session.execute(select(FileRow.id, FileRow.name).where(FileRow.id.in_(files_of(request)))).all()
+    return {row.id: row.name for row in rows}
+
+
+def _source(session: Session, job: JobRow) -> Source | None:
+    """The map that is extended; it cannot be gone, for the job that drew it is kept while this one is active."""
+    if job.resume_of is None:
+        return None
+    found = session.execute(
+        select(JobRow.store, JobRow.folder, AssetRow.size, AssetRow.sha256)
+        .join(AssetRow, AssetRow.job_id == JobRow.id)
+        .where(JobRow.id == job.resume_of, JobRow.tenant == job.tenant, AssetRow.name == MAP_STATE)
+    ).one()
+    return Source(found.store, found.folder or "", found.size, found.sha256)

@@ -1,0 +1,249 @@
+"""Jobs as their owners see them: submit, look, cancel, run again, delete."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+import uuid
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from sqlalchemy import delete, func, select
+
+from hsloc_service.db.tables import ACTIVE, AssetRow, DeliveryRow, EventRow, FileRow, IdempotencyRow, JobRow
+from hsloc_service.errors import ServiceError, busy, conflict, not_found
+from hsloc_service.jobs.events import record
+from hsloc_service.results.deletion_queue import removal_of
+from hsloc_service.storage import safe_name
+from hsloc_service.stored_request import MAP_STATE, logs_of
+from hsloc_service.uploads.repository import need_quota
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from sqlalchemy.orm import Session
+
+    from hsloc_service.auth import Principal
+    from hsloc_service.db.database import Database
+    from hsloc_service.settings import Settings
+    from hsloc_service.storage import Storage
+
+
+class Submitted(NamedTuple):
+    """A job, and whether this request made it (else an earlier one with the same Idempotency-Key)."""
+
+    job: JobRow
+    created: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Jobs:
+    """The jobs of all tenants; every method sees those of the principal only."""
+
+    database: Database
+    storage: Storage
+    settings: Settings
+
+    def submit(self, who: Principal, request: dict[str, Any], key: str | None = None) -> Submitted:
+        """Queue a job; when this returns, the job is on the disk.
+
+        `request` is a validated `JobRequest` as plain data. Raises ServiceError: 404 for files and jobs that are not
+        there, 409 for a key that was used for another request, 422 for a job without a map to extend, 429 when too
+        many wait, 507 when the disk or the quota is full.
+        """
+        digest = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
+        with self.database.write() as session:
+            known = None if key is None else session.get(IdempotencyRow, (who.tenant, key))
+            if known is not None:
+                if known.sha256 != digest:
+                    raise conflict("idempotency", "this Idempotency-Key was used for a different request")
+                return Submitted(_job(session, who, known.job_id), created=False)
+            self._need_room(session, who)
+            job = self._insert(session, who, request, None)
+            if key is not None:
+                now = time.time()
+                session.add(IdempotencyRow(tenant=who.tenant, key=key, sha256=digest, job_id=job.id, created=now))
+            return Submitted(job, created=True)
+
+    def rerun(self, who: Principal, job_id: str, request: dict[str, Any]) -> JobRow:
+        """The job again, with what the caller made of its request."""
+        with self.database.write() as session:
+            old = _job(session, who, job_id)
+            self._need_room(session, who)
+            return self._insert(session, who, request, old.id)
+
+    def get(self, who: Principal, job_id: str) -> JobRow:
+        """One job."""
+        with self.database.read() as session:
+            return _job(session, who, job_id)
+
+    def list(
+        self, who: Principal, *, state: str | None = None, before: int | None = None, limit: int = 50
+    ) -> Sequence[JobRow]:
+        """Jobs, newest first; `before` is the `seq` of the last one seen."""
+        query = select(JobRow).where(JobRow.tenant == who.tenant).order_by(JobRow.seq.desc()).limit(limit)
+        if state is not None:
+            query = query.where(JobRow.state == state)
+        if before is not None:
+            query = query.where(JobRow.seq < before)
+        with self.database.read() as session:
+            return session.scalars(query).all()
+
+    def assets(self, who: Principal, job_id: str) -> tuple[JobRow, Sequence[AssetRow]]:
+        """A job and the manifest of its results."""
+        with self.database.read() as session:
+            job = _job(session, who, job_id)
+            rows = session.scalars(select(AssetRow).where(AssetRow.job_id == job_id).order_by(AssetRow.name)).all()
+            return job, rows
+
+    def events(self, who: Principal, job_id: str, after: int, limit: int = 200) -> tuple[JobRow, Sequence[EventRow]]:
+        """A job and what happened to it after the cursor."""
+        query = (
+            select(EventRow).where(EventRow.job_id == job_id, EventRow.id > after).order_by(EventRow.id).limit(limit)
+        )
+        with self.database.read() as session:
+            job = _job(session, who, job_id)
+            return job, session.scalars(query).all()
+
+    def deliveries(self, who: Principal, job_id: str) -> Sequence[DeliveryRow]:
+        """The webhooks of a job."""
+        with self.database.read() as session:
+            _job(session, who, job_id)
+            return session.scalars(select(DeliveryRow).where(DeliveryRow.job_id == job_id)).all()
+
+    def cancel(self, who: Principal, job_id: str) -> JobRow:
+        """Ask for the end of a job. A waiting job is cancelled at once; a running one when its processes are dead."""
+        with self.database.write() as session:
+            job = _job(session, who, job_id)
+            if job.state == "queued":
+                finish_job(session, job, "cancelled", "cancelled", "cancelled before it started")
+            elif job.state == "running":
+                job.cancel, job.state = True, "cancelling"
+                record(session, job, "state", {"state": "cancelling"})
+            return job
+
+    def delete(self, who: Principal, job_id: str) -> None:
+        """Remove a job that has ended; its results are noted down for `Removals`.
+
+        Raises ServiceError 409 while it is active, or while an active job extends its map.
+        """
+        with self.database.write() as session:
+            job = _job(session, who, job_id)
+            if job.state in ACTIVE:
+                raise conflict("active", f"the job is {job.state}; cancel it first")
+            if base_job(session, job_id):
+                raise conflict("in_use", "an active job extends the map of this one; cancel that first")
+            delete_job(session, job)
+
+    def _need_room(self, session: Session, who: Principal) -> None:
+        self.storage.need_space()
+        need_quota(session, who, self.settings.tenant_bytes)
+        waiting = session.scalar(
+            select(func.count()).select_from(JobRow).where(JobRow.tenant == who.tenant, JobRow.state == "queued")
+        )
+        if (waiting or 0) >= self.settings.max_queued:
+            raise busy(f"{waiting} jobs are waiting already, which is the limit", 10.0)
+
+    def _insert(self, session: Session, who: Principal, request: dict[str, Any], rerun_of: str | None) -> JobRow:
+        logs = [_complete_file(session, who, ident, "log") for ident in logs_of(request)]
+        if request.get("map") is not None:
+            _complete_file(session, who, request["map"]["yaml"], "map.yaml")
+            _complete_file(session, who, request["map"]["image"], "map.image")
+        if request.get("relations") is not None:
+            _complete_file(session, who, request["relations"], "relations")
+        if request.get("resume") is not None:
+            _need_map(session, _job(session, who, request["resume"]))
+        job = JobRow(
+            id=str(uuid.uuid4()),
+            tenant=who.tenant,
+            file_id=logs[0].id,
+            log_name=", ".join(log.name for log in logs)[:1000],
+            request=request,
+            rerun_of=rerun_of,
+            resume_of=request.get("resume"),
+            state="queued",
+            created=time.time(),
+            attempt=0,
+            cancel=False,
+            webhook=request.get("webhook"),
+        )
+        session.add(job)
+        session.flush()
+        record(session, job, "state", {"state": "queued"})
+        return job
+
+
+def finish_job(session: Session, job: JobRow, state: str, reason: str | None, message: str | None) -> None:
+    """Put a job into a final state, and its webhook into the outbox, in one transaction."""
+    job.state, job.reason, job.message = state, reason, message
+    job.ended = time.time()
+    job.owner = job.lease_until = None
+    record(session, job, "state", {"state": state, "reason": reason, "message": message})
+    if job.webhook is not None:
+        ident = str(uuid.uuid4())
+        body = {
+            "event": "job.ended",
+            "event_id": ident,
+            "job": job.id,
+            "state": state,
+            "reason": reason,
+            "message": message,
+            "log": safe_name(job.log_name, "log"),
+            "ended": job.ended,
+        }
+        session.add(
+            DeliveryRow(
+                id=ident,
+                tenant=job.tenant,
+                job_id=job.id,
+                url=job.webhook,
+                body=json.dumps(body, separators=(",", ":")),
+                state="pending",
+                attempts=0,
+                next_at=job.ended,
+                created=job.ended,
+            )
+        )
+
+
+def delete_job(session: Session, job: JobRow) -> None:
+    """Remove the rows of a job, and note down that its results are to go."""
+    if job.folder is not None:
+        session.add(removal_of(job))
+    for table in (AssetRow, EventRow, DeliveryRow):
+        session.execute(delete(table).where(table.job_id == job.id))
+    session.execute(delete(IdempotencyRow).where(IdempotencyRow.job_id == job.id))
+    session.delete(job)
+
+
+def base_job(session: Session, job_id: str) -> bool:
+    """Whether a job that has not ended extends the map of this one."""
+    query = select(JobRow.id).where(JobRow.resume_of == job_id, JobRow.state.in_(ACTIVE)).limit(1)
+    return session.scalar(query) is not None
+
+
+def _need_map(session: Session, job: JobRow) -> None:
+    """Raises ServiceError 422 unless the job left a map that can be extended."""
+    if job.state != "succeeded":
+        raise ServiceError(422, "resume", f"resume: job {job.id} is {job.state}; only a succeeded one has left a map")
+    if session.get(AssetRow, (job.id, MAP_STATE)) is None:
+        raise ServiceError(
+            422, "resume", f"resume: job {job.id} drew no map with the graph mapper, so there is none to extend"
+        )
+
+
+def _job(session: Session, who: Principal, job_id: str) -> JobRow:
+    job = session.scalar(select(JobRow).where(JobRow.id == job_id, JobRow.tenant == who.tenant))
+    if job is None:
+        raise not_found("job", job_id)
+    return job
+
+
+def _complete_file(session: Session, who: Principal, file_id: str, what: str) -> FileRow:
+    row = session.scalar(select(FileRow).where(FileRow.id == file_id, FileRow.tenant == who.tenant))
+    if row is None:
+        raise ServiceError(404, "not_found", f"{what}: there is no file {file_id[:64]!r}; upload it first")
+    if row.state != "complete":
+        raise conflict("incomplete", f"{what}: the upload of file {file_id} is not finished")
+    return row

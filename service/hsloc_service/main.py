@@ -1,0 +1,172 @@
+"""Start the service: check what it listens on, make the first token, run uvicorn."""
+
+from __future__ import annotations
+
+import dataclasses
+import ipaddress
+import resource
+import signal
+import sys
+import time
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import uvicorn
+
+from hsloc_service.auth import SCOPES, Tokens
+from hsloc_service.db.database import Database
+from hsloc_service.http.app import create_app
+from hsloc_service.http.timeouts import protocol_class
+from hsloc_service.logs import configure
+from hsloc_service.settings import Settings, SettingsError
+from hsloc_service.storage import Storage
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from fastapi import FastAPI
+
+SHUTDOWN_S = 10
+
+
+class Server(uvicorn.Server):
+    """Tells the event streams when it is asked to stop; else it would wait for them."""
+
+    def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
+        super().__init__(config)
+        self._hsloc = app
+
+    def handle_exit(self, sig: int, frame: Any) -> None:
+        """SIGTERM or SIGINT."""
+        self._hsloc.state.context.stopping.set()
+        super().handle_exit(sig, frame)
+
+
+def serve(
+    settings: Settings,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    *,
+    open_to_all: bool = False,
+    first_token: bool = False,
+    secret: str | None = None,
+) -> int:
+    """Serve until SIGTERM; the exit code.
+
+    Without any token the service answers loopback only, unless `open_to_all`. `first_token` makes one on the first
+    start and writes it to stdout; `secret` is a token that the operator chose. Raises SettingsError.
+    """
+    app = create_app(settings := with_tokens(settings, host, open_to_all, first_token, secret))
+    configure()
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, 65536) if hard > 0 else 65536), hard))
+    config = uvicorn.Config(
+        app,
+        host=host,
+        port=port,
+        http=protocol_class(
+            settings.header_timeout_s, settings.body_timeout_s, settings.write_timeout_s, settings.max_connections
+        ),
+        ws="none",
+        loop="asyncio",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_keep_alive=5,
+        timeout_graceful_shutdown=SHUTDOWN_S,
+        backlog=2048,
+    )
+    server = Server(config, app)
+    for which in (signal.SIGTERM, signal.SIGINT):
+        # uvicorn raises the signal once more when it is done; being asked to stop is no failure.
+        signal.signal(which, lambda *_: None)
+    server.run()
+    return 0 if server.started else 1
+
+
+def with_tokens(settings: Settings, host: str, open_to_all: bool, first_token: bool, secret: str | None) -> Settings:
+    """The settings, with tokens required where they must be. Raises SettingsError where none is there."""
+    settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+    # A server that holds the folder must not find its database migrated, or its token gone, by one that may not start.
+    Storage(settings.data, settings.min_free_bytes).close()
+    database = Database(settings.data / "hsloc.db")
+    try:
+        tokens = Tokens(database)
+        if secret is not None:
+            if len(secret) < 24:
+                raise SettingsError(f"the token has {len(secret)} characters; it must have 24 or more")
+            tokens.issue_operators("default", secret)
+        elif first_token and not tokens.any():
+            show_token(tokens.issue("default", label="first"))
+        required = settings.require_token or tokens.any()
+    finally:
+        database.close()
+    if not required and not open_to_all and not is_loopback(host):
+        raise SettingsError(
+            f"host is {host}, and no token exists: everybody who reaches it could do everything; "
+            "make one with --first-token or `hsloc serve --new-token TENANT`, or pass --open-to-all"
+        )
+    hosts = settings.allowed_hosts if host in settings.allowed_hosts else (*settings.allowed_hosts, host)
+    return dataclasses.replace(settings, require_token=required, allowed_hosts=hosts)
+
+
+def new_token(settings: Settings, tenant: str, scopes: str = ",".join(SCOPES), days: float | None = None) -> int:
+    """Make a token and show it; works while the service runs. Raises SettingsError."""
+    settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+    database = Database(settings.data / "hsloc.db")
+    try:
+        chosen = tuple(part.strip() for part in scopes.split(",") if part.strip())
+        expires = None if days is None else time.time() + days * 86400.0
+        show_token(Tokens(database).issue(tenant, chosen, expires=expires))
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
+    finally:
+        database.close()
+    return 0
+
+
+def list_tokens(settings: Settings) -> int:
+    """Show what tokens there are; works while the service runs. Raises SettingsError."""
+    with _tokens(settings) as tokens:
+        for row in tokens.rows():
+            state = "revoked" if row.revoked is not None else "never expires"
+            if row.revoked is None and row.expires is not None:
+                state = f"expires {time.strftime('%Y-%m-%dT%H:%MZ', time.gmtime(row.expires))}"
+            made = time.strftime("%Y-%m-%dT%H:%MZ", time.gmtime(row.created))
+            sys.stdout.write(f"{row.id}  {row.tenant}  {row.scopes.replace(' ', ',')}  made {made}  {state}\n")
+    return 0
+
+
+def revoke_token(settings: Settings, ident: str) -> int:
+    """Make a token worthless from the next request on; works while the service runs. Raises SettingsError."""
+    with _tokens(settings) as tokens:
+        if not tokens.revoke(ident):
+            raise SettingsError(f"there is no token {ident!r}; `hsloc serve --list-tokens` shows what there is")
+    return 0
+
+
+@contextmanager
+def _tokens(settings: Settings) -> Iterator[Tokens]:
+    """The tokens of a data folder that exists already."""
+    path = settings.data / "hsloc.db"
+    if not path.is_file():
+        raise SettingsError(f"{settings.data}: no data folder of hsloc; name it with --data")
+    database = Database(path)
+    try:
+        yield Tokens(database)
+    finally:
+        database.close()
+
+
+def show_token(token: str) -> None:
+    """Once, on stdout."""
+    sys.stdout.write(f"token (shown this once): {token}\n")
+    sys.stdout.flush()
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches it."""
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"

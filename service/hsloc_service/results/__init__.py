@@ -1,0 +1,1 @@
+"""Results: data folder or object store."""

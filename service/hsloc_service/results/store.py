@@ -1,0 +1,161 @@
+"""What a store of results must do, and the data folder as one.
+
+Law of a store: `publish` puts files under a name that was never used, which the job's row names in the commit that ends
+the job. Until then nobody can ask for them; so there is the whole result or none, whatever breaks in between, and what
+a broken attempt left behind is found by `names` and removed.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import stat
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from hsloc_service.storage import hash_file, sync_folder
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+MAX_ASSETS = 1000
+BLOCK = 4 << 20
+"""Bytes that are read from a store at once."""
+MEDIA_TYPES = {
+    ".tum": "text/plain; charset=utf-8",
+    ".json": "application/json",
+    ".yaml": "application/yaml",
+    ".png": "image/png",
+    ".pgm": "image/x-portable-graymap",
+    ".svg": "image/svg+xml",
+    ".html": "text/html; charset=utf-8",
+    ".mcap": "application/octet-stream",
+    ".ply": "application/octet-stream",
+    ".csv": "text/csv; charset=utf-8",
+}
+"""What results may be; anything else is application/octet-stream."""
+_ASSET_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}\Z")
+_RESULT_NAME = re.compile(r"[0-9a-f-]{36}\.[0-9]{1,9}\Z")
+
+
+@dataclass(frozen=True, slots=True)
+class Asset:
+    """A file of a result."""
+
+    name: str
+    size: int
+    sha256: str
+    media_type: str
+
+
+class ResultStore(Protocol):
+    """See the law above. Methods may block for as long as the store likes: see `waiting`.
+
+    All but `publish` raise StoreError for trouble that may pass, and FileNotFoundError for what is not there.
+    """
+
+    @property
+    def url(self) -> str | None:
+        """What the job's row says of where its results are; None for the data folder."""
+        ...
+
+    def publish(self, output: Path, name: str, assets: list[Asset]) -> None:
+        """Make the files of `output`, which `collect` has seen, the results `name`.
+
+        Raises StoreError, or OSError for trouble of the local disk.
+        """
+        ...
+
+    def path(self, name: str, asset: str) -> Path | None:
+        """The file, if it is one of this machine."""
+        ...
+
+    def read(self, name: str, asset: str, start: int, size: int) -> bytes:
+        """`size` bytes from `start` on, which the manifest says are there."""
+        ...
+
+    def remove(self, name: str) -> None:
+        """Remove results; no error if they are gone."""
+        ...
+
+    def names(self) -> list[str]:
+        """All results, also those that no job names."""
+        ...
+
+
+class FolderStore:
+    """A folder of the data folder: results appear by one rename."""
+
+    url = None
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    def publish(self, output: Path, name: str, assets: list[Asset]) -> None:
+        """Rename the output to `<root>/<name>`; its files were synced when they were hashed."""
+        del assets
+        sync_folder(output)
+        output.rename(self._root / checked_result(name))
+        sync_folder(self._root)
+
+    def path(self, name: str, asset: str) -> Path:
+        """The path of an asset that the manifest names."""
+        return self._root / checked_result(name) / checked_asset(asset)
+
+    def read(self, name: str, asset: str, start: int, size: int) -> bytes:
+        """Bytes of an asset. Raises OSError if they are not there: that does not pass."""
+        with self.path(name, asset).open("rb") as file:
+            file.seek(start)
+            block = file.read(size)
+        if len(block) != size:
+            raise OSError(f"{asset} of {name} is shorter than its manifest says")
+        return block
+
+    def remove(self, name: str) -> None:
+        """Remove the results `name`."""
+        shutil.rmtree(self._root / checked_result(name), ignore_errors=True)
+
+    def names(self) -> list[str]:
+        """The folders with the names of results; anything else is somebody's, and left alone."""
+        return [entry.name for entry in os.scandir(self._root) if _RESULT_NAME.match(entry.name)]
+
+
+def collect(output: Path) -> list[Asset]:
+    """The manifest of a job's output: each file hashed, and on the disk.
+
+    Only regular files with plain names are taken; what else a job leaves behind is dropped.
+    """
+    assets: list[Asset] = []
+    for path in sorted(output.iterdir()):
+        mode = path.lstat().st_mode
+        if not stat.S_ISREG(mode) or not _ASSET_NAME.match(path.name) or len(assets) >= MAX_ASSETS:
+            _remove(path)
+            continue
+        path.chmod(0o600)
+        size, digest = hash_file(path, sync=True)
+        media = MEDIA_TYPES.get(path.suffix.lower(), "application/octet-stream")
+        assets.append(Asset(path.name, size, digest, media))
+    return assets
+
+
+def checked_asset(name: str) -> str:
+    """The name of an asset; raises ValueError for anything that could lead elsewhere."""
+    if not _ASSET_NAME.match(name):
+        raise ValueError(f"{name!r} is not the name of an asset")
+    return name
+
+
+def checked_result(name: str) -> str:
+    """The name of results, `<job>.<attempt>`; raises ValueError for anything that could lead elsewhere."""
+    if not _RESULT_NAME.match(name):
+        raise ValueError(f"{name!r} is not the name of results")
+    return name
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)

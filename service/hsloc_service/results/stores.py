@@ -1,0 +1,34 @@
+"""The stores of a server: the data folder, and the object store that the settings name."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hsloc_service.errors import StoreError
+from hsloc_service.results.store import FolderStore
+
+if TYPE_CHECKING:
+    from hsloc_service.results.store import ResultStore
+    from hsloc_service.settings import Settings
+    from hsloc_service.storage import Storage
+
+
+class ResultStores:
+    """The data folder, where results are by default, and the object store that the settings name."""
+
+    def __init__(self, storage: Storage, settings: Settings) -> None:
+        self.folder = FolderStore(storage.results)
+        self.current: ResultStore = self.folder
+        if settings.results_url:
+            # fsspec is imported where it is needed alone.
+            from hsloc_service.results.object_store import ObjectStore
+
+            self.current = ObjectStore(settings.results_url, storage.instance)
+
+    def of(self, url: str | None) -> ResultStore:
+        """The store that a job's row names. Raises StoreError if the settings do not name it any more."""
+        if url is None:
+            return self.folder
+        if url != self.current.url:
+            raise StoreError(f"these results are in {url}, which this server is not set to (HSLOC_RESULTS_URL)")
+        return self.current

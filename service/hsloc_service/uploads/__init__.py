@@ -1,0 +1,1 @@
+"""Uploads: rows, and bytes on disk."""

@@ -1,0 +1,157 @@
+"""Uploads: rows with an offset that is true, bytes that are on the disk before the offset says so."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from sqlalchemy import case, func, select, tuple_
+
+from hsloc_service.db.tables import ACTIVE, FileRow, JobRow
+from hsloc_service.errors import ServiceError, conflict, no_space, not_found
+from hsloc_service.stored_request import files_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from sqlalchemy.orm import Session
+
+    from hsloc_service.auth import Principal
+    from hsloc_service.db.database import Database
+    from hsloc_service.settings import Settings
+    from hsloc_service.storage import Storage
+
+
+@dataclass(frozen=True, slots=True)
+class Files:
+    """The uploads of all tenants; every method sees those of the principal only."""
+
+    database: Database
+    storage: Storage
+    settings: Settings
+
+    def create(self, who: Principal, name: str, size: int | None, file_id: str | None = None) -> FileRow:
+        """A row for an upload of `size` bytes (None: not known yet), which are reserved.
+
+        Raises ServiceError 413 for too much, 507 where disk or quota do not suffice, 409 for an id that is taken.
+        """
+        if size is not None:
+            self.need_size(size)
+        now = time.time()
+        with self.database.write() as session:
+            self._need_room(session, who, size or 0)
+            taken = None if file_id is None else session.get(FileRow, file_id)
+            if taken is not None:
+                raise conflict("exists", "taken") if taken.tenant == who.tenant else not_found("file", taken.id)
+            row = FileRow(
+                id=file_id or str(uuid.uuid4()),
+                tenant=who.tenant,
+                name=name[:255] or "log",
+                state="receiving",
+                size=size,
+                received=0,
+                created=now,
+                expires=now + self.settings.upload_ttl_s,
+            )
+            session.add(row)
+        return row
+
+    def need_size(self, size: int) -> None:
+        """Raises ServiceError 413 for a file larger than any that is taken."""
+        if size > self.settings.max_upload_bytes:
+            raise ServiceError(413, "too_large", f"{size} bytes; at most {self.settings.max_upload_bytes} are taken")
+
+    def need_room(self, who: Principal) -> None:
+        """Raises ServiceError 507 where disk or quota are used up; asked now and then while bytes come in."""
+        with self.database.read() as session:
+            self._need_room(session, who, 0)
+
+    def _need_room(self, session: Session, who: Principal, size: int) -> None:
+        need_quota(session, who, self.settings.tenant_bytes, size)
+        # What others announced and have not sent yet is theirs already.
+        pending = session.scalar(
+            select(func.coalesce(func.sum(FileRow.size - FileRow.received), 0)).where(
+                FileRow.state == "receiving", FileRow.size.is_not(None)
+            )
+        )
+        self.storage.need_space((pending or 0) + size)
+
+    def get(self, who: Principal, file_id: str) -> FileRow:
+        """One upload."""
+        with self.database.read() as session:
+            return _file(session, who, file_id)
+
+    def list(self, who: Principal, limit: int = 200, before: str | None = None) -> Sequence[FileRow]:
+        """Uploads, newest first; `before` is the id of the last one seen. Raises ServiceError 404 if that is gone."""
+        query = select(FileRow).where(FileRow.tenant == who.tenant).limit(limit)
+        with self.database.read() as session:
+            if before is not None:
+                last = _file(session, who, before)
+                query = query.where(tuple_(FileRow.created, FileRow.id) < tuple_(last.created, last.id))
+            return session.scalars(query.order_by(FileRow.created.desc(), FileRow.id.desc())).all()
+
+    def advance(self, file_id: str, received: int) -> None:
+        """So many bytes are on the disk."""
+        with self.database.write() as session:
+            row = session.get(FileRow, file_id)
+            if row is not None:
+                row.received = received
+
+    def complete(self, file_id: str, size: int, sha256: str) -> FileRow:
+        """The file is whole. Raises ServiceError 404 if it was deleted meanwhile."""
+        with self.database.write() as session:
+            row = session.get(FileRow, file_id)
+            if row is None:
+                raise not_found("file", file_id)
+            row.state, row.size, row.received, row.sha256, row.expires = "complete", size, size, sha256, None
+            return row
+
+    def restart(self, who: Principal, file_id: str, size: int | None) -> None:
+        """Begin an unfinished upload anew, of `size` bytes, for which the same holds as for a new one."""
+        if size is not None:
+            self.need_size(size)
+        with self.database.write() as session:
+            row = _file(session, who, file_id)
+            if row.state == "complete":
+                raise conflict("complete", "this upload is finished and cannot be changed")
+            row.received, row.size = 0, None  # what was reserved for it is free again
+            session.flush()
+            self._need_room(session, who, size or 0)
+            row.size = size
+
+    def delete(self, who: Principal, file_id: str) -> None:
+        """Remove an upload. Raises ServiceError 409 while an active job needs it."""
+        with self.database.write() as session:
+            row = _file(session, who, file_id)
+            if needed(session, file_id):
+                raise conflict("in_use", "an active job needs this file; cancel it first")
+            session.delete(row)
+        self.storage.upload_path(file_id).unlink(missing_ok=True)
+
+
+def need_quota(session: Session, who: Principal, most: int, size: int = 0) -> None:
+    """Raises ServiceError 507 where uploads, as received or announced, and results of a tenant take too much.
+
+    Results count wherever they are stored, by their manifest.
+    """
+    size_or_none = func.coalesce(FileRow.size, 0)
+    announced = case((FileRow.received > size_or_none, FileRow.received), else_=size_or_none)
+    uploads = session.scalar(select(func.coalesce(func.sum(announced), 0)).where(FileRow.tenant == who.tenant)) or 0
+    results = session.scalar(select(func.coalesce(func.sum(JobRow.bytes), 0)).where(JobRow.tenant == who.tenant)) or 0
+    if uploads + results + size > most:
+        raise no_space(f"your uploads take {uploads} and your results {results} of {most} bytes; delete some")
+
+
+def needed(session: Session, file_id: str) -> bool:
+    """Whether a job that has not ended reads the file."""
+    active = session.scalars(select(JobRow.request).where(JobRow.state.in_(ACTIVE)))
+    return any(file_id in files_of(request) for request in active)
+
+
+def _file(session: Session, who: Principal, file_id: str) -> FileRow:
+    row = session.scalar(select(FileRow).where(FileRow.id == file_id, FileRow.tenant == who.tenant))
+    if row is None:
+        raise not_found("file", file_id)
+    return row

@@ -1,0 +1,108 @@
+"""A run that is doubtful as a whole says so: most scans without a place, odometry that jumps and is mended."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hsloc.analysis.quality_warnings import doubts
+from hsloc.log import LogWriter, ReadOptions, open_log
+from hsloc.model import Odometry, Pose2, Scan, Truth
+from hsloc.replay.run import run
+from hsloc.request import RunRequest
+
+OFFICE = Path(__file__).resolve().parents[2] / "recordings" / "office.mcap"
+
+
+def rewritten(path, change, end=20.0):
+    """The office, with each event changed by `change`."""
+    log = open_log(OFFICE, ReadOptions(end_s=end))
+    with LogWriter(path) as writer:
+        writer.occupancy_grid(log.map(), log.summary.origin_ns)
+        for event in map(change, log.events()):
+            if isinstance(event, Scan):
+                writer.scan(event)
+            elif isinstance(event, Odometry):
+                writer.odometry(event.stamp_ns, event.T_odom_base)
+    return path
+
+
+def test_a_sound_run_leaves_no_doubt():
+    assert doubts(run(RunRequest(logs=(OFFICE,), read=ReadOptions(end_s=20.0), unknown_start=True))) == []
+
+
+def test_a_laser_that_hangs_head_down_and_is_not_said_to_leaves_a_doubt(tmp_path):
+    def mirrored(event):
+        return replace(event, ranges=event.ranges[::-1].copy()) if isinstance(event, Scan) else event
+
+    found = run(RunRequest(logs=(rewritten(tmp_path / "run.mcap", mirrored),), unknown_start=True))
+    (line,) = doubts(found)
+    assert "scans found no place on the map" in line
+    assert "--laser-pose" in line
+
+
+def test_a_log_too_short_to_be_sure_is_all_guesses():
+    found = run(RunRequest(logs=(OFFICE,), read=ReadOptions(end_s=0.5), unknown_start=True))
+    assert not found.localised.any()
+    assert "every pose is a guess" in doubts(found)[0]
+
+
+def test_odometry_that_is_told_in_millimetres_is_not_mended(tmp_path):
+    def in_millimetres(event):
+        if isinstance(event, Odometry):
+            pose = event.T_odom_base
+            return replace(event, T_odom_base=Pose2(1000.0 * pose.x, 1000.0 * pose.y, pose.theta))
+        return event
+
+    log = rewritten(tmp_path / "run.mcap", in_millimetres, end=6.0)
+    found = run(RunRequest(logs=(log,), initial_pose=Pose2(2.6, 8.1, 1.5708)))
+    (line,) = (text for text in found.warnings if "jumps" in text)
+    assert "too often to be mended" in line
+    assert found.odometry.length() > 1000.0  # as it is, but for the first few jumps
+
+
+@pytest.mark.parametrize("mode", ["localise", "slam"])
+@pytest.mark.parametrize("reset", [Pose2(5.0, 0.0, 0.0), Pose2(0.1, 0.0, 3.0), Pose2(-40.0, 7.0, -2.0)])
+def test_odometry_that_begins_anew_goes_on_where_it_was_and_is_told(tmp_path, mode, reset):
+    def begun_anew(event):
+        if isinstance(event, Odometry) and event.stamp_ns >= 1_700_000_010_000_000_000:
+            return replace(event, T_odom_base=reset @ event.T_odom_base)
+        return event
+
+    start = Pose2(2.6, 8.1, 1.5708)
+    spec = RunRequest(logs=(rewritten(tmp_path / "run.mcap", begun_anew, end=14.0),), mode=mode, initial_pose=start)
+    found = run(spec)
+    whole = run(replace(spec, logs=(rewritten(tmp_path / "whole.mcap", lambda event: event, end=14.0),)))
+    (line,) = (text for text in found.warnings if "jumps" in text)
+    assert line.startswith("odometry (/odom) jumps (1 times, first by ")
+    assert " at 10.000 s); it goes on there" in line
+    assert not any("jumps" in text for text in whole.warnings)
+    # But for the one step in which it jumped, 2 cm at 1 m/s.
+    for name in ("odometry", "trajectory"):
+        a, b = getattr(found, name), getattr(whole, name)
+        assert np.array_equal(a.stamps_ns, b.stamps_ns)
+        assert np.abs(a.poses - b.poses)[:, :2].max() < 0.05
+    assert found.localised.all()
+
+
+def test_the_way_is_retraced_as_far_as_the_scans_fit_and_no_farther(tmp_path):
+    """For eight seconds the lidar sees nothing of the map, so that nobody can say where the robot was at first."""
+    rng = np.random.default_rng(0)
+
+    def blind(event):
+        if isinstance(event, Scan) and event.stamp_ns < 1_700_000_008_000_000_000:
+            clutter = rng.uniform(0.3, 6.0, len(event.ranges)).astype(np.float32)
+            return replace(event, ranges=clutter)
+        return event
+
+    found = run(RunRequest(logs=(rewritten(tmp_path / "run.mcap", blind, end=25.0),), unknown_start=True))
+    seconds = (found.trajectory.stamps_ns - 1_700_000_000_000_000_000) / 1e9
+    assert not found.localised[seconds < 6.5].any()
+    assert found.localised[seconds > 20.0].all()
+    truth = open_log(OFFICE, ReadOptions(end_s=25.0))
+    known = {e.stamp_ns: e.T_map_base for e in truth.events() if isinstance(e, Truth)}
+    for stamp, pose, sure in zip(found.trajectory.stamps_ns, found.trajectory.poses, found.localised, strict=True):
+        assert not sure or np.hypot(*(pose[:2] - known[int(stamp)].to_array()[:2])) < 0.3

@@ -1,0 +1,110 @@
+"""run.mcap and report.html of a run, as others read them: the mcap library, rosbags, evo, and a reader of the page."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from hsloc.cli.main import main
+from hsloc.log import open_log
+from hsloc.maps import save_map
+from hsloc.trajectory_io.tum import read_tum
+
+HALL = Path(__file__).parents[2] / "recordings" / "hall.mcap"
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run") / "out"
+    assert main(["replay", str(HALL), "--end", "8", "--out", str(folder), "--quiet"]) == 0
+    return folder
+
+
+def test_the_mcap_library_finds_index_checksums_attachment_and_metadata(results):
+    with (results / "run.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary.chunk_indexes
+        count = sum(1 for _ in reader.iter_messages())
+        assert count == summary.statistics.message_count > 0
+        (attachment,) = reader.iter_attachments()
+        (metadata,) = reader.iter_metadata()
+    assert (attachment.name, attachment.data) == ("config.yaml", (results / "config.yaml").read_bytes())
+    assert metadata.metadata["seed"] == "0"
+
+
+def test_rosbags_decodes_every_message(results):
+    trajectory = read_tum(results / "trajectory.tum")
+    found = Counter()
+    poses = []
+    with AnyReader([results / "run.mcap"]) as reader:
+        for connection, _, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            found[connection.topic] += 1
+            if connection.topic == "/pose":
+                poses.append((message.pose.position.x, message.pose.position.y))
+            if connection.topic == "/map":
+                cells = np.asarray(message.data).reshape(message.info.height, message.info.width)
+                np.testing.assert_array_equal(cells, open_log(HALL).map().cells)
+    scans = json.loads((results / "metrics.json").read_text())["scans"]["total"]
+    of_each = {"/scan": scans, "/pose": len(trajectory), "/tf": len(trajectory)}
+    assert found == {"/map": 1, "/path": 1, "/tf_static": 1, **of_each}
+    np.testing.assert_allclose(poses, trajectory.poses[:, :2], atol=1e-9)
+
+
+def test_evo_reads_the_poses(results, tmp_path):
+    command = [
+        str(Path(sys.executable).with_name("evo_traj")),
+        "bag2",
+        str(results / "run.mcap"),
+        "/pose",
+        "--save_as_tum",
+    ]
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=False, env={**os.environ, "HOME": str(tmp_path)}
+    )
+    assert done.returncode == 0, done.stderr
+    (saved,) = tmp_path.glob("*.tum")
+    ours, theirs = read_tum(results / "trajectory.tum"), read_tum(saved)
+    assert len(ours) == len(theirs)
+    np.testing.assert_allclose(theirs.poses, ours.poses, atol=1e-6)
+
+
+def test_the_page_tells_what_was_read_how_it_converged_and_where_the_origin_is(results):
+    page = (results / "report.html").read_text()
+    assert "localised on the map of the log" in page
+    assert "2023-11-14 22:13:20 UTC" in page
+    assert "/scan, laser at x -0.047 m, y 0.000 m, yaw 90.0° (from /tf_static)" in page
+    assert '<g class="axes"' in page
+    (name,) = re.findall(r"Convergence: (.*?) <", page)
+    assert name == "HIDE, 25 scans, ±0.5 m, ±20°"
+    assert "Remarks" not in page
+
+
+def test_the_page_tells_warnings_and_the_checksums_of_a_map_that_was_given(results, tmp_path):
+    save_map(open_log(HALL).map(), tmp_path)
+    text = (tmp_path / "map.yaml").read_text().replace("free_thresh: 0.196", "free_thresh: 0.25")
+    (tmp_path / "map.yaml").write_text(text)
+    out = tmp_path / "out"
+    command = ["replay", str(HALL), "--map", str(tmp_path / "map.yaml"), "--end", "4", "--out", str(out), "--quiet"]
+    assert main([*command, "--matcher", "icp"]) == 0
+    page = (out / "report.html").read_text()
+    assert "localised on map.yaml" in page
+    for name in ("map.yaml", "map.pgm"):
+        assert f"{name}</th>" in page
+        assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() in page
+    (warning,) = json.loads((out / "metrics.json").read_text())["warnings"]
+    assert "free_thresh 0.25" in warning
+    assert re.search(r"<h2>Remarks</h2><ul><li>[^<]*free_thresh 0\.25", page)
+    assert "Convergence" not in page  # ICP does not search

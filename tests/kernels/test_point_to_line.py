@@ -1,0 +1,120 @@
+import numpy as np
+import pytest
+
+from hsloc.kernels.point_to_line import bearing, choose_hits, pair_terms
+from hsloc.model import Pose2, Scan
+from hsloc.slam.keyscans import KeyScan, KeyScans
+
+DEGREE = np.radians(1.0)
+
+
+def room_scan(pose, *, beams=181, noise=0.0, seed=0, increment=DEGREE):
+    """What a laser in a room of 6 x 4 m sees, by hand: the nearest of four walls."""
+    angles = pose.theta - increment * (beams - 1) / 2 + increment * np.arange(beams)
+    with np.errstate(divide="ignore"):
+        to_x = np.where(np.cos(angles) > 0, 6.0 - pose.x, -pose.x) / np.cos(angles)
+        to_y = np.where(np.sin(angles) > 0, 4.0 - pose.y, -pose.y) / np.sin(angles)
+    ranges = np.minimum(np.abs(to_x), np.abs(to_y))
+    ranges = ranges + noise * np.random.default_rng(seed).standard_normal(beams)
+    return Scan(0, ranges.astype(np.float32), -increment * (beams - 1) / 2, increment, 0.05, 30.0)
+
+
+def terms(scans, i, j, pose, *, gate=0.3, scale=1e6):
+    information, gradient, counts = np.empty((3, 3)), np.empty(3), np.empty(5)
+    chosen, chosen_start = scans.chosen(10_000)
+    pair_terms(
+        i, j, *pose, scans.points, scans.normals, scans.centroids, scans.start, scans.hit_of_beam, scans.ranges,
+        scans.table_start, scans.geometry, chosen, chosen_start, gate, scale, information, gradient, counts,
+    )  # fmt: skip
+    return information, gradient, counts
+
+
+@pytest.fixture(scope="module")
+def two():
+    first, second = Pose2(2.0, 1.5, 0.3), Pose2(2.4, 1.8, 0.5)
+    scans = KeyScans.from_scans([KeyScan.of(room_scan(first)), KeyScan.of(room_scan(second))])
+    return scans, first.between(second).to_array()
+
+
+def test_surfels_of_a_room_point_at_the_laser_across_the_walls(two):
+    scans, _ = two
+    valid = np.hypot(*scans.normals.T) > 0
+    assert valid.mean() > 0.9
+    pose = Pose2(2.0, 1.5, 0.3)
+    first = scans.normals[: scans.start[1]][valid[: scans.start[1]]].astype(float)
+    in_room = (Pose2(0, 0, pose.theta) @ first).round(2)
+    axis = np.isclose(np.abs(in_room).max(axis=1), 1.0, atol=0.02)
+    assert axis.mean() > 0.9
+    towards = -(first * scans.hits(0)[valid[: scans.start[1]]]).sum(axis=1)
+    assert (towards > 0).all()
+
+
+def test_at_the_true_pose_nothing_pulls(two):
+    scans, true = two
+    _, gradient, counts = terms(scans, 1, 0, true)
+    assert counts[0] > 120
+    assert counts[1] == 0
+    assert np.sqrt(counts[3] / counts[4]) < 0.01
+    assert np.abs(gradient).max() / counts[0] < 0.004
+
+
+@pytest.mark.parametrize("off", [(0.08, -0.05, 0.0), (0.0, 0.1, 0.02), (-0.06, 0.03, -0.03)])
+def test_a_few_steps_lead_back_to_the_true_pose(two, off):
+    scans, true = two
+    pose = true + off
+    for _ in range(6):
+        information, gradient, _ = terms(scans, 1, 0, pose)
+        pose = pose - np.linalg.solve(information, gradient)
+    assert (np.abs(pose - true) < (0.005, 0.005, 0.002)).all()
+
+
+def test_the_gradient_is_that_of_half_the_sum_of_squares(two):
+    scans, true = two
+    pose = true + np.array((0.02, 0.01, 0.004))
+    _, gradient, _ = terms(scans, 1, 0, pose)
+    numeric = []
+    for k in range(3):
+        step = np.zeros(3)
+        step[k] = 1e-5
+        numeric.append((terms(scans, 1, 0, pose + step)[2][3] - terms(scans, 1, 0, pose - step)[2][3]) / 4e-5)
+    np.testing.assert_allclose(gradient, numeric, rtol=0.02, atol=0.05)
+
+
+def test_a_scan_moved_into_the_room_conflicts():
+    scans = KeyScans.from_scans(
+        [KeyScan.of(room_scan(Pose2(1.0, 2.0, 0.0))), KeyScan.of(room_scan(Pose2(1.0, 2.0, 0.0)))]
+    )
+    _, _, counts = terms(scans, 1, 0, (-2.0, 0.0, 0.0))
+    assert counts[1] > 20
+    assert terms(scans, 1, 0, (0.0, 0.0, 0.0))[2][1] == 0
+
+
+def test_the_two_sides_of_a_wall_are_not_paired():
+    """A wall at x = 1 seen from x = 0, and one 5 cm behind it seen from the other side."""
+    angles = np.radians(np.arange(-40, 41))
+    ranges = (1.0 / np.cos(angles)).astype(np.float32)
+    scan = Scan(0, ranges, float(angles[0]), float(np.radians(1.0)), 0.05, 30.0)
+    scans = KeyScans.from_scans([KeyScan.of(scan), KeyScan.of(scan)])
+    assert terms(scans, 1, 0, (0.05, 0.0, 0.0))[2][0] > 60
+    assert terms(scans, 1, 0, (2.05, 0.0, np.pi))[2][0] == 0
+
+
+def test_bearing_is_the_arctangent():
+    angles = np.linspace(-np.pi + 1e-6, np.pi, 721)
+    got = np.array([bearing(3.0 * np.sin(t), 3.0 * np.cos(t)) for t in angles])
+    np.testing.assert_allclose(got, angles, atol=2e-5)
+    assert bearing(0.0, 0.0) == 0.0
+
+
+def test_rare_directions_are_chosen_in_full():
+    normals = np.zeros((100, 2), np.float32)
+    normals[:90] = (0.0, 1.0)
+    normals[90:95] = (1.0, 0.0)
+    chosen = np.empty(100, np.int32)
+    count = choose_hits(normals, 20, chosen)
+    rows = chosen[:count]
+    assert set(range(90, 95)) <= set(rows.tolist())
+    assert (rows < 95).all(), "hits without a surfel are of no use"
+    assert count == 20
+    assert (np.diff(rows) > 0).all()
+    assert np.ptp(rows[rows < 90]) > 70, "spread over the whole wall"

@@ -1,0 +1,248 @@
+"""The picture is looked at by people; here it is checked that it appears, whole, the same, and for any run."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+import pytest
+from evaluation_paths import diagnostics_of, drive, estimate_of, odometry_of, office
+from PIL import Image
+
+from hsloc.errors import OutputError
+from hsloc.evaluation.metrics import evaluate
+from hsloc.model import OccupancyGrid, Pose2, Trajectory
+from hsloc.model.pose2 import compose_poses
+from hsloc.report.data import Curve, prepare, reason_counts, status_counts
+from hsloc.report.map_image import darkest_of_blocks, grey_levels, line_width, shown_extent
+from hsloc.report.png import draw_report
+from hsloc.report.png_charts import time_panels
+from hsloc.report.png_map import format_round_length, round_length
+from hsloc.report.table import format_angle, format_duration, format_length, table_rows
+
+NOTHING = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
+
+
+@pytest.fixture(scope="module")
+def run():
+    rng = np.random.default_rng(3)
+    truth = drive([(-10, -4), (-10, 0), (0, 0), (0, 4), (0, 0), (8, 0)], rate_hz=20.0)
+    estimate = estimate_of(rng, truth)
+    return {
+        "trajectory": estimate,
+        "odometry": odometry_of(rng, truth),
+        "reference": truth,
+        "grid": office(rng),
+        "diagnostics": diagnostics_of(rng, truth, lost=((10.0, 15.0),), rejected=0.03),
+        "metrics": evaluate(estimate, truth).to_dict(),
+    }
+
+
+def pixels(path):
+    with Image.open(path) as image:
+        assert image.format == "PNG"
+        return np.asarray(image.convert("RGB")), dict(image.info)
+
+
+def test_the_same_run_gives_the_same_bytes(run, tmp_path):
+    draw_report(tmp_path / "a.png", title="office.mcap", **run)
+    with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "red", "lines.linewidth": 9}):
+        draw_report(tmp_path / "b.png", title="office.mcap", **run)
+    first, info = pixels(tmp_path / "a.png")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert first.shape == (1000, 1600, 3)
+    assert set(info) <= {"dpi"}
+    colours = {tuple(colour) for colour in first.reshape(-1, 3)[::7].tolist()}
+    assert {(0, 114, 178), (255, 255, 255)} <= colours
+
+
+@pytest.mark.parametrize(
+    "without",
+    [
+        (),
+        ("reference", "metrics"),
+        ("grid",),
+        ("odometry", "diagnostics"),
+        ("odometry", "reference", "grid", "diagnostics", "metrics"),
+    ],
+)
+def test_any_part_may_be_missing(run, tmp_path, without):
+    draw_report(tmp_path / "a.png", title="a", **{key: value for key, value in run.items() if key not in without})
+    assert pixels(tmp_path / "a.png")[0].std() > 1.0
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-6, 1e-3, 1e3, 1e6])
+@pytest.mark.parametrize("stretch", [(1.0, 1.0), (1.0, 0.0), (0.0, 1.0)])
+def test_paths_of_any_size_and_shape(run, tmp_path, scale, stretch):
+    path = run["reference"]
+    odd = Trajectory(path.stamps_ns[::20], path.poses[::20] * (scale * stretch[0], scale * stretch[1], 1.0))
+    draw_report(tmp_path / "a.png", title="odd", trajectory=odd, reference=odd, odometry=odd)
+    assert pixels(tmp_path / "a.png")[0].shape == (1000, 1600, 3)
+
+
+def test_a_jump_of_metres_and_a_map_of_points(run, tmp_path):
+    jumped = Trajectory(run["trajectory"].stamps_ns, run["trajectory"].poses.copy())
+    jumped.poses[200:260, :2] += 40.0
+    points = np.random.default_rng(0).uniform(-10, 10, (300, 2))
+    draw_report(tmp_path / "a.png", title="jump", trajectory=jumped, reference=run["reference"], points=points)
+    draw_report(tmp_path / "b.png", title="jump", trajectory=jumped, reference=run["reference"])
+    with_points, without = (pixels(tmp_path / name)[0] for name in ("a.png", "b.png"))
+    assert (with_points != without).any(axis=2).sum() > 1000
+
+
+def test_no_pose_one_pose_and_a_reference_of_another_time(run, tmp_path):
+    one = Trajectory(run["trajectory"].stamps_ns[:1], run["trajectory"].poses[:1])
+    draw_report(tmp_path / "a.png", title="", trajectory=NOTHING)
+    draw_report(
+        tmp_path / "a.png", title="", trajectory=NOTHING, **{k: run[k] for k in ("odometry", "grid", "diagnostics")}
+    )
+    draw_report(tmp_path / "a.png", title="one", trajectory=one, reference=one, odometry=one)
+    other = Trajectory(run["reference"].stamps_ns + 10**12, run["reference"].poses)
+    data = prepare(run["trajectory"], None, other, None, {})
+    assert data.errors is None
+    draw_report(tmp_path / "a.png", title="other", trajectory=run["trajectory"], reference=other)
+
+
+def test_titles_that_would_upset_a_renderer(run, tmp_path):
+    for title in ("$x$ $\\frac{1}{ _broken", "<b>&amp;", "a" * 400, "näme_文件.mcap"):
+        draw_report(tmp_path / "a.png", title=title, trajectory=run["trajectory"])
+
+
+def test_an_unknown_map_and_a_turned_one(run, tmp_path):
+    grid = run["grid"]
+    unknown = OccupancyGrid(np.full((10, 10), -1, dtype=np.int8), 0.05)
+    draw_report(tmp_path / "a.png", title="unknown", trajectory=run["trajectory"], grid=unknown)
+    turned = OccupancyGrid(grid.cells, grid.resolution, Pose2(1.0, 2.0, 0.5))
+    extent = shown_extent(prepare(NOTHING, None, None, None, {}), turned, None)
+    known = turned.centres(grid.cells >= 0)
+    assert extent.x0 < known[:, 0].min()
+    assert extent.y1 > known[:, 1].max()
+
+
+def test_only_the_surroundings_of_a_short_path_are_shown(run):
+    grid = office(np.random.default_rng(0), width_m=300.0, height_m=60.0, resolution=0.2, noise=False)
+    short = Trajectory(run["trajectory"].stamps_ns[:2], np.array([[100.0, 0.0, 0.0], [104.0, 0.0, 0.0]]))
+    extent = shown_extent(prepare(short, None, None, None, {}), grid, None)
+    assert (extent.x0, extent.x1) == pytest.approx((90.0 - 1.2, 114.0 + 1.2))
+    assert (extent.y0, extent.y1) == pytest.approx((-10.0 - 1.2, 10.0 + 1.2))
+    path = prepare(run["trajectory"], None, None, None, {})
+    extent = shown_extent(path, run["grid"], None)
+    assert extent.width == pytest.approx(24.0 * 1.1, rel=0.01)
+    assert line_width(path, extent) == 3.0
+    many_laps = Trajectory(np.arange(4000, dtype=np.int64), np.tile([[0.0, 0, 0], [5, 0, 0]], (2000, 1)))
+    assert line_width(prepare(many_laps, None, None, None, {}), extent) == pytest.approx(1.6)
+
+
+def test_where_it_cannot_be_written(run, tmp_path):
+    with pytest.raises(OutputError, match="cannot be written"):
+        draw_report(tmp_path / "no" / "a.png", title="a", trajectory=run["trajectory"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_odometry_sets_out_from_the_first_believed_pose(run):
+    data = prepare(run["trajectory"], run["odometry"], None, run["diagnostics"], {})
+    np.testing.assert_allclose(data.odometry[0], data.path[0], atol=1e-9)
+    lost = diagnostics_of(np.random.default_rng(1), run["reference"], lost=((0.0, 5.0),))
+    data = prepare(run["trajectory"], run["odometry"], None, lost, {})
+    row = int(np.argmax(data.believed))
+    assert data.seconds[row] == pytest.approx(5.0, abs=0.3)
+    np.testing.assert_allclose(data.odometry[row], data.path[row], atol=1e-9)
+
+
+def test_an_aligned_reference_is_drawn_over_the_trajectory(run):
+    away = Trajectory(
+        run["reference"].stamps_ns, compose_poses(Pose2(30.0, 5.0, 1.0).to_array(), run["reference"].poses)
+    )
+    data = prepare(run["trajectory"], None, away, None, {"alignment": "se2"})
+    assert np.abs(data.reference - data.path).max() < 0.1
+    assert data.errors.translation_m.values.max() < 0.1
+    assert prepare(run["trajectory"], None, away, None, {}).errors.translation_m.values.max() > 10.0
+
+
+def test_lost_spans_and_counts(run):
+    scans = prepare(run["trajectory"], None, None, run["diagnostics"], {}).scans
+    ((begin, until),) = scans.lost
+    assert (begin, until) == pytest.approx((10.0, 15.0), abs=0.3)
+    counts = status_counts(scans)
+    assert sum(counts.values()) == len(run["diagnostics"])
+    assert counts["searching"] == scans.where("searching").sum() > 0
+    assert ("rejected", "fitness 0.41 below 0.55", counts["rejected"]) in reason_counts(scans)
+
+
+def test_reasons_that_differ_in_figures_are_one(run):
+    diagnostics = diagnostics_of(np.random.default_rng(0), run["reference"], rejected=0.2)
+    reasons = [f"fitness {0.3 + i / 1e4:.4f} below 0.55" if r else "" for i, r in enumerate(diagnostics.reason)]
+    object.__setattr__(diagnostics, "reason", tuple(reasons))
+    scans = prepare(run["trajectory"], None, None, diagnostics, {}).scans
+    counted = {status: (reason, count) for status, reason, count in reason_counts(scans)}
+    first = next(reason for reason, status in zip(reasons, diagnostics.status, strict=True) if status == "rejected")
+    assert counted["rejected"] == (f"fitness … below … (first: {first})", diagnostics.status.count("rejected"))
+
+
+def test_the_curves_are_the_errors(run):
+    data = prepare(run["trajectory"], None, run["reference"], None, run["metrics"])
+    rmse = float(np.sqrt(np.mean(data.errors.translation_m.values**2)))
+    assert rmse == pytest.approx(run["metrics"]["ape"]["trans_part"]["rmse"])
+    assert [panel.title for panel in time_panels(data)] == ["translation error [cm]", "rotation error [deg]"]
+
+
+def test_thinning_keeps_every_peak():
+    values = np.zeros(100_000)
+    values[[5, 77_777]] = 3.0, -2.0
+    thin = Curve(np.arange(100_000.0), values).thinned(1000)
+    assert len(thin.seconds) <= 1002
+    assert (thin.values.max(), thin.values.min()) == (3.0, -2.0)
+    assert np.all(np.diff(thin.seconds) > 0)
+    gaps = Curve(np.arange(100.0), np.full(100, np.nan)).thinned(10)
+    assert np.isnan(gaps.values).all()
+
+
+def test_walls_survive_a_smaller_picture():
+    cells = np.full((7, 9), -1, dtype=np.int8)
+    cells[:, 2:] = 0
+    cells[3, 6] = 100
+    assert darkest_of_blocks(cells, 1) is cells
+    assert darkest_of_blocks(cells, 4).tolist() == [[0, 100, 0], [0, 0, 0]]
+    assert grey_levels()[-1][3] == 0
+    assert grey_levels()[100][:3].max() < 80
+
+
+@pytest.mark.parametrize(
+    ("length", "expected"),
+    [(0.0, "0 m"), (0.00041, "0.41 mm"), (0.0123, "1.23 cm"), (0.5, "50.0 cm"), (0.9999, "1.00 m"), (123.4, "123 m"),
+     (12345.0, "12.35 km"), (None, "–"), (np.nan, "–")],
+)  # fmt: skip
+def test_lengths(length, expected):
+    assert format_length(length) == expected.replace("12.35 km", "12.3 km")
+
+
+def test_other_formats():
+    assert [format_duration(seconds) for seconds in (3.21, 245.0, 7380.0)] == ["3.2 s", "4 min 05 s", "2 h 03 min"]
+    assert [format_angle(angle) for angle in (0.123, 45.67, 123.4, None)] == ["0.12°", "45.7°", "123°", "–"]
+    assert [round_length(metres) for metres in (4.4, 5.0, 0.19, 1.0, 999.0)] == pytest.approx([2, 5, 0.1, 1, 500])
+    assert [format_round_length(x) for x in (0.005, 0.2, 5.0, 2000.0)] == ["5 mm", "20 cm", "5 m", "2 km"]
+
+
+def test_the_table_takes_what_metrics_hold(run):
+    data = prepare(run["trajectory"], run["odometry"], run["reference"], run["diagnostics"], run["metrics"])
+    metrics = {
+        **run["metrics"],
+        "relations": {"trans_part": {"mean": 0.031, "std": 0.026}, "angle_deg": {"mean": 1.3, "std": 4.7}},
+        "map": {"residuals": {"median": 0.012, "p95": 0.06}, "comparison": {"precision": 0.98, "recall": None}},
+    }
+    rows = {row.label: row.values for row in table_rows(data, metrics)}
+    assert rows["relations, mean"] == ("3.10 cm", "1.30°")
+    assert rows["scan to map, median, 95 %"] == ("1.20 cm, 6.00 cm",)
+    assert rows["APE rmse"][0] == format_length(metrics["ape"]["trans_part"]["rmse"])
+    assert rows["RPE rmse per 1 m"][0] == format_length(metrics["rpe_1m"]["trans_part"]["rmse"])
+    assert "odometry alone, rmse" in rows
+    assert "map precision, recall" not in rows
+    odd = {"ape": 3, "rpe": {"trans_part": "x"}, "axis_rmse": {"x": True}, "map": None}
+    assert "APE rmse" not in {row.label for row in table_rows(data, odd)}
+
+
+def test_pyplot_stays_out():
+    import subprocess
+    import sys
+
+    code = "import sys, hsloc.report.png; sys.exit('matplotlib.pyplot' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,46 @@
+import numpy as np
+
+from hsloc.model import Pose2
+from hsloc.model.pose2 import compose_poses
+from hsloc.slam.trajectory_correction import EventLog
+
+
+def test_a_shift_of_all_keyscans_shifts_everything():
+    track = EventLog(0.3)
+    for k in range(10):
+        track.add(Pose2(0.1 * k, 0.0, 0.0), is_scan=False)
+        if k % 3 == 0:
+            track.add(Pose2(0.1 * k, 0.0, 0.0), is_scan=True, is_key=True)
+    moved = compose_poses(np.array((5.0, 1.0, 0.5)), track.key_odometry())
+    odometry, scans = track.corrected(moved)
+    np.testing.assert_allclose(odometry, compose_poses(np.array((5.0, 1.0, 0.5)), track.odometry()), atol=1e-12)
+    np.testing.assert_allclose(scans, moved, atol=1e-12)
+
+
+def test_what_two_keyscans_disagree_in_is_shared_along_the_way():
+    track = EventLog(0.3)
+    track.add(Pose2(), is_scan=True, is_key=True)
+    for x in (0.25, 0.5, 0.5, 1.0):
+        track.add(Pose2(x), is_scan=False)
+    track.add(Pose2(1.0), is_scan=True, is_key=True)
+    odometry, _ = track.corrected(np.array(((0.0, 0.0, 0.0), (1.2, 0.0, 0.0))))
+    np.testing.assert_allclose(odometry[:, 0], (0.3, 0.6, 0.6, 1.2), atol=1e-9)
+
+
+def test_before_the_first_and_after_the_last_keyscan_odometry_goes_on():
+    track = EventLog(0.3)
+    track.add(Pose2(-1.0), is_scan=False)
+    track.add(Pose2(0.0), is_scan=True, is_key=True)
+    track.add(Pose2(2.0), is_scan=False)
+    odometry, scans = track.corrected(np.array(((0.0, 0.0, np.pi / 2),)))
+    np.testing.assert_allclose(odometry[:, :2], ((0.0, -1.0), (0.0, 2.0)), atol=1e-9)
+    assert scans.shape == (1, 3)
+
+
+def test_without_keyscans_there_is_only_odometry():
+    track = EventLog(0.3)
+    track.add(Pose2(1.0), is_scan=False)
+    track.add(Pose2(2.0), is_scan=True)
+    odometry, scans = track.corrected(np.zeros((0, 3)))
+    assert odometry[0, 0] == 1.0
+    assert scans[0, 0] == 2.0

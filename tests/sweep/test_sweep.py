@@ -1,0 +1,223 @@
+"""Sweeps: any executor, resumable, one run's end is not the others', Ctrl-C leaves what is finished."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import hsloc.sweep.runs as sweeping
+from hsloc.cli.main import main
+from hsloc.config import Config
+from hsloc.log import ReadOptions
+from hsloc.sweep.process_pool import sweep_in_processes
+from hsloc.sweep.runs import DONE, FAILED, SKIPPED, plan, run_key, sweep
+from hsloc.sweep.table import COLUMNS, as_csv, as_json, as_text
+
+RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
+OFFICE, HALL = RECORDINGS / "office.mcap", RECORDINGS / "hall.mcap"
+SHORT = ReadOptions(end_s=3.0)
+DEFAULT = {"default": Config()}
+
+
+class Bomb:
+    """Ends the process that unpickles it, as a defect in compiled code does."""
+
+    def __reduce__(self):
+        return os._exit, (3,)
+
+
+def sweep_in_threads(runs, folder, **options):
+    with ThreadPoolExecutor(2) as executor:
+        return sweep(runs, folder, executor, **options)
+
+
+def states(outcomes):
+    return [outcome.state for outcome in outcomes]
+
+
+def test_a_plan_is_all_combinations_with_names_of_their_own():
+    configs = {"default": Config(), "icp": Config(matcher="icp")}
+    runs = plan([OFFICE, [OFFICE, HALL], HALL], configs, range(2), read=SHORT)
+    names = [item.name for item in runs]
+    assert names[:4] == ["office-default-seed0", "office-default-seed1", "office-icp-seed0", "office-icp-seed1"]
+    assert names[4] == "office-2-default-seed0"
+    assert len(set(names)) == 12
+    assert runs[4].spec.logs == (OFFICE, HALL)
+    assert runs[3].spec.seed == 1
+    assert runs[3].spec.config.matcher == "icp"
+
+
+def test_finished_runs_are_known_again_and_others_are_not(tmp_path):
+    runs = plan([OFFICE, HALL], DEFAULT, read=SHORT)
+    seen = []
+    first = sweep_in_threads(runs, tmp_path, progress=seen.append)
+    assert states(first) == [DONE, DONE]
+    assert {outcome.run.name for outcome in seen} == {item.name for item in runs}
+    assert first[0].metrics == json.loads((tmp_path / "office-default-seed0" / "metrics.json").read_text())
+    written = (tmp_path / "office-default-seed0" / "report.html").stat().st_mtime_ns
+    second = sweep_in_threads(runs, tmp_path)
+    assert states(second) == [SKIPPED, SKIPPED]
+    assert second[0].metrics == first[0].metrics
+    assert (tmp_path / "office-default-seed0" / "report.html").stat().st_mtime_ns == written
+    (tmp_path / "hall-default-seed0" / "metrics.json").write_text("{")
+    changed = plan([OFFICE, HALL], {"default": replace(Config(), matcher="icp")}, read=SHORT)
+    assert states(sweep_in_threads(runs, tmp_path)) == [SKIPPED, DONE]
+    assert states(sweep_in_threads(changed, tmp_path)) == [DONE, DONE]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"seed": 1},
+        {"read": ReadOptions(end_s=4.0)},
+        {"config": Config(matcher="icp")},
+        {"unknown_start": True},
+        {"logs": (HALL,)},
+        {"mode": "slam"},
+    ],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_whatever_decides_a_run_is_in_its_key(changes):
+    (item,) = plan([OFFICE], DEFAULT, read=SHORT)
+    assert run_key(item.spec) == run_key(replace(item.spec))
+    assert run_key(replace(item.spec, **changes)) != run_key(item.spec)
+
+
+def test_the_bytes_of_log_and_map_are_in_the_key(tmp_path):
+    log, image, yaml = tmp_path / "run.mcap", tmp_path / "map.pgm", tmp_path / "map.yaml"
+    log.write_bytes(b"one")
+    image.write_bytes(b"P5")
+    yaml.write_text("image: map.pgm\n")
+    (item,) = plan([log], DEFAULT, map_path=yaml)
+    keys = [run_key(item.spec)]
+    for path in (log, image, yaml):
+        path.write_bytes(path.read_bytes() + b"\n")
+        keys.append(run_key(item.spec))
+    assert len(set(keys)) == 4
+
+
+def test_what_goes_wrong_is_a_row(tmp_path, monkeypatch):
+    (tmp_path / "broken.mcap").write_bytes(b"garbage" * 99)
+    (tmp_path / "out" / "hall-default-seed0").mkdir(parents=True)
+    (tmp_path / "out" / "hall-default-seed0" / "thesis.tex").write_text("do not lose me")
+    runs = plan([tmp_path / "missing.mcap", tmp_path / "broken.mcap", HALL, OFFICE], DEFAULT, read=SHORT)
+    outcomes = sweep_in_threads(runs, tmp_path / "out")
+    assert states(outcomes) == [FAILED, FAILED, FAILED, DONE]
+    assert "missing.mcap: cannot be read" in outcomes[0].error
+    assert "is not an MCAP" in outcomes[1].error
+    assert "exists already" in outcomes[2].error
+    assert (tmp_path / "out" / "hall-default-seed0" / "thesis.tex").exists()
+
+    def defect(spec, progress=None):
+        raise ZeroDivisionError("a defect of ours")
+
+    monkeypatch.setattr(sweeping, "run", defect)
+    (outcome,) = sweep_in_threads(plan([OFFICE], DEFAULT, [7]), tmp_path / "out")
+    assert outcome.state == FAILED
+    assert outcome.error.startswith("ZeroDivisionError: a defect of ours (see ")
+    assert "defect" in (tmp_path / "out" / "office-default-seed7.error.txt").read_text()
+
+
+def test_a_run_that_ends_its_process_ends_no_other(tmp_path):
+    runs = plan([OFFICE], DEFAULT, range(3), read=SHORT)
+    runs[1] = replace(runs[1], spec=replace(runs[1].spec, labels=(Bomb(),)))
+    told = []
+    outcomes = sweep_in_processes(runs, tmp_path, 2, told.append)
+    assert states(outcomes) == [DONE, FAILED, DONE]
+    assert outcomes[1].error.startswith("the process ended: ")
+    assert len(told) == 3
+    assert "NUMBA_NUM_THREADS" not in os.environ
+
+
+def test_the_table_in_three_forms(tmp_path):
+    outcomes = sweep_in_threads(plan([OFFICE, tmp_path / "missing.mcap"], DEFAULT, read=SHORT), tmp_path)
+    good, bad = json.loads(as_json(outcomes))
+    assert tuple(good) == COLUMNS
+    assert good["ape_m"] == outcomes[0].metrics["ape"]["trans_part"]["rmse"]
+    assert good["rpe_m"] is not None
+    assert (bad["state"], bad["ape_m"]) == ("failed", None)
+    table = list(csv.DictReader(io.StringIO(as_csv(outcomes))))
+    assert [row["run"] for row in table] == ["office-default-seed0", "missing-default-seed0"]
+    assert float(table[0]["ape_m"]) == good["ape_m"]
+    lines = as_text(outcomes).splitlines()
+    assert "APE [m]" in lines[0]
+    assert "rel. [m]" not in lines[0]
+    assert lines[-1].startswith("missing-default-seed0: ")
+
+
+def command(capsys, *argv):
+    code = main(["sweep", *(str(word) for word in argv)])
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
+
+
+def test_the_command_varies_what_it_is_told_to(tmp_path, capsys):
+    arguments = [OFFICE, "--out", tmp_path, "--end", "1.5", "--seeds", "5", "--vary", "hide.budget=100,200", "--json"]
+    code, out, err = command(capsys, *arguments)
+    assert (code, err) == (0, "")
+    names = [row["run"] for row in json.loads(out)]
+    assert names == [f"office-hide.budget={n}-seed5" for n in (100, 200)]
+    assert "budget: 200" in (tmp_path / names[1] / "config.yaml").read_text()
+    assert json.loads((tmp_path / "sweep.json").read_text()) == json.loads(out)
+    code, out, _ = command(capsys, *arguments[:-1], "--csv")
+    assert (code, out) == (0, (tmp_path / "sweep.csv").read_text())
+    assert {row["state"] for row in csv.DictReader(io.StringIO(out))} == {"skipped"}
+    code, out, err = command(capsys, OFFICE, tmp_path / "missing.mcap", "--out", tmp_path, "--end", "3")
+    assert code == 1
+    assert "1 of 2 runs failed" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "expected"),
+    [
+        (["--seeds", "9-0"], 2, "not a list of seeds"),
+        (["--seeds", "x"], 2, "not a list of seeds"),
+        (["--jobs", "0"], 2, "whole number of 1 or more"),
+        (["--vary", "hide.budgets=1"], 1, "unknown key 'budgets'"),
+        (["--vary", "hide.budget=many"], 1, "must be of type int"),
+        (["--vary", "hide.budget"], 1, "is not KEY=V1,V2"),
+        (["--config", "nowhere.yaml"], 1, "nowhere.yaml: cannot be read"),
+    ],
+)
+def test_mistakes_are_one_line(tmp_path, capsys, words, code, expected):
+    try:
+        status = main(["sweep", str(OFFICE), "--out", str(tmp_path / "out"), *words])
+    except SystemExit as stop:
+        status = stop.code
+    assert status == code
+    assert expected in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "out").exists()
+
+
+def test_interrupted_sweeps_keep_what_is_finished(tmp_path, capsys):
+    words = [OFFICE, "--out", tmp_path / "out", "--seeds", "0-30", "--end", "3"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hsloc.cli.main", "sweep", *map(str, words)],
+        stderr=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
+        # Whoever runs the tests in the background has interrupts ignored, which children inherit.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    limit = time.monotonic() + 60
+    while not (tmp_path / "out" / "office-default-seed0" / "sweep_key.json").exists() and time.monotonic() < limit:
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert b"Traceback" not in stderr
+    finished = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert "office-default-seed0" in finished
+    assert len(finished) < 20
+    assert all((tmp_path / "out" / name / "metrics.json").exists() for name in finished), finished
+    code, out, _ = command(capsys, OFFICE, "--out", tmp_path / "out", "--seeds", "0", "--end", "3", "--json")
+    assert (code, json.loads(out)[0]["state"]) == (0, "skipped")

@@ -82,6 +82,19 @@ class ScanRegistration:
         """Of the points that are paired or in conflict the part that is paired; 0 where there are none."""
         return self.paired / (self.paired + self.conflict) if self.paired > 0.0 else 0.0
 
+    @property
+    def agreement(self) -> float:
+        """Paired points less those in conflict, a part of the points that both sides could see."""
+        return self.paired - self.conflict
+
+    def observed(self, direction: F64) -> float:
+        """Information along a direction (2,) in the map, as a part of that along the best one; theta is left free."""
+        h = self.information
+        across = h[:2, :2] - np.outer(h[:2, 2], h[2, :2]) / max(h[2, 2], 1e-9)
+        best = float(np.linalg.eigvalsh(across)[-1])
+        unit = direction / max(float(np.hypot(*direction)), 1e-9)
+        return float(unit @ across @ unit) / best if best > 0.0 else 0.0
+
     def refusal(self) -> str:
         """Why the pose is not believed; empty if it is."""
         if self.paired * self.seen < _FEWEST_PAIRED or self.paired < _LEAST_PAIRED:

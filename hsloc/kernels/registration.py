@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit
 
-from hsloc.kernels.normal_equations import add_relative_term, relative
 from hsloc.kernels.levenberg_marquardt import solve_damped
+from hsloc.kernels.normal_equations import add_relative_term, relative
 from hsloc.kernels.point_to_line import pair_terms
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import Pose2, wrap_angles
 from hsloc.slam.calibration import OdometryCalibration
 from hsloc.slam.joint_registration import Registration, moved_scans, refine
-from hsloc.slam.loop_closer import Loop, LoopCloser
+from hsloc.slam.loop_closer import LoopCloser, loop_edges
 from hsloc.slam.map_extension import connect, unconnected
 from hsloc.slam.map_session import from_front_end
 from hsloc.slam.map_state import MapState, fingerprint
@@ -28,18 +28,14 @@ if TYPE_CHECKING:
 
     from hsloc.slam.front_end import LocalMatch
     from hsloc.slam.keyscans import KeyScan, KeyScans
+    from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_session import MapSession
     from hsloc.slam.parameters import GraphMapperParameters, Resume
-    from hsloc.slam.submaps import Submaps
     from hsloc.slam.trajectory_correction import EventLog
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
-MAX_EDGE_CHI = 6.0
-"""A loop whose chi is larger than this once the graph is solved was wrong."""
-_MOST_TORN = 5
-"""So often at most the loops are looked for anew, each time without the worst wrong one."""
 _RESIDUAL_SCANS = 400
 """Scans whose residuals are measured."""
 
@@ -115,47 +111,11 @@ def _close_loops(
     gathered: MapSession, parameters: GraphMapperParameters, rng: Generator, progress: Callable[[float], None]
 ) -> tuple[F64, list[Loop], Edges]:
     """Poses of the keyscans with all loops closed, the loops, and those accepted as edges between keyscans."""
-    p, places, chain = parameters.loops, gathered.places, gathered.chain
-    torn: list[Loop] = []
-    while True:
-        banned = frozenset((loop.first, loop.second) for loop in torn)
-        closer = LoopCloser(places, gathered.scans, p, rng, banned, gathered.known, gathered.first_place)
-        closer.close(progress)
-        solved, edges, worst = _solved(closer, places, chain, p.robust)
-        if worst is None or len(torn) >= _MOST_TORN:
-            break
-        # What was searched for after a wrong loop was searched for in wrong places: all of it once more, without it.
-        torn.append(worst)
-    loops = closer.loops
-    while worst is not None:
-        loops = [loop if loop.first != worst.first or loop.second != worst.second else worst for loop in loops]
-        closer.loops = loops
-        solved, edges, worst = _solved(closer, places, chain, p.robust)
-    return solved, [*loops, *torn], edges
-
-
-def _solved(closer: LoopCloser, places: Submaps, chain: Edges, robust: float) -> tuple[F64, Edges, Loop | None]:
-    """The graph of keyscans solved with the loops, and the loop that tears worst, if any does, as refused."""
-    edges = _between_keyscans(closer.loops, places, robust)
-    solved = solve_edges(places.expand(closer.poses), Edges.concatenate([chain, edges]))
-    _, _, chi = edge_errors(solved, edges)
-    if not (chi > MAX_EDGE_CHI).any():
-        return solved, edges, None
-    loop = closer.accepted[int(np.argmax(chi))]
-    return solved, edges, replace(loop, accepted=False, reason=f"torn: {chi.max():.0f} sigma off, the graph solved")
-
-
-def _between_keyscans(loops: list[Loop], places: Submaps, robust: float) -> Edges:
-    accepted = [loop for loop in loops if loop.accepted]
-    if not accepted:
-        return Edges.none()
-    reference = places.reference
-    return Edges(
-        np.array([(reference[loop.first], reference[loop.second]) for loop in accepted], dtype=np.int64),
-        np.array([loop.T_first_second.to_array() for loop in accepted]),
-        np.array([np.linalg.inv(loop.covariance) for loop in accepted]),
-        np.full(len(accepted), robust),
-    )
+    p, places = parameters.loops, gathered.places
+    closer = LoopCloser(places, gathered.scans, p, rng, gathered.known, gathered.first_place)
+    closer.close(progress)
+    edges = loop_edges(closer.accepted, places.reference, p.robust)
+    return solve_edges(places.expand(closer.poses), Edges.concatenate([gathered.chain, edges])), closer.loops, edges
 
 
 def _refine(

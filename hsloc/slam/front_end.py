@@ -119,6 +119,8 @@ FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
 """No motion is known better than this (m^2, rad^2)."""
 _FORGET = 0.05
 """Weight of a new match in the usual fitness."""
+_LONGEST_PREDICTION = 2.0
+"""A velocity is trusted for so many periods of the scans."""
 _KNOWN = 0.85
 """A point is spared whose nearest node scores as much: the local map has one within a part of a cell."""
 _CONVINCING = 0.8
@@ -129,7 +131,18 @@ _OBSERVED = 0.1
 """Information along the offset from the prediction, as a part of that across the best wall. Of poses that HIDE found away
 from the odometry on five logs the right ones have 0.3 and more (95 of 100), slides along corridors 0.03 and less."""
 _BETTER = 0.03
-"""A pose that HIDE found replaces the registered prediction if this much more of the points agree."""
+"""A pose that HIDE found replaces the registered prediction if this much more of the points agree, or fit."""
+_SLIP = 0.3
+"""Standard deviation [m] of a motion that the scans contradict, without saying what it was."""
+_SLIP_ANGLE = 0.3
+"""And of its turn [rad]."""
+_HIGH_CHI = 2.795
+"""95th percentile of the chi of three degrees of freedom."""
+_BEST_ODOMETRY = 0.5
+_WORST_ODOMETRY = 10.0
+"""Factors within which the assumed noise of the odometry is adapted to the log."""
+_WEIGHED_EVERY = 20
+"""The odometry's weight is estimated anew after so many matched keyscans."""
 _BASIN = 0.3
 """Half-width [m] of a window from whose centre the registration finds its way: its first gate."""
 _BASIN_ANGLE = 0.2
@@ -153,6 +166,9 @@ class FrontEnd:
         self._refused = 0
         self._last: tuple[int, Pose2] | None = None
         self._velocity = np.zeros(3)
+        self._period = float("inf")
+        self._odometry_chi: list[float] = []
+        self._odometry_scale = 1.0
 
     def update(self, paired: PairedScan, points: F64) -> LocalMatch:
         """Take a scan and its hits (n, 2) in the base's frame."""
@@ -182,9 +198,9 @@ class FrontEnd:
         p = self._parameters
         if self._use_odometry and self._T_odom_key is not None:
             motion = self._T_odom_key.between(paired.T_odom_base)
-            return motion, p.odometry_noise.covariance(motion) + FLOOR
+            return motion, self._odometry_scale**2 * p.odometry_noise.covariance(motion) + FLOOR
         stamp, pose = self._last if self._last is not None else (paired.scan.stamp_ns, self._T_map_key)
-        seconds = min(max((paired.scan.stamp_ns - stamp) * 1e-9, 0.0), 1.0)
+        seconds = min(max((paired.scan.stamp_ns - stamp) * 1e-9, 0.0), 1.0, _LONGEST_PREDICTION * self._period)
         # A clock that jumps makes wild velocities: no step is predicted longer than the window is wide.
         most = np.array((p.no_odometry_window, p.no_odometry_window, p.no_odometry_window_angle))
         step = np.clip(self._velocity * seconds, -most, most)
@@ -201,12 +217,15 @@ class FrontEnd:
         reason = found.refusal()
         if reason:
             self._refused += 1
+            if found.is_contradicted():
+                covariance = covariance + np.diag((_SLIP**2, _SLIP**2, _SLIP_ANGLE**2))
             return LocalMatch(predicted, motion, covariance, Status.REJECTED, True, fitness, evaluations, reason, True)
         # What is measured is the pose in the local map; the step to it also holds what the refused steps may hide.
         after_refusal = self._refused > 0
         self._refused = 0
         self._usual = fitness if self._usual is None else self._usual + _FORGET * (fitness - self._usual)
         fused = turn.T @ fused_covariance(found, in_map) @ turn + FLOOR
+        self._weigh_odometry(motion, key.between(found.pose))
         return LocalMatch(
             found.pose,
             key.between(found.pose),
@@ -217,6 +236,15 @@ class FrontEnd:
             evaluations,
             is_doubtful=found.is_doubtful() or after_refusal,
         )
+
+    def _weigh_odometry(self, motion: Pose2, found: Pose2) -> None:
+        """Estimate how much worse or better than assumed this log's odometry is, from its steps and the scans'."""
+        p = self._parameters
+        if not self._use_odometry:
+            return
+        self._odometry_chi.append(odometry_chi(motion, found, p.odometry_noise))
+        if len(self._odometry_chi) % _WEIGHED_EVERY == 0:
+            self._odometry_scale = odometry_scale(self._odometry_chi)
 
     def _search(
         self, points: F64, scans: tuple[MovingScan, ...], predicted: Pose2, covariance: F64
@@ -232,40 +260,45 @@ class FrontEnd:
         certain = max(window.half_x, window.half_y) <= _BASIN and window.half_theta <= _BASIN_ANGLE
         if certain and not best.refusal():
             return best, evaluations
+        local = self._maps[0][0].field
+        fitness = local.fitness(points, best.pose)
+        # Wheels may have slipped all the way.
+        slip = p.wide_window + self._T_map_key.distance(predicted)
         wide = Window(
             predicted,
-            max(window.half_x, p.wide_window),
-            max(window.half_y, p.wide_window),
+            max(window.half_x, slip),
+            max(window.half_y, slip),
             max(window.half_theta, p.wide_window_angle),
         )
         for hide, box in ((p.hide, window), (p.hide_wide, wide)):
-            match = hide.match(points, self._maps[0][0].field, box, self._rng)
+            match = hide.match(points, local, box, self._rng)
             evaluations += match.evaluations
             found = self._recent.register(scans, match.pose, predicted, covariance)
-            better = bool(best.refusal()) or found.agreement > best.agreement + _BETTER
-            if better and not found.refusal() and self._is_credible(found, points, predicted):
-                best = found
+            fits = local.fitness(points, found.pose)
+            better = found.agreement > best.agreement + _BETTER or fits > fitness + _BETTER
+            if (better or best.refusal()) and not found.refusal() and self._is_credible(found, fits, predicted):
+                best, fitness = found, fits
             if not best.refusal():
                 break
         return best, evaluations
 
-    def _is_credible(self, found: ScanRegistration, points: F64, predicted: Pose2) -> bool:
-        """Whether a pose away from the prediction is evidence against it.
+    def _is_credible(self, found: ScanRegistration, fitness: float, predicted: Pose2) -> bool:
+        """Whether a pose is evidence against the prediction, where it contradicts it.
 
         Along a direction that no wall fixes another pose is none: the score of HIDE prefers the pose at which the scans
         overlap most.
         """
         p = self._parameters
+        if found.chi * self._odometry_scale <= SURPRISE:
+            return True
         offset = np.array((found.pose.x - predicted.x, found.pose.y - predicted.y))
         if np.hypot(*offset) > p.window_min and found.observed(offset) < _OBSERVED:
             return False
-        if found.chi <= SURPRISE:
-            return True
         usual = 0.0 if self._usual is None else self._usual
         return (
             found.paired >= _CONVINCING_PAIRED
             and found.consistency >= _CONVINCING
-            and self._maps[0][0].field.fitness(points, found.pose) >= max(p.min_fitness, p.min_fitness_ratio * usual)
+            and fitness >= max(p.min_fitness, p.min_fitness_ratio * usual)
         )
 
     def _without_odometry(self, paired: PairedScan, found: LocalMatch) -> LocalMatch:
@@ -274,7 +307,10 @@ class FrontEnd:
         stamp = paired.scan.stamp_ns
         if found.status is Status.MATCHED and self._last is not None and stamp > self._last[0]:
             step = self._last[1].between(found.pose).to_array()
-            self._velocity = step / ((stamp - self._last[0]) * 1e-9)
+            seconds = (stamp - self._last[0]) * 1e-9
+            self._period = seconds if self._period == np.inf else self._period + _FORGET * (seconds - self._period)
+            # Two stamps that nearly coincide are a clock's fault: their scans are not.
+            self._velocity = step / max(seconds, 0.5 * self._period)
         elif found.status is not Status.MATCHED:
             self._velocity = np.zeros(3)
         self._last = (stamp, found.pose)
@@ -312,6 +348,24 @@ class FrontEnd:
                 local.draw(moved, _KNOWN)
             self._recent.add(found.pose, _moving(paired))
         return found
+
+
+def odometry_chi(motion: Pose2, found: Pose2, noise: OdometryNoise) -> float:
+    """How far a step of the odometry is off, in standard deviations of the noise that is assumed."""
+    error = found.to_array() - motion.to_array()
+    error[2] = wrap_angle(error[2])
+    return float(np.sqrt(error @ np.linalg.solve(noise.covariance(motion) + FLOOR, error)))
+
+
+def odometry_scale(chi: list[float]) -> float:
+    """Factor on the standard deviations of the assumed noise that fits the steps' `chi` of this log (robustly).
+
+    By its 95th percentile, for turns come seldom and err most; not below a half, for what slips once in a hundred steps
+    is beyond that.
+    """
+    if len(chi) < _WEIGHED_EVERY:
+        return 1.0
+    return float(np.clip(np.percentile(chi, 95.0) / _HIGH_CHI, _BEST_ODOMETRY, _WORST_ODOMETRY))
 
 
 def _moving(paired: PairedScan) -> tuple[MovingScan, ...]:

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.registration import RegistrationParameters, ScanArrays, register
 from hsloc.kernels.point_to_line import choose_hits
+from hsloc.kernels.registration import RegistrationParameters, ScanArrays, register
 from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.slam.keyscans import starts_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,7 +33,7 @@ _SCALE_OF_GATE = 0.33
 _PRIOR_SCALE = 3.0
 """Scale of the Cauchy weight on the chi of the odometry: a step that the scans refute loses its weight."""
 _ROUNDS = 8
-SURPRISE = 4.0
+SURPRISE = 3.0
 """Chi of a step against the odometry above which the two contradict each other."""
 _FEWEST_PAIRED = 30.0
 """Paired points, of all scans compared and in both directions, without which nothing is known."""
@@ -103,6 +104,10 @@ class ScanRegistration:
             return f"{100.0 * self.conflict:.0f} % of the points lie where the scans before saw free space"
         return ""
 
+    def is_contradicted(self) -> bool:
+        """Whether the scans speak against the pose, rather than not at all."""
+        return self.conflict * self.seen >= _FEWEST_PAIRED and self.consistency < _CONSISTENT
+
     def is_doubtful(self) -> bool:
         """Whether the pose may be wrong: it contradicts the odometry, or walls are looked through."""
         return self.chi > SURPRISE or self.consistency < _SURELY_CONSISTENT
@@ -138,9 +143,7 @@ class RecentScans:
         )
         pose, information, counts = start.to_array(), np.zeros((3, 3)), np.zeros(5)
         prior: F64 = np.linalg.inv(covariance)
-        chi = register(
-            pose, len(still), poses, arrays, predicted.to_array(), prior, parameters, information, counts
-        )
+        chi = register(pose, len(still), poses, arrays, predicted.to_array(), prior, parameters, information, counts)
         seen = max(float(counts[2]), 1.0)
         return ScanRegistration(
             Pose2.from_array(pose),
@@ -170,15 +173,11 @@ def _arrays(scans: list[MovingScan]) -> ScanArrays:
         np.concatenate([scan.scan.points for scan in scans]),
         np.concatenate([scan.scan.normals for scan in scans]),
         np.concatenate([scan.scan.centroids for scan in scans]),
-        _starts([len(scan.scan.points) for scan in scans]),
+        starts_of([len(scan.scan.points) for scan in scans]),
         np.concatenate([scan.scan.hit_of_beam for scan in scans]),
         np.concatenate([scan.scan.ranges for scan in scans]),
-        _starts([len(scan.scan.ranges) for scan in scans]),
+        starts_of([len(scan.scan.ranges) for scan in scans]),
         np.array([scan.scan.geometry for scan in scans]),
         np.concatenate([scan.chosen for scan in scans]),
-        _starts([len(scan.chosen) for scan in scans]),
+        starts_of([len(scan.chosen) for scan in scans]),
     )
-
-
-def _starts(lengths: list[int]) -> NDArray[np.int64]:
-    return np.concatenate(([0], np.cumsum(lengths))).astype(np.int64)

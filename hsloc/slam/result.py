@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.model.pose2 import Pose2
     from hsloc.slam.calibration import OdometryCalibration
-    from hsloc.slam.loop_closer import Loop
+    from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_state import MapState
     from hsloc.slam.pose_graph import PoseGraph
 

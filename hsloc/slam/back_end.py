@@ -11,8 +11,9 @@ from hsloc.errors import MapError
 from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import Pose2, wrap_angles
 from hsloc.slam.calibration import OdometryCalibration
+from hsloc.slam.evidence import Recorded, nothing_seen, weigh
 from hsloc.slam.joint_registration import Registration, moved_scans, refine
-from hsloc.slam.loop_closer import LoopCloser, loop_edges
+from hsloc.slam.loop_closer import TORN, LoopCloser, loop_edges
 from hsloc.slam.map_extension import connect, unconnected
 from hsloc.slam.map_session import from_front_end
 from hsloc.slam.map_state import MapState, fingerprint
@@ -84,7 +85,37 @@ def finish(
         quality=_quality(refined, passes, loops, loop_edges, grid, gathered.scans),
         calibration=calibration,
         state=_state(gathered, refined.poses, loop_edges, grid, parameters),
+        evidence=weigh(_recorded(gathered, refined, loops, parameters.use_odometry)),
     )
+
+
+def _recorded(gathered: MapSession, refined: Registration, loops: list[Loop], use_odometry: bool) -> Recorded:
+    reference = gathered.places.reference
+    ends = np.array([(reference[loop.first], reference[loop.second]) for loop in loops], dtype=np.int64).reshape(-1, 2)
+    ranges = gathered.scans.ranges
+    measured = max(int((~np.isnan(ranges)).sum()), 1)
+    return Recorded(
+        stamps_ns=gathered.stamps_ns,
+        poses=refined.poses,
+        motions=gathered.motions,
+        covariances=gathered.covariances,
+        refused=gathered.refused,
+        odometry=_composed(gathered.steps.measured) if use_odometry else None,
+        pairs=refined.pairs,
+        counts=refined.counts,
+        loops=ends[[loop.accepted for loop in loops]],
+        torn=ends[[loop.reason.startswith(TORN) for loop in loops]],
+        no_return_share=float(np.isposinf(ranges).sum()) / measured,
+    )
+
+
+def _composed(steps: F64) -> F64:
+    """Poses (n, 3) from the steps (n - 1, 3) between them; the first is the origin."""
+    theta = np.concatenate(([0.0], np.cumsum(steps[:, 2])))
+    c, s = np.cos(theta[:-1]), np.sin(theta[:-1])
+    x = np.concatenate(([0.0], np.cumsum(c * steps[:, 0] - s * steps[:, 1])))
+    y = np.concatenate(([0.0], np.cumsum(s * steps[:, 0] + c * steps[:, 1])))
+    return np.column_stack((x, y, theta))
 
 
 def _connects(loop: Loop, gathered: MapSession) -> bool:
@@ -201,6 +232,7 @@ def _empty(track: EventLog) -> MappingResult:
         quality=MappingQuality(nan, nan, nan, nan, 0, 0, nan, nan, nan, nan, 0, 0, 0.0),
         calibration=OdometryCalibration(),
         state=None,
+        evidence=nothing_seen(),
     )
 
 

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 MAX_EDGE_CHI = 6.0
 """A loop whose chi is larger than this once the graph is solved was wrong."""
+TORN = "torn"
+"""How the reason begins for which such a loop is refused."""
 _SWEEPS = 3
 """Times that all places are visited at most."""
 _WIDENED = (16.0, 8.0, 4.0, 2.0)
@@ -125,7 +127,7 @@ class LoopCloser:
             if not chi[worst] > MAX_EDGE_CHI:
                 break
             loop = accepted[worst]
-            reason = f"torn: {chi[worst]:.0f} sigma off, the graph solved"
+            reason = f"{TORN}: {chi[worst]:.0f} sigma off, the graph solved"
             self._found[loop.first, loop.second] = replace(loop, accepted=False, reason=reason)
             torn += 1
             self.solve()

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import types
 import typing
 from dataclasses import dataclass, field, replace
 from math import isfinite
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from hsloc.errors import ConfigError
@@ -15,21 +17,20 @@ from hsloc.localisation.localiser import LocaliserParameters
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.hide import Hide
 from hsloc.matching.icp import Icp
+from hsloc.options import MAPPERS, MATCHER_ALIASES, MATCHERS, PRESETS
 from hsloc.slam.parameters import GraphMapperParameters
 from hsloc.slam.point_mapper import PointMapperParameters
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Iterable, Iterator, Mapping
+    from os import PathLike
 
     from hsloc.matching.match import Matcher
 
 T = TypeVar("T")
 
-MATCHERS = ("hide", "harmony_search", "icp")
-MAPPERS = ("graph", "point")
 _SMALLEST, _LARGEST = 1e-9, 1e9
 """No length, angle, part or count of use is smaller or larger; squares and quotients of these fit a float."""
-PRESETS = ("default", "paper", "paper-literal")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,18 +52,19 @@ class Config:
     """Everything that decides a run beside its input and its seed."""
 
     matcher: str = "hide"
-    """One of hide, harmony_search, icp."""
+    """Scan matcher: hide, harmony_search (or hs) or icp."""
     hide: Hide = field(default_factory=Hide)
     harmony_search: HarmonySearch = field(default_factory=HarmonySearch)
     icp: Icp = field(default_factory=Icp)
     likelihood_field: FieldParameters = field(default_factory=FieldParameters)
     localiser: LocaliserParameters = field(default_factory=LocaliserParameters)
     mapper: str = "graph"
-    """One of graph, point: the mapper that closes loops, or the report's."""
+    """Mapper: graph closes loops; point is the point map of the course report [P]."""
     graph_mapper: GraphMapperParameters = field(default_factory=GraphMapperParameters)
     point_mapper: PointMapperParameters = field(default_factory=PointMapperParameters)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "matcher", MATCHER_ALIASES.get(self.matcher, self.matcher))
         if self.mapper not in MAPPERS:
             raise ConfigError(f"mapper is {self.mapper!r}; it must be one of {', '.join(MAPPERS)}")
         if self.matcher not in MATCHERS:
@@ -95,6 +97,90 @@ def preset(name: str) -> Config:
         likelihood_field=FieldParameters(sigma=1.0, margin=3.0),
         localiser=LocaliserParameters(update_min_d=0.0, update_min_a=0.0, min_points=6, window_sigmas=1.0, fuse=False),
     )
+
+
+def combined(
+    base: Config,
+    source: Mapping[str, Any] | str | PathLike[str] | None = None,
+    settings: Iterable[str] = (),
+    chosen: Mapping[str, str] | None = None,
+    warnings: list[str] | None = None,
+) -> Config:
+    """A configuration made of, in this order: `base`, a table or YAML file, `chosen` keys, and KEY=VALUE `settings`.
+
+    Raises ConfigError. What a ROS 2 parameter file has to warn of is added to `warnings`.
+    """
+    if source is None or isinstance(source, dict):
+        config = from_dict(Config, source or {}, base)
+    else:
+        config = load(Path(typing.cast("str", source)), base, warnings)
+    if chosen:
+        config = replace(config, **typing.cast("Any", dict(chosen)))
+    settings = list(settings)
+    if not settings:
+        return config
+    values = nested(settings, config.matcher)
+    try:
+        return from_dict(Config, values, config)
+    except ConfigError as error:
+        raise ConfigError(f"--set: {str(error).removeprefix('config.')}") from error
+
+
+def nested(settings: Iterable[str], matcher: str) -> dict[str, Any]:
+    """KEY=VALUE texts with dotted keys as a table; `matcher.` means the section of the matcher that is chosen."""
+    values: dict[str, Any] = {}
+    known = [path for path, _ in _leaves(to_dict(Config()))]
+    for text in settings:
+        key, sign, value = text.partition("=")
+        path = tuple(key.strip().split("."))
+        if not sign or not all(path):
+            raise ConfigError(f"--set {text}: is not KEY=VALUE, such as hide.budget=400")
+        parsed = _yaml_value(f"--set {text}", value)
+        if path == ("matcher",):
+            matcher = MATCHER_ALIASES.get(str(parsed), str(parsed))
+        elif path[0] == "matcher":
+            path = (matcher, *path[1:])
+        if path not in known:
+            raise ConfigError(f"--set {text}: there is no parameter {'.'.join(path)}; {_similar(path, known)}")
+        _put(values, path, parsed)
+    return values
+
+
+def _similar(path: tuple[str, ...], known: Iterable[tuple[str, ...]]) -> str:
+    """Parameters that may be meant: with the same last name, or written nearly so."""
+    if path[-1] in _RENAMED:
+        return f"since version 0.2 it is called {_RENAMED[path[-1]]}"
+    names = [".".join(each) for each in known]
+    found = [name for name in names if name.endswith(f".{path[-1]}") or name.startswith(f"{'.'.join(path)}.")]
+    found = found or difflib.get_close_matches(".".join(path), names, 3, 0.75)
+    return f"did you mean {' or '.join(found[:3])}?" if found else "`hsloc config` lists them"
+
+
+def differences(config: Config, base: Config) -> list[str]:
+    """KEY=VALUE for each parameter in which `config` differs from `base`; `nested` reads them."""
+    return [
+        f"{'.'.join(path)}={value if isinstance(value, str) else json.dumps(value)}"
+        for path, value in _leaves(to_dict(config))
+        if value != _get(to_dict(base), path)
+    ]
+
+
+def _leaves(values: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    if isinstance(values, dict):
+        for key, value in values.items():
+            yield from _leaves(value, (*path, key))
+    else:
+        yield path, values
+
+
+def _yaml_value(where: str, text: str) -> Any:
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        return YAML(typ="safe", pure=True).load(text)
+    except YAMLError as error:
+        raise ConfigError(f"{where}: the value is not valid YAML") from error
 
 
 def to_dict(value: Any) -> Any:
@@ -181,6 +267,14 @@ def load(path: Path, base: Config | None = None, warnings: list[str] | None = No
 
     A ROS 2 parameter file is taken as well (see `from_ros_parameters`); what it has to warn of is added to `warnings`.
     """
+    try:
+        return from_dict(Config, read_values(path, warnings), base)
+    except ConfigError as error:
+        raise ConfigError(str(error) if str(error).startswith(f"{path}: ") else f"{path}: {error}") from error
+
+
+def read_values(path: Path, warnings: list[str] | None = None) -> dict[str, Any]:
+    """Keys and values of a YAML or ROS 2 parameter file, as `load` takes them, not yet checked."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
@@ -190,14 +284,13 @@ def load(path: Path, base: Config | None = None, warnings: list[str] | None = No
         raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
-    try:
-        if is_ros_parameters(values):
-            values, ignored = from_ros_parameters(values)
-            if warnings is not None:
-                warnings += [f"{path}: {text}" for text in ignored]
-        return from_dict(Config, {} if values is None else values, base)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
+    if is_ros_parameters(values):
+        values, ignored = from_ros_parameters(values)
+        if warnings is not None:
+            warnings += [f"{path}: {text}" for text in ignored]
+    if values is not None and not isinstance(values, dict):
+        raise ConfigError(f"{path}: is {values!r:.80}; it must be a table of keys and values")
+    return values or {}
 
 
 _ROS = "ros__parameters"

@@ -1,37 +1,42 @@
-"""What to run: one description, whatever door it comes by."""
+"""What to run: one description, whatever offers it. Its options are listed in `hsloc.options`."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
-from os import fsencode
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from hsloc.config import Config
+from hsloc.config import Config, combined, differences, preset
 from hsloc.errors import ConfigError
 from hsloc.log import ReadOptions
+from hsloc.model.pose2 import Pose2, wrap_angle
+from hsloc.options import ALIGNMENTS, BY_NAME, MODES, OPTIONS, PRESETS, VERDICTS, merged
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Mapping, Sequence
 
-    from hsloc.model.pose2 import Pose2
+    from hsloc.matching.match import Matcher
+    from hsloc.options import Option
     from hsloc.slam.parameters import GraphMapperParameters
 
 _LONGEST_S = 1e9
-"""No log takes so many seconds; in nanoseconds it fits 64 bits."""
-MODES = ("auto", "localise", "slam")
+"""No log is as long as this [s]; in nanoseconds it fits 64 bits."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunRequest:
-    """What to run. The same spec on the same files gives the same result, bit for bit.
+    """What to run. The same request on the same files gives the same result, bit for bit.
 
     With `resume`, the results of an earlier mapping run, that run's map is extended: the new map and trajectory are in
     its frame. `mode` is "localise", "slam" or "auto": localise if there is a map, `map_path` or the log's own, else
-    draw one.
-    With `no_odometry` the log's odometry is not looked at (slam alone). The start is `initial_pose`, else the one
+    build one. With `no_odometry` the log's odometry is not read (slam only). The start is `initial_pose`, else the one
     that the log states for the time of the first event, else unknown; with `unknown_start` it is unknown whatever the
-    log states. `labels` are the names of the logs in reports, where the files' own names say nothing.
-    `reference` names poses to compare with, see `hsloc.replay.references`; otherwise they are the log's truth.
+    log states. `reference` names poses to compare with, see `hsloc.replay.references`; otherwise they are those in the
+    log. `alignment` and `relations` are for the evaluation. `own_matcher` is used instead of the one that `config`
+    names. `min_localised`, `max_ape`, `max_warnings` and `fail_if` are limits that the result must keep, see
+    `hsloc.analysis.limits`. `labels` are the names of the logs in reports; with `bare_names` no folder is written into
+    the results, so that they are the same wherever the files are.
     """
 
     logs: tuple[Path, ...]
@@ -47,10 +52,23 @@ class RunRequest:
     mode: str = "auto"
     no_odometry: bool = False
     reference: str | None = None
+    alignment: str | None = None
+    relations: Path | None = None
+    own_matcher: Matcher | None = None
+    min_localised: float | None = None
+    max_ape: float | None = None
+    max_warnings: int | None = None
+    fail_if: str | None = None
+    bare_names: bool = False
 
     def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise ConfigError(f"mode is {self.mode!r}; it must be one of {', '.join(MODES)}")
+        for name, choices in (("mode", MODES), ("alignment", ALIGNMENTS), ("preset", PRESETS), ("fail_if", VERDICTS)):
+            value = getattr(self, name)
+            if value is not None and value not in choices:
+                raise ConfigError(f"{name} is {value!r}; it must be one of {', '.join(choices)}")
+        for option in OPTIONS:
+            if option.place in ("run", "check"):
+                _check_bounds(option, getattr(self, option.target))
         if self.no_odometry and (self.mode == "localise" or self.map_path is not None):
             raise ConfigError(
                 "a robot on a given map is followed with odometry; leave out --no-odom or use --mode slam"
@@ -63,6 +81,8 @@ class RunRequest:
             )
         if self.no_odometry and self.read.deskew:
             raise ConfigError("scans are deskewed with odometry; leave out --no-odom or --deskew")
+        if self.initial_pose is not None and self.unknown_start:
+            raise ConfigError("the start is either given (--initial-pose) or unknown (--unknown-start)")
         if self.reference is not None and self.read.truth_topic is not None:
             raise ConfigError(
                 "--reference and --truth-topic both name the poses to compare with; leave out one of them"
@@ -70,6 +90,76 @@ class RunRequest:
         _check_window(self.read.start_s, self.read.end_s)
         if len({path.resolve() for path in self.logs}) < len(self.logs):
             raise ConfigError(f"{self.logs[0]}: a log is named twice; several logs must be parts of one run")
+
+    @staticmethod
+    def from_values(
+        logs: Sequence[str | os.PathLike[str]], values: Mapping[str, Any], warnings: list[str] | None = None
+    ) -> RunRequest:
+        """From options by their names, in plain data: paths and poses may be texts and lists; None is the default.
+
+        `config` is a Config, a table of parameters, or a YAML file, whose warnings are added to `warnings`. `matcher`
+        is a name or a Matcher. Raises ConfigError for an option that does not exist, naming the nearest.
+        """
+        values = {name: value for name, value in merged(values).items() if value is not None}
+        matcher = values.get("matcher")
+        if matcher is not None and not isinstance(matcher, str):
+            values["own_matcher"] = values.pop("matcher")
+        config = values.get("config")
+        if not isinstance(config, Config):
+            config = combined(
+                preset(values.get("preset", "default")),
+                config,
+                values.get("set", ()),
+                {name: values[name] for name in ("matcher", "mapper") if name in values},
+                warnings,
+            )
+        elif rest := [name for name in ("matcher", "mapper", "set") if name in values]:
+            config = combined(config, None, values.get("set", ()), {n: values[n] for n in rest if n != "set"})
+        run: dict[str, Any] = {"logs": tuple(Path(log) for log in logs), "config": config}
+        read: dict[str, Any] = {}
+        for name, value in values.items():
+            if name in _BESIDE:
+                run[name] = value
+                continue
+            option = BY_NAME.get(name)
+            if option is None:
+                raise ConfigError(f"no option is called {name!r}{_nearest(name)}")
+            if option.place != "config":
+                (read if option.place == "read" else run)[option.target] = _converted(option, value)
+        if "read" in values:
+            run["read"] = replace(values["read"], **read)
+        else:
+            run["read"] = ReadOptions(**read)
+        return RunRequest(**run)
+
+    def to_values(self) -> dict[str, Any]:
+        """The options by their names that `from_values` reads back, in plain data, files as they were named.
+
+        `config` is left out: `set` gives all parameters that differ from the preset.
+        """
+        found: dict[str, Any] = {}
+        for option in OPTIONS:
+            if option.place != "config":
+                owner: Any = self.read if option.place == "read" else self
+                value = getattr(owner, option.target, None)
+                found[option.name] = _plain(value, self.bare_names)
+        base = preset(self.preset)
+        found |= {name: getattr(self.config, name) for name in ("matcher", "mapper")}
+        base = replace(base, matcher=self.config.matcher, mapper=self.config.mapper)
+        found["set"] = differences(self.config, base)
+        if self.reference is not None and self.bare_names and Path(self.reference).exists():
+            found["reference"] = Path(self.reference).name
+        return found
+
+    @property
+    def matcher(self) -> Matcher:
+        """The scan matcher."""
+        return self.config.make_matcher() if self.own_matcher is None else self.own_matcher
+
+    @property
+    def matcher_name(self) -> str:
+        """What the scan matcher is called in reports."""
+        return self.config.matcher if self.own_matcher is None else type(self.own_matcher).__name__
 
     def mapping(self) -> GraphMapperParameters:
         """The graph mapper's parameters as this run uses them."""
@@ -81,7 +171,72 @@ class RunRequest:
 
     def names(self) -> tuple[str, ...]:
         """What to call the logs in reports; of a name that is no text (UTF-8) the odd bytes as `\\xfc`."""
-        return self.labels or tuple(fsencode(path.name).decode("utf-8", "backslashreplace") for path in self.logs)
+        return self.labels or tuple(os.fsencode(path.name).decode("utf-8", "backslashreplace") for path in self.logs)
+
+    def paths(self) -> tuple[str, ...]:
+        """The logs as they were named on the command line."""
+        return tuple(path.name if self.bare_names else os.fspath(path) for path in self.logs)
+
+
+_BESIDE = ("read", "labels", "own_matcher", "bare_names")
+"""Fields of a request that are no option of a command line."""
+
+
+def _converted(option: Option, value: Any) -> Any:
+    """A value of plain data as the dataclass has it."""
+    if option.kind == "path":
+        return _typed(option, value, (str, os.PathLike), "a path", Path)
+    if option.kind == "pose":
+        return value if isinstance(value, Pose2) else _pose(option, value)
+    if option.kind == "topics" and isinstance(value, list | tuple):
+        return ",".join(value)
+    if option.kind in ("text", "topics", "choice"):
+        return _typed(option, value, (str, os.PathLike), "a text", os.fspath)
+    if option.kind == "switch":
+        return _typed(option, value, (bool,), "true or false", bool)
+    kind, what = ((int,), "a whole number") if option.kind == "whole" else ((int, float), "a number")
+    if isinstance(value, bool):
+        raise ConfigError(f"{option.name} is {value!r}; it must be {what}")
+    return _typed(option, value, kind, what, kind[-1])
+
+
+def _typed(option: Option, value: Any, kinds: tuple[type, ...], what: str, convert: Any) -> Any:
+    if not isinstance(value, kinds):
+        raise ConfigError(f"{option.name} is {value!r}; it must be {what}")
+    return convert(value)
+
+
+def _pose(option: Option, value: Any) -> Pose2:
+    try:
+        x, y, yaw = (float(number) for number in value)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{option.name} is {value!r}; it must be x, y [m], yaw [rad]") from error
+    return Pose2(x, y, wrap_angle(yaw))
+
+
+def _plain(value: Any, bare_names: bool) -> Any:
+    if isinstance(value, Pose2):
+        return [value.x, value.y, value.theta]
+    if isinstance(value, Path):
+        return value.name if bare_names else os.fspath(value)
+    return value
+
+
+def _nearest(name: str) -> str:
+    import difflib
+
+    close = difflib.get_close_matches(name, [*BY_NAME, *_BESIDE], 1)
+    return f"; did you mean {close[0]}?" if close else f"; they are {', '.join(BY_NAME)}"
+
+
+def _check_bounds(option: Option, value: Any) -> None:
+    if option.kind not in ("number", "whole") or value is None:
+        return
+    least = 0 if option.kind == "whole" else option.least
+    if isinstance(value, bool) or value != value or (least is not None and value < least):
+        raise ConfigError(f"{option.flag} is {value}; it must be a number of {least:g} or more")
+    if option.most is not None and value > option.most:
+        raise ConfigError(f"{option.flag} is {value}; it must be at most {option.most:.16g}")
 
 
 def _check_window(start: float | None, end: float | None) -> None:

@@ -1,15 +1,17 @@
-"""All parts of the benchmark in one call."""
+"""All parts of the benchmark in one call, and the machine that they ran on."""
 
 from __future__ import annotations
 
+import os
+import platform
 import tempfile
 from dataclasses import dataclass, replace
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.benchmark.cases import read_cases, run_method
 from hsloc.benchmark.kernel import time_kernel, time_matches
-from hsloc.benchmark.machine import load, machine
 from hsloc.benchmark.memory import measure_memory
 from hsloc.benchmark.methods import our_methods, peers
 from hsloc.benchmark.replaying import fixture, time_replay
@@ -18,6 +20,7 @@ from hsloc.benchmark.sub_cell import measure_sub_cell
 from hsloc.benchmark.targets import Bench
 from hsloc.simulation.presets import OFFICE
 from hsloc.simulation.recorder import record
+from hsloc.version import __version__
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -110,3 +113,40 @@ def _log(folder: Path, sizes: Sizes) -> Path:
     path = folder / "office.mcap"
     record(replace(OFFICE, seed=1, duration_s=sizes.replay_seconds), path)
     return path
+
+
+PACKAGES = ("numpy", "numba", "scipy", "mealpy", "small-gicp")
+
+
+def machine() -> dict[str, object]:
+    """Processor, cores, load and versions; a package that is missing is None."""
+    return {
+        "cpu": _cpu(),
+        "cores": os.cpu_count(),
+        "load_average": load(),
+        "platform": platform.platform(),
+        "python": platform.python_version(),
+        "hsloc": __version__,
+        **{name: _version(name) for name in PACKAGES},
+    }
+
+
+def load() -> tuple[float, ...] | None:
+    """Load over 1, 5 and 15 minutes: above 0 before a benchmark somebody else is at work."""
+    return tuple(round(value, 2) for value in os.getloadavg()) if hasattr(os, "getloadavg") else None
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None

@@ -1,4 +1,4 @@
-"""Arguments that several commands share."""
+"""Arguments that several commands share; those of a run are made from `hsloc.options`."""
 
 from __future__ import annotations
 
@@ -6,23 +6,65 @@ import argparse
 import sys
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from hsloc.options import BY_NAME, offered
 
 if TYPE_CHECKING:
-    from hsloc.config import Config
+    from collections.abc import Callable, Iterable
+
     from hsloc.log import ReadOptions
     from hsloc.model.pose2 import Pose2
+    from hsloc.options import Door, Option
+    from hsloc.request import RunRequest
+
+
+def add_options(parser: argparse.ArgumentParser, door: Door, names: Iterable[str] | None = None) -> None:
+    """The options that `door` offers, or those of them in `names`, in their groups."""
+    groups: dict[str, Any] = {"": parser}
+    chosen = [option for option in offered(door) if names is None or option.name in names]
+    for option in chosen:
+        if option.group not in groups:
+            groups[option.group] = parser.add_argument_group(option.group)
+        group = groups[option.group]
+        if option.instead_of:
+            if option.instead_of not in groups:
+                groups[option.instead_of] = group.add_mutually_exclusive_group()
+            group = groups[option.instead_of]
+        group.add_argument(option.flag, dest=option.name, **_how(option, door))
+
+
+def _how(option: Option, door: Door) -> dict[str, Any]:
+    """Arguments of `add_argument`."""
+    how: dict[str, Any] = {"help": option.help.replace("%", "%%")}
+    repeated = option.kind in ("settings", "topics") or (door == "sweep" and option.varied)
+    if option.kind == "switch":
+        return {**how, "action": "store_true", "default": None}
+    if repeated:
+        how["action"] = "append"
+    if door == "sweep" and option.varied:
+        how["help"] = how["help"].removesuffix(".") + "; may be repeated."
+    if option.kind == "choice":
+        return {**how, "choices": option.choices}
+    types: dict[str, Callable[[str], Any]] = {"pose": pose, "path": Path, "whole": whole, "number": _number(option)}
+    metavar = "X,Y,YAW" if option.kind == "pose" else option.metavar
+    return {**how, "type": types.get(option.kind, str), "metavar": metavar}
+
+
+def values(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The options that were given, by their names."""
+    return {name: value for name, value in vars(arguments).items() if name in BY_NAME and value is not None}
 
 
 def numbers(text: str, count: int, what: str) -> tuple[float, ...]:
     """`count` finite numbers, separated by commas or blanks."""
     try:
-        values = tuple(float(part) for part in text.replace(",", " ").split())
+        found = tuple(float(part) for part in text.replace(",", " ").split())
     except ValueError:
-        values = ()
-    if len(values) != count or not all(isfinite(value) for value in values):
+        found = ()
+    if len(found) != count or not all(isfinite(value) for value in found):
         raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
-    return values
+    return found
 
 
 def pose(text: str) -> tuple[float, float, float]:
@@ -40,79 +82,60 @@ def to_pose(values: tuple[float, float, float] | None) -> Pose2 | None:
     return Pose2(values[0], values[1], wrap_angle(values[2]))
 
 
-def add_read_arguments(parser: argparse.ArgumentParser) -> None:
-    """How to read a log."""
-    group = parser.add_argument_group("reading the log")
-    group.add_argument(
-        "--scan-topic", metavar="TOPIC", action="append",
-        help="topic of the laser scans (default: the only one); several, or with commas, are merged",
-    )  # fmt: skip
-    group.add_argument("--odom-topic", metavar="TOPIC", help="topic of the odometry (default: the only one)")
-    group.add_argument("--truth-topic", metavar="TOPIC", help="topic of reference poses, or tf for map -> base in /tf")
-    group.add_argument("--base-frame", metavar="FRAME", help="frame of the base (default: the odometry's child frame)")
-    group.add_argument(
-        "--laser-pose", type=pose, metavar="X,Y,YAW", help="mounting of the laser, over what the log says"
-    )
-    group.add_argument(
-        "--deskew", action="store_true", help="move each beam to where the robot was when it was measured"
-    )
-    group.add_argument("--start", type=float, metavar="S", help="begin so many seconds into the log")
-    end = group.add_mutually_exclusive_group()
-    end.add_argument("--end", type=float, metavar="S", help="end so many seconds into the log")
-    end.add_argument("--duration", type=float, metavar="S", help="end so many seconds after --start")
-    parser.add_argument("--no-progress", action="store_true", help="no bar on the terminal")
-
-
-def read_options(arguments: argparse.Namespace) -> ReadOptions:
-    """What `add_read_arguments` collected."""
-    from hsloc.log import ReadOptions
-
-    end = arguments.end if arguments.duration is None else (arguments.start or 0.0) + arguments.duration
-    return ReadOptions(
-        scan_topic=None if arguments.scan_topic is None else ",".join(arguments.scan_topic),
-        odom_topic=arguments.odom_topic,
-        truth_topic=arguments.truth_topic,
-        base_frame=arguments.base_frame,
-        laser_pose=to_pose(arguments.laser_pose),
-        start_s=arguments.start,
-        end_s=end,
-        deskew=arguments.deskew,
-    )
-
-
-def add_config_arguments(parser: argparse.ArgumentParser) -> None:
-    """Which algorithms, with which parameters."""
-    group = parser.add_argument_group("algorithms")
-    group.add_argument("--matcher", choices=("hide", "harmony_search", "hs", "icp"), help="default: hide")
-    group.add_argument("--mapper", choices=("graph", "point"), help="default: graph; point is the report's SLAM")
-    group.add_argument("--preset", choices=("default", "paper", "paper-literal"), default="default", help="parameters")
-    group.add_argument(
-        "--config", type=Path, metavar="FILE", help="parameters from YAML (also of a ROS 2 node), on top of the preset"
-    )
-    group.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of all randomness (default: 0)")
-
-
-def seed(text: str) -> int:
+def whole(text: str) -> int:
     """A whole number, 0 or more."""
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 0 or more")
     return int(text)
 
 
-def config(arguments: argparse.Namespace) -> Config:
-    """What `add_config_arguments` collected: preset, then file, then flags."""
-    from dataclasses import replace
+seed = whole
 
-    from hsloc.config import load, preset
 
-    chosen = preset(arguments.preset)
-    if arguments.config is not None:
-        ignored: list[str] = []
-        chosen = load(arguments.config, chosen, ignored)
-        for line in ignored:
-            print(f"hsloc: warning: {line}", file=sys.stderr)
-    if arguments.matcher is not None:
-        chosen = replace(chosen, matcher="harmony_search" if arguments.matcher == "hs" else arguments.matcher)
-    if arguments.mapper is not None:
-        chosen = replace(chosen, mapper=arguments.mapper)
-    return chosen
+def _number(option: Option) -> Callable[[str], float]:
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+        low, high = option.least, option.most
+        if not isfinite(value) or (low is not None and value < low) or (high is not None and value > high):
+            bounds = "finite" if low is None else f"{low:g} or more" if high is None else f"from {low:g} to {high:g}"
+            raise argparse.ArgumentTypeError(f"{text!r} must be {bounds}")
+        return value
+
+    return number
+
+
+def add_read_arguments(parser: argparse.ArgumentParser) -> None:
+    """How to read a log, for commands that read one without a run."""
+    names = [option.name for option in offered("replay") if option.place == "read"]
+    add_options(parser, "replay", names)
+    add_no_progress(parser)
+
+
+def add_no_progress(parser: argparse._ActionsContainer) -> None:
+    """Whether a bar is shown."""
+    parser.add_argument("--no-progress", action="store_true", help="Show no progress bar.")
+
+
+def request(arguments: argparse.Namespace) -> RunRequest:
+    """The run that the arguments describe; warnings of a configuration file go to stderr."""
+    from hsloc.request import RunRequest
+
+    ignored: list[str] = []
+    found = RunRequest.from_values(getattr(arguments, "log", ()), values(arguments), ignored)
+    for line in ignored:
+        print(f"hsloc: warning: {line}", file=sys.stderr)
+    return found
+
+
+def read_options(arguments: argparse.Namespace) -> ReadOptions:
+    """What `add_read_arguments` collected."""
+    from hsloc.request import RunRequest
+
+    return RunRequest.from_values((), values(arguments)).read
+
+
+CONFIG_OPTIONS = ("preset", "config", "matcher", "mapper", "set")
+"""Options that decide the configuration."""

@@ -8,6 +8,10 @@ from pathlib import Path
 from hsloc.cli.progress import ProgressLine
 
 HELP = "measure speed, memory and matching beside peers"
+EXAMPLES = """
+  hsloc bench --quick
+  hsloc bench kernel --json
+"""
 
 _PARTS = ("kernel", "match", "replay", "memory", "sub-cell", "cases")
 

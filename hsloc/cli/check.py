@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from hsloc.log import CheckReport, Finding
 
 HELP = "check a log for what spoils results"
+EXAMPLES = """
+  hsloc check run.mcap
+  hsloc check run.mcap --json -q || echo "see the findings"
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

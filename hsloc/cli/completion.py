@@ -1,9 +1,4 @@
-"""Print the completion of all commands and flags for a shell: bash, zsh or fish.
-
-eval "$(hsloc completion bash)"       # in ~/.bashrc
-hsloc completion zsh > ~/.zfunc/_hsloc
-hsloc completion fish > ~/.config/fish/completions/hsloc.fish
-"""
+"""Print the completion of all commands and flags for a shell: bash, zsh or fish."""
 
 from __future__ import annotations
 
@@ -15,12 +10,16 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 HELP = "print the completion for a shell"
+EXAMPLES = """
+  eval "$(hsloc completion bash)"                                  in ~/.bashrc
+  hsloc completion zsh > ~/.zfunc/_hsloc
+  hsloc completion fish > ~/.config/fish/completions/hsloc.fish
+"""
 _FILES = ("log", "files")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The shell."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("shell", choices=("bash", "zsh", "fish"))
 
 

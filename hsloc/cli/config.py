@@ -4,25 +4,29 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from hsloc.cli.arguments import add_config_arguments, config
+from hsloc.cli.arguments import CONFIG_OPTIONS, add_options, request
 
 if TYPE_CHECKING:
     import argparse
 
 HELP = "print the parameters as YAML"
+EXAMPLES = """
+  hsloc config > mine.yaml
+  hsloc config --preset paper --set hide.budget=400
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Preset and file."""
-    add_config_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_options(parser, "replay", CONFIG_OPTIONS)
+    parser.add_argument("--json", action="store_true", help="Print JSON.")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the configuration."""
     from hsloc.config import dump, to_dict
 
-    chosen = config(arguments)
+    chosen = request(arguments).config
     if arguments.json:
         import json
 

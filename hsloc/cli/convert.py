@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from hsloc.log import Conversion, LogSummary
 
 HELP = "convert a log to MCAP"
+EXAMPLES = """
+  hsloc convert intel.clf intel.mcap
+  hsloc convert bag_folder run.mcap --start 10 --duration 60
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,6 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _report(arguments: argparse.Namespace, summary: LogSummary, conversion: Conversion) -> None:
     from json import dumps
 
+    from hsloc.dataclass_json import to_json
+
     losses = conversion.losses.lines()
     if arguments.json:
         values = {
@@ -67,7 +73,7 @@ def _report(arguments: argparse.Namespace, summary: LogSummary, conversion: Conv
             "stamps_backwards": conversion.stamps_backwards,
             "data_lost": conversion.losses.data_lost,
             "losses": losses + conversion.losses.reasons,
-            "warnings": list(summary.warnings),
+            "warnings": [to_json(warning) for warning in summary.warnings],
         }
         print(dumps(values))
         return

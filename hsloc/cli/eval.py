@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from hsloc.model import Trajectory
 
 HELP = "compare trajectories with a reference"
+EXAMPLES = """
+  hsloc eval reference.tum trajectory.tum --alignment se2
+  hsloc eval results/a results/b --json
+  hsloc eval trajectory.tum --relations intel.relations --no-reference
+"""
 
 COLUMNS = ("rmse", "mean", "median", "std", "min", "max", "sse")
 

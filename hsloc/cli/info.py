@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from hsloc.model import Pose2
 
 HELP = "say what is in a log"
+EXAMPLES = """
+  hsloc info run.mcap
+  hsloc info bag_folder --quick --json
+"""
 
 YEAR_2000_NS = 946_684_800_000_000_000
 
@@ -60,6 +64,8 @@ def _all_losses(log: Log) -> Losses:
 
 
 def _values(log: Log, losses: Losses, counts: dict[str, int]) -> dict[str, Any]:
+    from hsloc.dataclass_json import to_json
+
     summary = log.summary
     grid, start = log.map(), log.initial_pose()
     pose = summary.T_base_laser
@@ -103,7 +109,7 @@ def _values(log: Log, losses: Losses, counts: dict[str, int]) -> dict[str, Any]:
         "data_lost": losses.data_lost,
         "losses": losses.lines(),
         "reasons": losses.reasons,
-        "warnings": list(summary.warnings),
+        "warnings": [to_json(warning) for warning in summary.warnings],
     }
 
 
@@ -141,8 +147,8 @@ def _lines(summary: LogSummary, losses: Losses, report: dict[str, Any]) -> list[
     lines += [f"  {'order:':<12}{order}"]
     if report["events"]:
         lines += [f"  {'events:':<12}" + ", ".join(f"{n} {name}" for name, n in sorted(report["events"].items()))]
-    remarks = [*summary.warnings, *losses.lines(), *losses.reasons]
-    lines += ["", "remarks:", *(f"  {remark}" for remark in remarks)] if remarks else ["", "no remarks"]
+    warnings = [*summary.warnings, *losses.lines(), *losses.reasons]
+    lines += ["", "warnings:", *(f"  {warning}" for warning in warnings)] if warnings else ["", "no warnings"]
     if losses.data_lost:
         lines += ["part of the log is damaged; what is whole is read, and commands end with exit code 3"]
     return lines

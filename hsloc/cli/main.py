@@ -7,12 +7,12 @@ stand inside `run`, so that `hsloc --help` answers at once.
 
 from __future__ import annotations
 
-import argparse
 import errno
 import importlib
 import os
 import signal
 import sys
+import warnings
 from io import TextIOWrapper
 from typing import TYPE_CHECKING
 
@@ -21,6 +21,8 @@ from hsloc.version import __version__
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from hsloc.cli.parser import Parser
 
 COMMANDS = (
     "record",
@@ -39,31 +41,50 @@ COMMANDS = (
     "submit",
 )
 
-EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_DATA_LOST = 0, 1, 2, 3
-"""Exit codes: done; failed; wrong use; done, but part of the input was lost."""
+EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_DATA_LOST, EXIT_BELOW_LIMIT = 0, 1, 2, 3, 4
+"""Exit codes: done; failed; wrong use; done, but part of the input was lost; done, but a limit was not kept."""
+EXAMPLES = """
+  hsloc record office.mcap --world office      a simulated log to try
+  hsloc replay office.mcap                     where was the robot?
+  hsloc info run.mcap                          what is in a log
+  hsloc COMMAND --help                         options and examples of a command
+
+exit codes:
+  0 done    1 failed    2 wrong use    3 done, part of the log lost    4 done, a limit not kept
+"""
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> Parser:
     """The parser of all commands."""
-    parser = argparse.ArgumentParser(
+    from hsloc.cli.parser import Parser
+
+    parser = Parser(
         prog="hsloc",
         description="Where was the robot? Offline localisation and mapping for recorded 2D-lidar logs.",
+        epilog=f"examples:{EXAMPLES}",
     )
-    parser.add_argument("--version", action="version", version=f"hsloc {__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    parser.add_argument("--version", action="version", version=f"hsloc {__version__}", help="Print the version.")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for name in COMMANDS:
         module = importlib.import_module(f"hsloc.cli.{name}")
-        command = commands.add_parser(name, help=module.HELP, description=module.__doc__)
+        command = commands.add_parser(
+            name, help=module.HELP, description=module.__doc__, epilog=f"examples:{module.EXAMPLES}"
+        )
         module.add_arguments(command)
         command.set_defaults(run=module.run)
+        parser.commands[name] = command
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code. Errors of `HslocError` are one line on stderr."""
     try:
-        arguments = build_parser().parse_args(argv)
+        parser = build_parser()
+        arguments = parser.parse(sys.argv[1:] if argv is None else argv)
+        if arguments.command is None:
+            parser.print_help()
+            return EXIT_USAGE
         status = int(arguments.run(arguments))
         sys.stdout.flush()
         return status
@@ -91,6 +112,7 @@ def program() -> None:
     """
     if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")
+    warnings.formatwarning = lambda message, *_, **__: f"hsloc: warning: {message}\n"
     status = main()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:

@@ -1,4 +1,4 @@
-"""Draw a map from a recorded log: `hsloc replay --mode slam` by the name that people look for first."""
+"""Build a map from a recorded log, as `hsloc replay --mode slam` does; it is compared with a map in the log."""
 
 from __future__ import annotations
 
@@ -9,12 +9,17 @@ from hsloc.cli import replay
 if TYPE_CHECKING:
     import argparse
 
-HELP = "draw a map from a recorded log (replay --mode slam)"
+HELP = "build a map from a recorded log (replay --mode slam)"
+EXAMPLES = """
+  hsloc map run.mcap --out floor
+  hsloc map second.mcap --resume floor --out both          extend an earlier map
+  hsloc map run.clf --no-odom --scan-topic FLASER
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Those of `hsloc replay`; a map that is given is what the drawn one is compared with."""
-    replay.add_arguments(parser)
+    """Those of `hsloc replay`; the built map is compared with one that the log holds."""
+    replay.add_arguments(parser, "map")
     parser.set_defaults(mode="slam")
 
 

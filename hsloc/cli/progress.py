@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 
 _EVERY = 0.1
+_TICK = 0.5
 
 
 class ProgressLine:
@@ -17,11 +19,17 @@ class ProgressLine:
         self._phase = ""
         self._next = 0.0
         self._length = 0
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._clock: tuple[float, str] | None = None
 
     def __enter__(self) -> ProgressLine:
+        if self._on:
+            threading.Thread(target=self._tick, daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._ended.set()
         self._write("")
 
     @property
@@ -31,19 +39,38 @@ class ProgressLine:
 
     def show(self, phase: str, share: float, note: str = "") -> None:
         """A bar at `share` of 1, at most ten times a second."""
+        self._clock = None
+        now = self._enter(phase)
+        if self._on and now >= self._next:
+            self._next = now + _EVERY
+            self._draw(share, note)
+
+    def show_clock(self, phase: str, expected_s: float, note: str = "") -> None:
+        """A bar that moves by itself, over about `expected_s` seconds: for work that reports nothing."""
+        self._enter(phase)
+        self._clock = expected_s, note
+
+    def _enter(self, phase: str) -> float:
         now = time.monotonic()
         if phase != self._phase:
             self._phase, self._begin = phase, now
-        if not self._on or now < self._next:
-            return
-        self._next = now + _EVERY
-        share = min(max(share, 0.0), 1.0)
+        return now
+
+    def _tick(self) -> None:
+        while not self._ended.wait(_TICK):
+            clock = self._clock
+            if clock is not None:
+                expected_s, note = clock
+                self._draw(min(self.elapsed / expected_s, 0.99), f"{self.elapsed:.0f} s, {note}")
+
+    def _draw(self, share: float, note: str) -> None:
         width = 28
-        filled = round(share * width)
-        self._write(f"{phase:<9} [{'#' * filled}{'.' * (width - filled)}] {100 * share:3.0f} %  {note}")
+        filled = round(min(max(share, 0.0), 1.0) * width)
+        self._write(f"{self._phase:<9} [{'#' * filled}{'.' * (width - filled)}] {100 * share:3.0f} %  {note}")
 
     def _write(self, text: str) -> None:
         if self._on:
-            sys.stderr.write("\r" + text.ljust(self._length) + ("" if text else "\r"))
-            sys.stderr.flush()
-            self._length = len(text)
+            with self._lock:
+                sys.stderr.write("\r" + text.ljust(self._length) + ("" if text else "\r"))
+                sys.stderr.flush()
+                self._length = len(text)

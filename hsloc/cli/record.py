@@ -25,6 +25,11 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound="DataclassInstance")
 
 HELP = "drive a simulated robot and write its log"
+EXAMPLES = """
+  hsloc record office.mcap --world office --seed 3
+  hsloc record floor.mcap --world floor.yaml --waypoints path.txt
+  hsloc record --list
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -121,8 +126,8 @@ def run(arguments: argparse.Namespace) -> int:
     world = load_world(arguments.world or preset(arguments.scenario).world, arguments.waypoints)
     scenario = build_scenario(arguments, world)
     if not arguments.quiet:
-        for note in world.notes:
-            print(f"hsloc: warning: {note}", file=sys.stderr)
+        for warning in world.warnings:
+            print(f"hsloc: warning: {warning}", file=sys.stderr)
     way = world.lap_length() * scenario.laps_needed(world.lap_length())
     with ProgressLine(arguments.quiet) as line:
 

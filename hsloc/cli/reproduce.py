@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from hsloc.reproduction import Material
 
 HELP = "run the experiments of the papers again"
+EXAMPLES = """
+  hsloc reproduce                              all experiments, about an hour
+  hsloc reproduce E1 --seeds 20 --out results/e1
+"""
 
 _EXPERIMENTS = ("E1", "E2", "E3", "E4", "M1")
 
@@ -43,8 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run, write, print; 1 where something that ought to hold does not."""
-    from hsloc.cli.folders import default_folder, link_latest, refuse_early
     from hsloc.cli.main import EXIT_FAILED, EXIT_OK
+    from hsloc.cli.output import default_folder, link_latest, refuse_early
     from hsloc.evaluation.metrics import format_json
     from hsloc.reproduction import reproduce
     from hsloc.reproduction.results import write_results

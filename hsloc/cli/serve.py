@@ -11,6 +11,13 @@ if TYPE_CHECKING:
     import argparse
 
 HELP = "serve the HTTP API and the web page"
+EXAMPLES = """
+  hsloc serve                                  on http://127.0.0.1:8000, for this machine
+  hsloc serve --host 0.0.0.0 --first-token --slots 2
+
+Everything else, such as limits, is set by variables HSLOC_<NAME>: HSLOC_MAX_UPLOAD_BYTES=2G, HSLOC_JOB_MEMORY_BYTES=4G,
+HSLOC_MIN_FREE_BYTES=256M, HSLOC_RETENTION_S, ...; HSLOC_TOKEN is a token of your own choice.
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,11 +38,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--expires-days", type=float, metavar="D", help="the new token ends after so many days")
     group.add_argument("--list-tokens", action="store_true", help="show the tokens' ids and tenants, and end")
     group.add_argument("--revoke-token", metavar="ID", help="make a token worthless, and end")
-    parser.epilog = (
-        "Everything else, such as limits, is set by variables HSLOC_<NAME>: HSLOC_MAX_UPLOAD_BYTES=2G, "
-        "HSLOC_JOB_MEMORY_BYTES=4G, HSLOC_MIN_FREE_BYTES=256M, HSLOC_RETENTION_S, ...; HSLOC_TOKEN is a token of your "
-        "own choice."
-    )
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -7,69 +7,58 @@ input and the same options, are not done again.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hsloc.cli.arguments import add_read_arguments, pose, read_options, to_pose
+from hsloc.cli.arguments import add_no_progress, add_options, values
 from hsloc.cli.progress import ProgressLine
+from hsloc.options import BY_NAME, MATCHER_ALIASES
 
 if TYPE_CHECKING:
     from hsloc.config import Config
     from hsloc.sweep.runs import Outcome
 
 HELP = "replay many logs, configurations and seeds"
-PRESETS = ("default", "paper", "paper-literal")
-MATCHERS = ("hide", "harmony_search", "hs", "icp")
+EXAMPLES = """
+  hsloc sweep logs/*.mcap --out nightly --jobs 4 --min-localised 0.95
+  hsloc sweep run.mcap --out budgets --vary hide.budget=100,200,400 --seeds 0-9
+  hsloc sweep run.mcap --out compare --matcher hide --matcher icp --csv
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Logs, what to vary, and how."""
-    parser.add_argument("log", nargs="+", type=Path, help="logs; each is a run of its own")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of all results")
+    parser.add_argument("log", nargs="+", type=Path, help="Logs; each is a run of its own.")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="Folder of all results.")
     parser.add_argument(
-        "--jobs", "-j", type=_positive, default=1, metavar="N", help="runs at the same time (default: 1)"
+        "--jobs", "-j", type=_positive, default=1, metavar="N", help="Runs at the same time (default: 1)."
     )
-    parser.add_argument("--map", type=Path, metavar="YAML", help="map for all logs (default: /map in each)")
-    parser.add_argument("--mode", choices=("auto", "localise", "slam"), default="auto")
-    start = parser.add_mutually_exclusive_group()
-    start.add_argument("--initial-pose", type=pose, metavar="X,Y,YAW", help="start of all runs")
-    start.add_argument("--unknown-start", action="store_true", help="search the whole map")
-    group = parser.add_argument_group("what to vary")
-    group.add_argument("--seeds", type=seeds, default=(0,), metavar="LIST", help="such as 0,1,2 or 0-9 (default: 0)")
+    group = parser.add_argument_group("what to vary, besides --preset, --config, --matcher and --mapper")
+    group.add_argument("--seeds", type=seeds, default=(0,), metavar="LIST", help="Seeds: 0,1,2 or 0-9 (default: 0).")
     group.add_argument(
-        "--preset", action="append", choices=("default", "paper", "paper-literal"), help="may be repeated"
-    )
-    group.add_argument("--config", action="append", type=Path, metavar="FILE", help="may be repeated")
-    group.add_argument("--matcher", action="append", choices=MATCHERS, help="may be repeated")
-    group.add_argument(
-        "--vary", action="append", default=[], metavar="KEY=V1,V2", help="a parameter, such as hide.budget=200,400"
-    )
+        "--vary", action="append", default=[], metavar="KEY=V1,V2",
+        help="Values of one parameter, such as hide.budget=200,400; may be repeated.",
+    )  # fmt: skip
     output = parser.add_mutually_exclusive_group()
-    output.add_argument("--json", action="store_true", help="print the table as JSON")
-    output.add_argument("--csv", action="store_true", help="print the table as CSV")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print the table only")
-    add_read_arguments(parser)
+    output.add_argument("--json", action="store_true", help="Print the table as JSON.")
+    output.add_argument("--csv", action="store_true", help="Print the table as CSV.")
+    parser.add_argument("-q", "--quiet", action="store_true", help="Print the table only.")
+    add_no_progress(parser)
+    add_options(parser, "sweep")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Sweep; 1 where a run failed, else 3 where part of an input was lost."""
+    """Sweep; 1 where a run failed, else 4 where one keeps a limit not, else 3 where part of an input was lost."""
     from hsloc.cli.main import EXIT_DATA_LOST, EXIT_FAILED, EXIT_OK
     from hsloc.errors import OutputError
     from hsloc.sweep.process_pool import sweep_in_processes
     from hsloc.sweep.runs import FAILED, plan
     from hsloc.sweep.table import as_csv, as_json, as_text
 
-    runs = plan(
-        arguments.log,
-        configs(arguments),
-        arguments.seeds,
-        map_path=arguments.map,
-        read=read_options(arguments),
-        initial_pose=to_pose(arguments.initial_pose),
-        unknown_start=arguments.unknown_start,
-        mode=arguments.mode,
-    )
+    common = {name: value for name, value in values(arguments).items() if not BY_NAME[name].varied and name != "set"}
+    runs = plan(arguments.log, configs(arguments), arguments.seeds, **common)
     folder: Path = arguments.out
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -96,29 +85,31 @@ def run(arguments: argparse.Namespace) -> int:
     return EXIT_DATA_LOST if any(outcome.data_lost for outcome in outcomes) else EXIT_OK
 
 
-def configs(arguments: argparse.Namespace) -> dict[str, Config]:
-    """All configurations by a label: presets x files x matchers x the values of --vary."""
-    from dataclasses import replace
+def configs(arguments: argparse.Namespace) -> dict[str, tuple[str, Config]]:
+    """All configurations, with their presets, by a label: presets x files x matchers x mappers x values of --vary."""
+    from hsloc.config import combined, preset
 
-    from hsloc.config import load, preset
-
-    found = {name: preset(name) for name in arguments.preset or ["default"]}
-    if arguments.config:
-        found = {_label(n, p.stem, arguments.preset): load(p, c) for n, c in found.items() for p in arguments.config}
-    if arguments.matcher:
-        names = list(dict.fromkeys("harmony_search" if name == "hs" else name for name in arguments.matcher))
-        given = arguments.preset or arguments.config
-        found = {_label(n, m, given): replace(c, matcher=m) for n, c in found.items() for m in names}
-    named = bool(arguments.preset or arguments.config or arguments.matcher)
-    for text in arguments.vary:
-        key, values = varied(text)
-        found = {
-            _label(name, f"{key}={value}", named): _changed(config, key, value)
-            for name, config in found.items()
-            for value in values
-        }
-        named = True
-    return found
+    found: dict[str, tuple[str, Config]] = {name: (name, preset(name)) for name in arguments.preset or ["default"]}
+    named = bool(arguments.preset)
+    matchers = list(dict.fromkeys(MATCHER_ALIASES.get(name, name) for name in arguments.matcher or ()))
+    mappers = list(dict.fromkeys(arguments.mapper or ()))
+    variants: list[list[tuple[str, dict[str, Any]]]] = [
+        [(path.stem, {"source": path}) for path in arguments.config or ()],
+        [(name, {"chosen": {"matcher": name}}) for name in matchers],
+        [(name, {"chosen": {"mapper": name}}) for name in mappers],
+    ]
+    for key, vary in map(varied, arguments.vary):
+        variants.append([(f"{key}={value}", {"settings": [f"{key}={json.dumps(value)}"]}) for value in vary])
+    for choices in variants:
+        if choices:
+            found = {
+                _label(label, added, named): (base, combined(config, **change))
+                for label, (base, config) in found.items()
+                for added, change in choices
+            }
+            named = True
+    settings = arguments.set or ()
+    return {label: (base, combined(config, settings=settings)) for label, (base, config) in found.items()}
 
 
 def _label(before: str, added: str, keep: object) -> str:
@@ -140,15 +131,6 @@ def varied(text: str) -> tuple[str, list[Any]]:
     if not sign or not key or not parsed:
         raise ConfigError(f"--vary {text}: is not KEY=V1,V2 (such as hide.budget=200,400)")
     return key, parsed
-
-
-def _changed(config: Config, key: str, value: Any) -> Config:
-    from hsloc.config import Config, from_dict
-
-    nested: Any = value
-    for part in reversed(key.split(".")):
-        nested = {part: nested}
-    return from_dict(Config, nested, config, "--vary")
 
 
 def seeds(text: str) -> tuple[int, ...]:

@@ -98,7 +98,7 @@ def seconds(stamps_ns: Stamps) -> Floats:
 
 
 def interpolate_poses(trajectory: Trajectory, stamps_ns: Stamps) -> Floats:
-    """Poses at any stamps, shape (n, 3): straight in x and y, the short way round in theta, held at the ends.
+    """Poses at any stamps, shape (n, 3): linear in x and y, by the smaller angle in theta, held at the ends.
 
     At the very stamp of several poses the first of them counts.
     """
@@ -121,7 +121,7 @@ def _nearest(leading: Floats, other: Floats, limit: float) -> tuple[Indices, Ind
     """Rows of `leading` that have a partner within `limit` seconds, and their partners in `other`.
 
     Where `other` is sorted, the earlier of two equally near partners wins (and the last of equal stamps); where
-    it is not, the one that stands first in the file. Both are what evo does.
+    it is not, the one that is first in the file. Both are what evo does.
     """
     if np.all(np.diff(other) >= 0.0):
         partners, near = _nearest_sorted(leading, other, limit)

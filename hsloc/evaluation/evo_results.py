@@ -1,7 +1,7 @@
 """Results as evo saves them (`evo_ape --save_results`), for `evo_res` and whatever else reads its zip files.
 
 One file holds one measure of one estimate: `info.json` (title, names), `stats.json`, the error of each pair in
-`error_array.npy`, and where each stands: `timestamps.npy` and `seconds_from_start.npy` (s), `distances_from_start.npy`
+`error_array.npy`, and its place: `timestamps.npy` and `seconds_from_start.npy` (s), `distances_from_start.npy`
 and `distances.npy` (m along reference and estimate); `alignment_transformation_sim3.npy` (4, 4) where one was moved.
 """
 
@@ -107,12 +107,12 @@ def _places(
     return {
         "seconds_from_start": (times - times[0])[-count:],
         "timestamps": times[-count:],
-        "distances_from_start": _way(reference[rows])[-count:],
-        "distances": _way(estimate[rows])[-count:],
+        "distances_from_start": _path_lengths(reference[rows])[-count:],
+        "distances": _path_lengths(estimate[rows])[-count:],
     }
 
 
-def _way(poses: Floats) -> Floats:
+def _path_lengths(poses: Floats) -> Floats:
     steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
     return np.concatenate(((0.0,), np.cumsum(steps)))
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from math import isfinite, log, nan, pi
+from dataclasses import dataclass
+from math import log, nan, pi
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from hsloc.dataclass_json import Measured
 from hsloc.errors import EvaluationError
 from hsloc.model import IDENTITY
 
@@ -21,31 +21,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Residuals:
-    """Distances of scan points to the nearest wall of the final map: metres; NaN where `count` is 0."""
-
-    median: float
-    p95: float
-    mean: float
-    count: int
-
-    @staticmethod
-    def of(distances: Floats) -> Residuals:
-        """Of distances in metres, of any shape; those that are not finite are left out."""
-        known = distances[np.isfinite(distances)]
-        if len(known) == 0:
-            return Residuals(nan, nan, nan, 0)
-        median, p95 = np.percentile(known, (50.0, 95.0))
-        return Residuals(float(median), float(p95), float(known.mean()), len(known))
-
-    def to_dict(self) -> dict[str, float | int | None]:
-        """For JSON: NaN becomes None."""
-        return _plain(asdict(self))
-
-
-@dataclass(frozen=True, slots=True)
 class Crispness:
-    """How sharply the walls of a map are drawn; a pose that is wrong by little blurs them or doubles them.
+    """Sharpness of the walls of a map: small errors of the poses blur walls or double them.
 
     Around each occupied cell, the occupied cells within `radius` form a small cloud with a covariance.
 
@@ -61,17 +38,20 @@ class Crispness:
     registration methods for sparse 3D laser scans", ECMR 2015.
     """
 
-    wall_thickness_median: float
-    wall_thickness_mean: float
-    wall_thickness_p95: float
-    mean_map_entropy: float
-    occupancy_entropy: float
+    wall_thickness_median: Measured
+    """Median thickness of the walls [m]."""
+    wall_thickness_mean: Measured
+    """Mean thickness of the walls [m]."""
+    wall_thickness_p95: Measured
+    """Thickness that 95 of 100 wall cells stay below [m]."""
+    mean_map_entropy: Measured
+    """Mean map entropy [nats]; lower is crisper."""
+    occupancy_entropy: Measured
+    """Mean entropy of the occupancy near walls, from 0 to 1 [bits]."""
     radius: float
+    """Radius around a cell in which its neighbours are considered [m]."""
     occupied_cells: int
-
-    def to_dict(self) -> dict[str, float | int | None]:
-        """For JSON: NaN becomes None."""
-        return _plain(asdict(self))
+    """Number of occupied cells."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,18 +62,22 @@ class MapComparison:
     the true walls has a wall of the map within `tolerance` (a wall that no scan has seen counts as missed).
     """
 
-    precision: float
+    precision: Measured
+    """Fraction of the map's occupied cells within the tolerance of an occupied cell of the true map, from 0 to 1."""
     recall: float
+    """Fraction of the true map's occupied cells within the tolerance of one of the map, from 0 to 1."""
     f1: float
-    mean_distance_to_truth: float
-    mean_distance_from_truth: float
+    """Harmonic mean of precision and recall, from 0 to 1."""
+    mean_distance_to_truth: Measured
+    """Mean distance from the map's occupied cells to the nearest of the true map [m]."""
+    mean_distance_from_truth: Measured
+    """Mean distance from the true map's occupied cells to the nearest of the map [m]."""
     tolerance: float
+    """Tolerance of precision and recall [m]."""
     map_cells: int
+    """Number of occupied cells of the map."""
     true_cells: int
-
-    def to_dict(self) -> dict[str, float | int | None]:
-        """For JSON: NaN becomes None."""
-        return _plain(asdict(self))
+    """Number of occupied cells of the true map."""
 
 
 def compare_maps(
@@ -149,6 +133,8 @@ def crispness(grid: OccupancyGrid, *, radius: float = 0.3) -> Crispness:
 
 def _nearest_distances(points: Floats, others: Floats) -> Floats:
     """Distance of each point (n, 2) to the nearest of others (m, 2), shape (n,)."""
+    from scipy.spatial import cKDTree
+
     return np.asarray(cKDTree(others).query(points)[0], dtype=np.float64)
 
 
@@ -191,7 +177,3 @@ def _occupancy_entropy(grid: OccupancyGrid, walls: NDArray[np.bool_], offsets: N
     q = np.where(certain, 0.5, p)
     bits = np.where(certain, 0.0, -(q * np.log2(q) + (1.0 - q) * np.log2(1.0 - q)))
     return float(bits.mean())
-
-
-def _plain(values: dict[str, float | int]) -> dict[str, float | int | None]:
-    return {name: value if isfinite(value) else None for name, value in values.items()}

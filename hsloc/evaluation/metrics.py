@@ -4,45 +4,46 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.atomic_write import write_text_atomically
+from hsloc.dataclass_json import to_json
 from hsloc.errors import EvaluationError
 from hsloc.evaluation.alignment import Alignment, align, parse_alignment
-from hsloc.evaluation.ape import ape, axis_rmse
 from hsloc.evaluation.association import AssociationMethod, associate
 from hsloc.evaluation.rpe import Delta, rpe
+from hsloc.evaluation.statistics import PoseErrors, PoseStatistics
+from hsloc.model import wrap_angles
 from hsloc.model.pose2 import compose_poses
+from hsloc.trajectory_io.tum import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from numpy.typing import NDArray
+
     from hsloc.evaluation.association import Pairs
-    from hsloc.evaluation.statistics import PoseErrors, PoseStatistics
     from hsloc.model import Pose2, Trajectory
 
-PER_FRAME, PER_METRE, PER_SECOND = Delta(1.0, "frames"), Delta(1.0, "m"), Delta(1.0, "s")
+    Floats = NDArray[np.float64]
+
+DELTAS = (Delta(1.0, "frames"), Delta(1.0, "m"), Delta(1.0, "s"))
+_MIN_PAIRED = 0.5
+"""Fraction of the sparser trajectory's poses that must have a partner within 10 ms."""
 
 
 @dataclass(frozen=True, slots=True)
 class RelativeError:
     """RPE over pieces of one length; the statistics are NaN where the path is shorter than one piece."""
 
-    delta: Delta
-    statistics: PoseStatistics
-
-    def to_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return {
-            "delta": self.delta.value,
-            "delta_unit": self.delta.unit,
-            "all_pairs": self.delta.all_pairs,
-            **self.statistics.to_dict(),
-        }
+    delta: Delta = field(metadata={"inline": True})
+    """Length of a piece."""
+    statistics: PoseStatistics = field(metadata={"inline": True})
+    """Statistics of the errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +67,7 @@ class Evaluation:
     def to_dict(self) -> dict[str, object]:
         """For JSON: the first RPE is called "rpe", a further one by its length, as "rpe_1m"."""
         moved = self.T_reference_estimate
-        further = {f"rpe_{error.delta.value:g}{error.delta.unit}": error.to_dict() for error in self.rpe[1:]}
+        further = {f"rpe_{error.delta.value:g}{error.delta.unit}": to_json(error) for error in self.rpe[1:]}
         return {
             "alignment": self.alignment,
             "alignment_transform": {"x": moved.x, "y": moved.y, "theta": moved.theta},
@@ -76,8 +77,8 @@ class Evaluation:
             "matched": self.matched,
             "unmatched_reference": self.unmatched_reference,
             "unmatched_estimate": self.unmatched_estimate,
-            "ape": self.ape.to_dict(),
-            **({"rpe": self.rpe[0].to_dict()} if self.rpe else {}),
+            "ape": to_json(self.ape),
+            **({"rpe": to_json(self.rpe[0])} if self.rpe else {}),
             **further,
             "axis_rmse": dict(zip(("x", "y", "theta"), self.axis_rmse, strict=True)),
             "path_length": {"reference": self.length_reference, "estimate": self.length_estimate},
@@ -88,13 +89,57 @@ class Evaluation:
 class Comparison:
     """An estimate paired with its reference and moved onto it, with the error of each pair.
 
-    `pairs` holds the estimate as it came; `aligned` (n, 3) are its poses in the reference's frame.
+    `pairs` holds the estimate as it came; `aligned` (n, 3) are its poses in the reference's frame. The other fields
+    are how it was paired and aligned, and the lengths of both trajectories (m).
     """
 
     pairs: Pairs
+    alignment: Alignment
+    association: AssociationMethod
+    max_difference_s: float
+    offset_s: float
+    length_reference: float
+    length_estimate: float
     T_reference_estimate: Pose2
-    aligned: np.ndarray[tuple[int, int], np.dtype[np.float64]]
+    aligned: Floats
     errors: PoseErrors
+
+    def evaluation(self, deltas: tuple[Delta, ...] = DELTAS) -> Evaluation:
+        """The statistics of the errors, with RPE over pieces of each of `deltas`."""
+        pairs = self.pairs
+        return Evaluation(
+            alignment=self.alignment,
+            T_reference_estimate=self.T_reference_estimate,
+            association=self.association,
+            max_difference_s=self.max_difference_s,
+            offset_s=self.offset_s,
+            matched=len(pairs),
+            unmatched_reference=pairs.unmatched_reference,
+            unmatched_estimate=pairs.unmatched_estimate,
+            ape=self.errors.statistics(),
+            rpe=tuple(RelativeError(delta, rpe(pairs, delta).statistics()) for delta in deltas),
+            axis_rmse=axis_rmse(pairs.reference, self.aligned),
+            length_reference=self.length_reference,
+            length_estimate=self.length_estimate,
+        )
+
+
+def ape(reference: Floats, estimate: Floats) -> PoseErrors:
+    """Absolute pose errors (evo's `evo_ape`) of poses (n, 3) against reference poses (n, 3), row by row."""
+    return PoseErrors.of(_axis_errors(reference, estimate))
+
+
+def axis_rmse(reference: Floats, estimate: Floats) -> tuple[float, float, float]:
+    """RMSE of x (m), y (m) and theta (rad, wrapped): the figures of [P]'s experiments, which did not wrap."""
+    x, y, theta = np.sqrt(np.square(_axis_errors(reference, estimate)).mean(axis=0))
+    return float(x), float(y), float(theta)
+
+
+def _axis_errors(reference: Floats, estimate: Floats) -> Floats:
+    """Estimate minus reference, (n, 3): x and y in metres along the map's axes, theta in radians, wrapped."""
+    errors = estimate - reference
+    errors[:, 2] = wrap_angles(errors[:, 2])
+    return errors
 
 
 def compare(
@@ -111,7 +156,37 @@ def compare(
     pairs = associate(reference, estimate, max_difference_s=max_difference_s, method=association, offset_s=offset_s)
     moved = align(pairs.reference, pairs.estimate, chosen)
     aligned = pairs.estimate if chosen == "none" else compose_poses(moved.to_array(), pairs.estimate)
-    return Comparison(pairs, moved, aligned, ape(pairs.reference, aligned))
+    return Comparison(
+        pairs=pairs,
+        alignment=chosen,
+        association=association,
+        max_difference_s=max_difference_s,
+        offset_s=offset_s,
+        length_reference=reference.length(),
+        length_estimate=estimate.length(),
+        T_reference_estimate=moved,
+        aligned=aligned,
+        errors=ape(pairs.reference, aligned),
+    )
+
+
+def compare_run(estimate: Trajectory, reference: Trajectory, *, alignment: str = "none") -> Comparison:
+    """`compare` with the pairing that suits the two rates; raises `EvaluationError` as it does.
+
+    The nearest pose within 10 ms, as evo does, if at least half of the sparser trajectory's poses have one. Else the
+    denser one is interpolated, across gaps of up to a second: a reference at 1 Hz has no pose within 10 ms of one of a
+    robot's that was seen at 7 Hz.
+    """
+    try:
+        found = compare(estimate, reference, alignment=alignment)
+        if len(found.pairs) >= _MIN_PAIRED * min(len(reference), len(estimate)):
+            return found
+    except EvaluationError:
+        pass
+    denser = max(estimate, reference, key=len)
+    usual = float(np.median(np.diff(np.sort(denser.stamps_ns)))) / NS_PER_S if len(denser) > 1 else 0.0
+    gap = min(max(0.75 * usual, 0.01), 1.0)
+    return compare(estimate, reference, alignment=alignment, association="interpolation", max_difference_s=gap)
 
 
 def evaluate(
@@ -122,7 +197,7 @@ def evaluate(
     max_difference_s: float = 0.01,
     association: AssociationMethod = "nearest",
     offset_s: float = 0.0,
-    deltas: tuple[Delta, ...] = (PER_FRAME, PER_METRE, PER_SECOND),
+    deltas: tuple[Delta, ...] = DELTAS,
 ) -> Evaluation:
     """Compare an estimate with a reference: APE, RPE over pieces of each of `deltas`, RMSE of each axis.
 
@@ -130,30 +205,14 @@ def evaluate(
     `max_difference_s` seconds after `offset_s` has been added to the estimate's stamps. The figures equal
     those of `evo_ape` and `evo_rpe`. Raises `EvaluationError` where nothing matches or an argument is unknown.
     """
-    result = compare(
+    return compare(
         estimate,
         reference,
         alignment=alignment,
         max_difference_s=max_difference_s,
         association=association,
         offset_s=offset_s,
-    )
-    pairs = result.pairs
-    return Evaluation(
-        alignment=parse_alignment(alignment),
-        T_reference_estimate=result.T_reference_estimate,
-        association=association,
-        max_difference_s=max_difference_s,
-        offset_s=offset_s,
-        matched=len(pairs),
-        unmatched_reference=pairs.unmatched_reference,
-        unmatched_estimate=pairs.unmatched_estimate,
-        ape=result.errors.statistics(),
-        rpe=tuple(RelativeError(delta, rpe(pairs, delta).statistics()) for delta in deltas),
-        axis_rmse=axis_rmse(pairs.reference, result.aligned),
-        length_reference=reference.length(),
-        length_estimate=estimate.length(),
-    )
+    ).evaluation(deltas)
 
 
 def format_json(values: Mapping[str, object]) -> str:

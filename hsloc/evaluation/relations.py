@@ -1,17 +1,18 @@
-"""The relations metric [K]: does the path know how places lie to each other that a human has checked?
+"""The relations metric [K]: errors of relative poses that were verified by hand
 
 R. Kümmerle et al., "On measuring the accuracy of SLAM algorithms", Autonomous Robots 27, 2009. It needs no
-alignment, and does not punish one early error for ever after.
+alignment, and one early error does not count in all later poses.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.dataclass_json import to_json
 from hsloc.errors import EvaluationError
 from hsloc.evaluation.association import interpolate_poses
 from hsloc.evaluation.statistics import PoseErrors, PoseStatistics
@@ -39,15 +40,19 @@ class Relations:
 
 @dataclass(frozen=True, slots=True)
 class RelationsResult:
-    """Statistics over the relations whose two poses the trajectory has; [K] states mean and std."""
+    """Errors of the relations whose two poses the trajectory has; [K] states mean and std."""
 
-    statistics: PoseStatistics
     matched: int
+    """Number of relations whose two poses the trajectory has."""
     unmatched: int
+    """Number of the other relations."""
+    statistics: PoseStatistics = field(metadata={"inline": True})
+    """Statistics of the errors."""
 
     def to_dict(self) -> dict[str, object]:
         """For JSON."""
-        return {"matched": self.matched, "unmatched": self.unmatched, **self.statistics.to_dict()}
+        result: dict[str, object] = to_json(self)
+        return result
 
 
 def read_relations(path: str | Path) -> Relations:
@@ -78,12 +83,12 @@ def read_relations(path: str | Path) -> Relations:
 def evaluate_relations(trajectory: Trajectory, relations: Relations, *, max_gap_s: float = 1.0) -> RelationsResult:
     """Score a trajectory by relations: e = relation^-1 * (pose(t1)^-1 * pose(t2)).
 
-    The pose at a stamp is the one with that very stamp (the last of several, the wisest of an estimator);
+    The pose at a stamp is the one with that very stamp (the last of several, which an estimator has corrected most);
     else it is interpolated between neighbours at most `max_gap_s` apart; else the relation is unmatched.
     Raises `EvaluationError` where no relation matches.
     """
     errors = relation_errors(trajectory, relations, max_gap_s=max_gap_s)
-    return RelationsResult(errors.statistics(), len(errors), len(relations) - len(errors))
+    return RelationsResult(len(errors), len(relations) - len(errors), errors.statistics())
 
 
 def relation_errors(trajectory: Trajectory, relations: Relations, *, max_gap_s: float = 1.0) -> PoseErrors:
@@ -107,7 +112,7 @@ def relation_errors(trajectory: Trajectory, relations: Relations, *, max_gap_s: 
 def _poses_at(
     trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Poses (n, 3) at stamps, and which of them can be believed."""
+    """Poses (n, 3) at stamps, and which of them are known."""
     ordered = trajectory.sorted()
     times = ordered.stamps_ns
     # The last pose at or before each stamp, and the first after it.

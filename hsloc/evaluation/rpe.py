@@ -6,7 +6,7 @@ estimate, as evo does by default.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
@@ -38,9 +38,12 @@ class Delta:
     Raises `EvaluationError` for a length that is not positive, or a part of a frame.
     """
 
-    value: float = 1.0
-    unit: DeltaUnit = "frames"
+    value: float = field(default=1.0, metadata={"key": "delta"})
+    """Length of a piece, in `delta_unit`."""
+    unit: DeltaUnit = field(default="frames", metadata={"key": "delta_unit"})
+    """Unit of the length: frames (pairs), m (path) or s."""
     all_pairs: bool = False
+    """Whether a piece starts at every pose; else the pieces follow each other."""
 
     def __post_init__(self) -> None:
         if self.unit not in DELTA_UNITS:
@@ -79,7 +82,7 @@ def pieces(pairs: Pairs, delta: Delta) -> tuple[Indices, Indices]:
 
 
 def _pieces_end_to_end(steps: NDArray[np.float64], length: float) -> tuple[Indices, Indices]:
-    """Cut as soon as the steps since the last cut add up to `length`, and start afresh there."""
+    """Cut as soon as the steps since the last cut add up to `length`, and start again there."""
     cuts = [0]
     gone = 0.0
     for row, step in enumerate(steps.tolist(), start=1):
@@ -92,15 +95,15 @@ def _pieces_end_to_end(steps: NDArray[np.float64], length: float) -> tuple[Indic
 
 
 def _all_pieces(steps: NDArray[np.float64], length: float) -> tuple[Indices, Indices]:
-    """From every row to the later row (the first of several) whose way from it is nearest to `length`."""
-    way = np.concatenate(((0.0,), np.cumsum(steps)))
-    starts = np.arange(len(way) - 1)
-    after = np.clip(np.searchsorted(way, way[starts] + length, side="left"), starts + 1, len(way) - 1)
-    # Where the robot stands, many rows share one way: the first row of the plateau, but after the start.
-    before = np.maximum(np.searchsorted(way, way[after - 1], side="left"), starts + 1)
-    after = np.maximum(np.searchsorted(way, way[after], side="left"), starts + 1)
-    miss_before = np.abs(way[before] - way[starts] - length)
-    miss_after = np.abs(way[after] - way[starts] - length)
+    """From every row to the later row (the first of several) whose path length from it is nearest to `length`."""
+    path = np.concatenate(((0.0,), np.cumsum(steps)))
+    starts = np.arange(len(path) - 1)
+    after = np.clip(np.searchsorted(path, path[starts] + length, side="left"), starts + 1, len(path) - 1)
+    # Where the robot stands still, many rows share one path length: the first row of the plateau, but after the start.
+    before = np.maximum(np.searchsorted(path, path[after - 1], side="left"), starts + 1)
+    after = np.maximum(np.searchsorted(path, path[after], side="left"), starts + 1)
+    miss_before = np.abs(path[before] - path[starts] - length)
+    miss_after = np.abs(path[after] - path[starts] - length)
     ends = np.where(miss_before <= miss_after, before, after)
     near = np.minimum(miss_before, miss_after) <= RELATIVE_TOLERANCE * length
     return starts[near], ends[near]

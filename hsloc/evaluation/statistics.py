@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from math import isfinite, nan
+from dataclasses import dataclass
+from math import nan
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from hsloc.dataclass_json import Measured
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -14,19 +16,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Of a column of errors; all in the errors' unit but `sse` (its square). NaN where `count` is 0.
+    """Statistics of errors, in the errors' unit; NaN (null in JSON) where there is no error.
 
     `std` is the population's (divided by n), as numpy and evo have it.
     """
 
-    rmse: float
-    mean: float
-    median: float
-    std: float
-    min: float
-    max: float
-    sse: float
+    rmse: Measured
+    """Root mean square."""
+    mean: Measured
+    """Mean."""
+    median: Measured
+    """Median."""
+    std: Measured
+    """Standard deviation of the population."""
+    min: Measured
+    """Smallest error."""
+    max: Measured
+    """Largest error."""
+    sse: Measured
+    """Sum of squares, in the square of the errors' unit."""
     count: int
+    """Number of errors."""
 
     @staticmethod
     def of(errors: NDArray[np.float64]) -> Statistics:
@@ -44,10 +54,6 @@ class Statistics:
             sse=float(squares.sum()),
             count=len(errors),
         )
-
-    def to_dict(self) -> dict[str, float | int | None]:
-        """For JSON: NaN becomes None."""
-        return {name: value if isfinite(value) else None for name, value in asdict(self).items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +81,6 @@ class PoseStatistics:
     """Statistics of translation (m) and of absolute rotation (deg)."""
 
     trans_part: Statistics
+    """Translation [m]."""
     angle_deg: Statistics
-
-    def to_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return {"trans_part": self.trans_part.to_dict(), "angle_deg": self.angle_deg.to_dict()}
+    """Absolute rotation [deg]."""

@@ -6,9 +6,10 @@ import platform
 import shlex
 from hashlib import file_digest
 from importlib import metadata
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from hsloc.config import dump
+from hsloc.config import dump, preset
+from hsloc.options import OPTIONS, written
 from hsloc.replay.map_sources import map_files
 from hsloc.report.html import Provenance
 from hsloc.version import __version__
@@ -16,7 +17,6 @@ from hsloc.version import __version__
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from hsloc.model.pose2 import Pose2
     from hsloc.replay.run import Result
     from hsloc.request import RunRequest
 
@@ -38,43 +38,42 @@ def _sha256(path: Path) -> str:
         return file_digest(stream, "sha256").hexdigest()
 
 
-def command(spec: RunRequest) -> str:
-    """The command line that repeats the run, with the config.yaml of its results."""
-    words = ["hsloc", "replay", *spec.names()]
-    read = spec.read
-    flags: tuple[tuple[str, object], ...] = (
-        ("--mode", None if spec.mode == "auto" else spec.mode),
-        ("--map", None if spec.map_path is None else spec.map_path.name),
-        ("--resume", None if spec.resume is None else spec.resume.name),
-        ("--initial-pose", _pose(spec.initial_pose)),
-        ("--scan-topic", read.scan_topic),
-        ("--odom-topic", read.odom_topic),
-        ("--truth-topic", read.truth_topic),
-        ("--reference", spec.reference),
-        ("--base-frame", read.base_frame),
-        ("--laser-pose", _pose(read.laser_pose)),
-        ("--start", read.start_s),
-        ("--end", read.end_s),
-    )
-    words += [f"{flag}={value}" for flag, value in flags if value is not None]
-    if spec.unknown_start:
-        words.append("--unknown-start")
-    if read.deskew:
-        words.append("--deskew")
-    if spec.no_odometry:
-        words.append("--no-odom")
-    return shlex.join([*words, "--config=config.yaml", f"--seed={spec.seed}"])
+def command(request: RunRequest) -> str:
+    """The command line that repeats the run, in the folder in which it was made; but for --out it is complete.
+
+    With an own matcher, or the server's files (`bare_names`), it says what to put in.
+    """
+    values = request.to_values()
+    words = ["hsloc", "replay", *request.paths()]
+    for option in OPTIONS:
+        if option.place != "check":
+            words += written(option, _default_matcher(option.name, values))
+    return " ".join(_quoted(word) for word in words)
+
+
+def _default_matcher(name: str, values: dict[str, Any]) -> Any:
+    """Matcher and mapper are named only where they are not the preset's."""
+    if name in ("matcher", "mapper") and values[name] == getattr(preset(values["preset"]), name):
+        return None
+    return values.get(name)
+
+
+def _quoted(word: str) -> str:
+    """A word for bash on one line; bytes of a name that are no UTF-8, and control characters, as `$'\\xfc'`."""
+    if word.isprintable():
+        return shlex.quote(word)
+    plain = word.replace("\\", "\\\\").replace("'", "\\'")
+    octets = plain.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return "$'" + "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in octets) + "'"
 
 
 def config_text(result: Result) -> str:
     """The effective configuration; what else is needed to repeat the run stands above it."""
+    own = result.spec.own_matcher
     lines = [
         f"# hsloc {__version__}; run it again with: {command(result.spec)}",
+        *([] if own is None else [f"# matcher of the caller's own: {type(own).__name__}"]),
         f"# preset: {result.spec.preset}",
         f"# input sha256: {result.input_sha256}",
     ]
     return "\n".join(lines) + "\n" + dump(result.spec.config)
-
-
-def _pose(pose: Pose2 | None) -> str | None:
-    return None if pose is None else f"{pose.x!r},{pose.y!r},{pose.theta!r}"

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hsloc.analysis.quality_warnings import doubts
-from hsloc.analysis.run_metrics import metrics, timings
+from hsloc.analysis import Analysis, analyse, run_timings
 from hsloc.errors import OutputError
 from hsloc.evaluation import write_json, write_tum
 from hsloc.export.provenance import config_text, provenance
-from hsloc.export.run_mcap import write_recording
+from hsloc.export.run_mcap import RunRecording
 from hsloc.maps import save_map
 from hsloc.report.html import write_report_html
 from hsloc.report.png import draw_report
@@ -26,11 +27,23 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hsloc.replay.run import Result
-
-__all__ = ["metrics", "timings", "write_recording", "write_results"]
+    from hsloc.run_metrics import RunMetrics, RunTimings
 
 _OF_RESULTS = (("metrics.json", "config.yaml"), ("results.json", "report.md"))
-"""What tells a folder of results, of a run or of the report's experiments, from anything else."""
+"""Files that a folder of results holds, of a run or of the reproduced experiments, and no other folder."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WrittenResults:
+    """What was written: the analysis of the run, and its wall times."""
+
+    analysis: Analysis
+    timings: RunTimings
+
+    @property
+    def metrics(self) -> RunMetrics:
+        """The content of metrics.json."""
+        return self.analysis.metrics
 
 
 def write_results(
@@ -38,11 +51,9 @@ def write_results(
     folder: Path,
     *,
     overwrite: bool = False,
-    alignment: str | None = None,
-    relations: Path | None = None,
     progress: Callable[[float], None] | None = None,
-) -> dict[str, object]:
-    """Write the result into `folder`, which must not exist yet unless `overwrite`; returns the metrics.
+) -> WrittenResults:
+    """Analyse the result and write it into `folder`, which must not exist yet unless `overwrite`.
 
     Raises OutputError if the folder is there already, or cannot be written.
     """
@@ -51,7 +62,7 @@ def write_results(
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
         partial.mkdir(parents=True)
-        values = _write(result, partial, alignment, relations, progress)
+        written = _write(result, partial, progress)
         if folder.exists():
             shutil.rmtree(folder)
         partial.rename(folder)
@@ -59,7 +70,7 @@ def write_results(
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return values
+    return written
 
 
 def refuse_folder(folder: Path, overwrite: bool) -> None:
@@ -76,15 +87,12 @@ def refuse_folder(folder: Path, overwrite: bool) -> None:
         raise OutputError(f"{folder}: holds no results of hsloc, so it is not overwritten; choose another --out")
 
 
-def _write(
-    result: Result,
-    folder: Path,
-    alignment: str | None,
-    relations: Path | None,
-    progress: Callable[[float], None] | None,
-) -> dict[str, object]:
-    review = write_recording(result, folder / "run.mcap", progress)
-    values = metrics(result, review.residuals, alignment, relations, [*doubts(result), *review.doubts])
+def _write(result: Result, folder: Path, progress: Callable[[float], None] | None) -> WrittenResults:
+    begin = time.perf_counter()
+    with RunRecording(result, folder / "run.mcap") as recording:
+        analysis = analyse(result, observer=recording.add, progress=progress)
+    seconds = {"analyse": time.perf_counter() - begin - recording.seconds, "run_mcap": recording.seconds}
+    begin = time.perf_counter()
     write_tum(folder / "trajectory.tum", result.trajectory)
     if len(result.odometry):
         write_tum(folder / "odometry.tum", result.odometry)
@@ -96,19 +104,23 @@ def _write(
         result.mapping.graph.write_g2o(folder / "graph.g2o")
         if result.mapping.state is not None:
             write_state(result.mapping.state, folder / STATE_FILE)
-    write_json(folder / "metrics.json", values)
-    write_json(folder / "timings.json", timings(result))
+    write_json(folder / "metrics.json", analysis.metrics.to_json())
     (folder / "config.yaml").write_text(config_text(result), encoding="utf-8")
     shown = {
         "title": " ".join(result.spec.names()),
         "trajectory": result.trajectory,
-        "odometry": result.odometry if len(result.odometry) else None,
+        "localised": result.localised,
+        "odometry": analysis.odometry,
         "reference": result.reference,
         "grid": result.grid,
         "diagnostics": result.diagnostics,
-        "metrics": values,
+        "metrics": analysis.metrics,
+        "comparison": analysis.comparison,
     }
     draw_report(folder / "report.png", **shown)  # type: ignore[arg-type]
-    more = {"provenance": provenance(result), "convergence": review.convergence}
+    more = {"provenance": provenance(result), "convergence": analysis.convergence}
     write_report_html(folder / "report.html", **shown, **more)  # type: ignore[arg-type]
-    return values
+    seconds["reports"] = time.perf_counter() - begin
+    timings = run_timings(result, seconds)
+    write_json(folder / "timings.json", timings.to_json())
+    return WrittenResults(analysis, timings)

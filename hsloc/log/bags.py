@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
+    from hsloc.warnings import RunWarning
+
     class _Reader(Protocol):
         connections: list[Any]
         message_count: int
@@ -43,7 +45,7 @@ class BagContainer:
         self.statistics: dict[int, TopicStatistics] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self.losses_at_opening = Losses()
-        self.warnings: list[str] = []
+        self.warnings: list[RunWarning] = []
         with self._guarded(), self._reader() as reader:
             for number, connection in enumerate(reader.connections):
                 self.channels[number] = self._channel(number, connection)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hsloc.log.summary import Losses, TopicStatistics
+    from hsloc.warnings import RunWarning
 
 RawMessage = tuple[int, int, int, "memoryview | bytes"]
 """(log time in ns, position in the file, id of the channel, payload). Positions are unique in a file."""
@@ -61,7 +62,7 @@ class Container(Protocol):
     @property
     def losses_at_opening(self) -> Losses: ...  # noqa: D102
     @property
-    def warnings(self) -> list[str]: ...  # noqa: D102
+    def warnings(self) -> list[RunWarning]: ...  # noqa: D102
 
     def runs(self, wanted: Collection[int], losses: Losses) -> Iterator[list[RawMessage]]:
         """Messages of the wanted channels, in lists as they come out of the file."""

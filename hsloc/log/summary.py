@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from hsloc.warnings import RunWarning
+
 NANOSECONDS = 1_000_000_000
 
 
@@ -144,7 +146,7 @@ class LogSummary:
     parts: tuple[PartSummary, ...] = ()
     order: str = "stamp"
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[RunWarning, ...] = ()
 
     @property
     def duration_s(self) -> float:

@@ -15,6 +15,7 @@ from hsloc.errors import MapError, OutputError
 from hsloc.maps.metadata import MapMetadata, metadata_text, read_metadata
 from hsloc.model import OccupancyGrid
 from hsloc.model.occupancy_grid import FREE, OCCUPIED, UNKNOWN
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,7 +35,7 @@ class LoadedMap:
     """A map, and what its user should know about it."""
 
     grid: OccupancyGrid
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[RunWarning, ...] = ()
 
 
 class _Pixels(NamedTuple):
@@ -139,7 +140,7 @@ def _cells(metadata: MapMetadata, shade: Plane, opaque: NDArray[np.bool_]) -> ND
     return cells.astype(np.int8)
 
 
-def _warnings(path: Path, metadata: MapMetadata, pixels: _Pixels, grid: OccupancyGrid) -> tuple[str, ...]:
+def _warnings(path: Path, metadata: MapMetadata, pixels: _Pixels, grid: OccupancyGrid) -> tuple[RunWarning, ...]:
     found = []
     probability = pixels.shade if metadata.negate else 1.0 - pixels.shade
     unknown = np.abs(probability - UNKNOWN_PROBABILITY) < 1e-6
@@ -147,11 +148,19 @@ def _warnings(path: Path, metadata: MapMetadata, pixels: _Pixels, grid: Occupanc
         unknown = unknown[pixels.level]
     if metadata.mode == "trinary" and metadata.free_thresh >= UNKNOWN_PROBABILITY and unknown.any():
         found.append(
-            f"{path}: free_thresh {metadata.free_thresh} makes free of {int(unknown.sum())} pixels of value 205, "
-            "which mean unknown; write free_thresh: 0.196 if they do"
+            RunWarning(
+                WarningCode.MAP_UNKNOWN_READ_AS_FREE,
+                f"{path}: free_thresh {metadata.free_thresh} makes {int(unknown.sum())} pixels of value 205 free, "
+                "which usually mean unknown",
+                "write free_thresh: 0.196 if they do",
+            )
         )
     if not grid.occupied().any():
-        found.append(f"{path}: the map has no occupied cell; check negate and occupied_thresh")
+        found.append(
+            RunWarning(
+                WarningCode.MAP_EMPTY, f"{path}: the map has no occupied cell", "check negate and occupied_thresh"
+            )
+        )
     return tuple(found)
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from hsloc.log import LEAST_JUMP, LONGEST_JUMP_S, MAX_SPEED
 from hsloc.model.events import Odometry
 from hsloc.model.pose2 import Pose2, wrap_angle
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -25,7 +26,7 @@ _MOST = 20
 
 
 class ContinuousOdometry:
-    """Events whose odometry goes on where it jumped. To be gone through once; then `doubt` tells what was found."""
+    """Events whose odometry goes on where it jumped. To be gone through once; then `warnings` gives what was found."""
 
     def __init__(self, events: Iterable[Event], topic: str | None = None) -> None:
         self._events = events
@@ -67,18 +68,21 @@ class ContinuousOdometry:
             self._first = (way, (after.stamp_ns - self._start_ns) / 1e9)
         return True
 
-    def doubt(self) -> tuple[str, ...]:
-        """A line for the user, if there were jumps."""
+    def warnings(self) -> tuple[RunWarning, ...]:
+        """A warning if there were jumps."""
         if self._jumps == 0:
             return ()
         way, at = self._first
+        corrected = self._jumps <= _MOST
         what = (
-            "it goes on there as if it had begun anew"
-            if self._jumps <= _MOST
-            else "too often to be mended: poses may be wrong"
+            "it is continued from the pose before each jump"
+            if corrected
+            else "too often to be corrected: poses may be wrong"
         )
-        line = (
-            f"odometry ({self._topic}) jumps ({self._jumps} times, first by {way:.2f} m at {at:.3f} s); {what}; was it "
-            "reset, or do two publishers share the topic?"
+        return (
+            RunWarning(
+                WarningCode.ODOMETRY_RESET if corrected else WarningCode.ODOMETRY_JUMPS,
+                f"odometry ({self._topic}) jumps ({self._jumps} times, first by {way:.2f} m at {at:.3f} s); {what}",
+                "check whether it was reset, or whether two publishers share the topic",
+            ),
         )
-        return (line,)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from hsloc.errors import MapError
 from hsloc.model.events import Odometry
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -23,13 +24,15 @@ _FARTHEST = 5.0
 _OUTSIDE = 5.0
 """A start may lie so far outside the map (m): a robot may look into it from a part that was never drawn."""
 
+_GIVE_START = "give the start with --initial-pose"
 
-def find_start(spec: RunRequest, log: Log, grid: OccupancyGrid) -> tuple[Pose2 | None, tuple[str, ...]]:
-    """T_map_base at the first event, None if it is unknown; and what there is to warn of.
+
+def find_start(spec: RunRequest, log: Log, grid: OccupancyGrid) -> tuple[Pose2 | None, tuple[RunWarning, ...]]:
+    """T_map_base at the first event, None if it is unknown; and warnings.
 
     Raises MapError for a start that is not on the map, and for an unknown one on a map that offers no place.
     """
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[RunWarning, ...] = ()
     start, stated_by = spec.initial_pose, "--initial-pose"
     if start is None and not spec.unknown_start:
         start, warnings = _stated(spec, log)
@@ -55,7 +58,7 @@ def first_odometry(events: Iterable[Event]) -> Pose2 | None:
     return next((event.T_odom_base for event in events if isinstance(event, Odometry)), None)
 
 
-def _stated(spec: RunRequest, log: Log) -> tuple[Pose2 | None, tuple[str, ...]]:
+def _stated(spec: RunRequest, log: Log) -> tuple[Pose2 | None, tuple[RunWarning, ...]]:
     stated = log.initial_pose()
     if stated is None:
         return None, ()
@@ -63,13 +66,19 @@ def _stated(spec: RunRequest, log: Log) -> tuple[Pose2 | None, tuple[str, ...]]:
     begin_ns = log.summary.origin_ns + round(max(spec.read.start_s or 0.0, 0.0) * 1e9)
     if stamp_ns < begin_ns - _STALE_NS:
         age = (begin_ns - stamp_ns) / 1e9
-        return None, (f"the log states a start {age:.1f} s before the first event: not used, the start is unknown",)
+        text = (
+            f"the log states an initial pose {age:.1f} s before the first event; it is not used, the start is unknown"
+        )
+        return None, (RunWarning(WarningCode.START_STALE, text, _GIVE_START),)
     if stamp_ns <= begin_ns + _STALE_NS:
         return T_map_base, ()
     back = _way_back(log.events(), stamp_ns)
     if back is None:
         late = (stamp_ns - begin_ns) / 1e9
-        return None, (f"the log states a start {late:.1f} s late, after the robot moved; it is not used",)
+        text = (
+            f"the log states an initial pose {late:.1f} s after the first event, after the robot moved; it is not used"
+        )
+        return None, (RunWarning(WarningCode.START_LATE, text, _GIVE_START),)
     return T_map_base @ back, ()
 
 

@@ -9,6 +9,7 @@ from hsloc.errors import MapError
 from hsloc.maps import read_map
 from hsloc.maps.metadata import read_metadata
 from hsloc.slam.map_state import STATE_FILE, fingerprint, read_state
+from hsloc.warnings import RunWarning, WarningCode
 
 _MAP_TYPES = ("nav_msgs/msg/OccupancyGrid", "foxglove.Grid")
 _HEAD = 4096
@@ -65,8 +66,8 @@ def unread_maps(summary: LogSummary) -> list[str]:
     return topics if len(topics) < 2 else [f"any of {', '.join(topics)}, of which none is /map"]
 
 
-def load_grid(path: Path) -> tuple[OccupancyGrid, tuple[str, ...]]:
-    """The grid to localise in, and what there is to warn of. Raises MapError."""
+def load_grid(path: Path) -> tuple[OccupancyGrid, tuple[RunWarning, ...]]:
+    """The grid to localise in, and warnings. Raises MapError."""
     file = map_file(path)
     if file.suffix == ".npz":
         return read_state(file).grid, ()
@@ -76,15 +77,16 @@ def load_grid(path: Path) -> tuple[OccupancyGrid, tuple[str, ...]]:
     return loaded.grid, loaded.warnings
 
 
-def load_state(spec: RunRequest) -> tuple[MapState | None, tuple[str, ...]]:
-    """The saved map that is to be extended, if one is, and what there is to warn of. Raises MapError."""
+def load_state(spec: RunRequest) -> tuple[MapState | None, tuple[RunWarning, ...]]:
+    """The saved map that is to be extended, if one is, and warnings. Raises MapError."""
     path = spec.resume
     if path is None:
         return None, ()
     file = state_file(path)
     if not file.exists():
-        raise MapError(f"{path}: no {STATE_FILE} there; --resume wants the results of a run that drew its map")
+        raise MapError(f"{path}: no {STATE_FILE} there; --resume needs the results of a run that built its map")
     state = read_state(file)
     if state.fingerprint != fingerprint(spec.mapping()):
-        return state, (f"{file}: drawn with other parameters of the mapper; those of this run are used from here on",)
+        text = f"{file}: built with other parameters of the mapper; those of this run are used from here on"
+        return state, (RunWarning(WarningCode.MAP_PARAMETERS_DIFFER, text),)
     return state, ()

@@ -6,11 +6,14 @@ import signal
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from os import PathLike
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hsloc.config import preset
 from hsloc.errors import ConfigError, LogError, MapError
+from hsloc.kernels.cache import compilation_reported
 from hsloc.log import LogSummary, Losses, open_log
 from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.matching.window import Window
@@ -24,12 +27,14 @@ from hsloc.replay.initial_pose import find_start, first_odometry
 from hsloc.replay.map_sources import load_grid, load_state, maps_beside, unread_maps
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory
+from hsloc.request import RunRequest
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.parameters import Resume
 from hsloc.slam.point_mapper import PointMapper
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -40,14 +45,16 @@ if TYPE_CHECKING:
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.model.pose2 import Pose2
     from hsloc.replay.engine import Estimator
-    from hsloc.request import RunRequest
     from hsloc.slam.map_state import MapState
     from hsloc.slam.result import MappingResult
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a run is: the phase in a word, seconds of the log done and in all, and the scans so far."""
+    """How far a run is: the phase in a word, seconds of the log done and in all, and the scans so far.
+
+    In the phase "compile", `done_s` is the number of kernels compiled; how many there will be is not known.
+    """
 
     phase: str
     done_s: float
@@ -74,7 +81,7 @@ class Result:
     grid: OccupancyGrid
     diagnostics: ScanDiagnostics
     losses: Losses
-    warnings: tuple[str, ...]
+    warnings: tuple[RunWarning, ...]
     seconds: dict[str, float]
     mode: str = "localise"
     mapping: MappingResult | None = None
@@ -82,35 +89,61 @@ class Result:
     likelihood: LikelihoodField | None = None
 
     @property
+    def matcher_name(self) -> str | None:
+        """The scan matcher that was used; None for the graph mapper, which has its own."""
+        own = self.mode == "slam" and self.spec.config.mapper == "graph"
+        return None if own else self.spec.matcher_name
+
+    @property
     def follows_scans(self) -> bool:
         """Whether the trajectory has a pose for each scan, for want of odometry."""
         return len(self.odometry) == 0
 
 
-def run(spec: RunRequest, progress: Callable[[Progress], None] | None = None) -> Result:
+def run(
+    request: RunRequest | str | PathLike[str] | Sequence[str | PathLike[str]],
+    progress: Callable[[Progress], None] | None = None,
+    **options: Any,
+) -> Result:
     """Replay a log through the localiser or the mapper.
 
-    Raises an `HslocError` for a log, map or configuration that cannot be used.
+    `request` is a RunRequest, or the log, or the parts of one log; then `options` are those of `hsloc.options` by
+    their names, as in `run("run.mcap", map="map.yaml", matcher="icp", seed=3)`. `matcher` may be an object with the
+    method of `hsloc.Matcher`. Raises an `HslocError` for a log, map or option that cannot be used.
     """
+    if not isinstance(request, RunRequest):
+        logs = [request] if isinstance(request, str | PathLike) else request
+        request = RunRequest.from_values(logs, options)
+    elif options:
+        raise ConfigError(f"a RunRequest says it all; put {', '.join(options)} into it")
+    if progress is None:
+        return _run(request, None)
+    report = progress
+    with compilation_reported(lambda count: report(Progress("compile", float(count), 0.0, 0))):
+        return _run(request, progress)
+
+
+def _run(spec: RunRequest, progress: Callable[[Progress], None] | None) -> Result:
     begin = time.perf_counter()
     log = open_log(spec.logs, spec.reading())
     reference = None if spec.reference is None else read_reference(spec.reference, spec.logs)
     grid, warnings = find_map(spec, log)
-    state, remarks = load_state(spec)
-    warnings = (*warnings, *remarks)
+    state, of_state = load_state(spec)
+    warnings = (*warnings, *of_state)
     draws = spec.mode == "slam" or spec.no_odometry or state is not None
     localise = spec.mode == "localise" or (grid is not None and not draws)
     opened = time.perf_counter()
     if progress is not None:
         progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
     if localise:
-        start, doubts = find_start(spec, log, require_map(grid))
-        warnings = (*warnings, *doubts)
+        start, of_start = find_start(spec, log, require_map(grid))
+        warnings = (*warnings, *of_start)
         likelihood = LikelihoodField.from_grid(
             require_map(grid), spec.config.likelihood_field.sigma, spec.config.likelihood_field.margin
         )
         estimator: Estimator = _localiser(spec, require_map(grid), likelihood, start)
     else:
+        require_matcher(spec)
         likelihood, estimator = None, _mapper(spec, state)
     first = None if spec.no_odometry else first_odometry(log.events())
     prepared = time.perf_counter()
@@ -148,7 +181,7 @@ def run(spec: RunRequest, progress: Callable[[Progress], None] | None = None) ->
         grid=require_map(grid),
         diagnostics=history.diagnostics(),
         losses=log.losses,
-        warnings=(*log.summary.warnings, *warnings, *events.doubt()),
+        warnings=(*log.summary.warnings, *warnings, *events.warnings()),
         seconds=seconds,
         mode="localise" if localise else "slam",
         mapping=mapping,
@@ -179,8 +212,8 @@ def _share(progress: Callable[[Progress], None] | None, total: float, scans: int
     return lambda share: progress(Progress("refine", share * total, total, scans))
 
 
-def find_map(spec: RunRequest, log: Log) -> tuple[OccupancyGrid | None, tuple[str, ...]]:
-    """The map that is given or that the log carries, and what there is to warn of."""
+def find_map(spec: RunRequest, log: Log) -> tuple[OccupancyGrid | None, tuple[RunWarning, ...]]:
+    """The map that is given or that the log carries, and warnings."""
     if spec.map_path is not None:
         return load_grid(spec.map_path)
     grid = log.map()
@@ -194,8 +227,9 @@ def find_map(spec: RunRequest, log: Log) -> tuple[OccupancyGrid | None, tuple[st
         raise MapError(f"{spec.logs[0]}: {what}; give one with --map {given}")
     if spec.mode == "slam" or spec.resume is not None or not (unread or beside):
         return None, ()
-    hint = f"{what}, so one is drawn; to localise on a map give it with --map {given}"
-    return None, (hint + ("" if not beside[1:] else f" (also there: {', '.join(p.name for p in beside[1:])})"),)
+    remedy = f"to localise on a map give it with --map {given}"
+    remedy += "" if not beside[1:] else f" (also there: {', '.join(p.name for p in beside[1:])})"
+    return None, (RunWarning(WarningCode.MAP_NOT_USED, f"{what}, so a map is built", remedy),)
 
 
 def require_map(grid: OccupancyGrid | None) -> OccupancyGrid:
@@ -205,37 +239,49 @@ def require_map(grid: OccupancyGrid | None) -> OccupancyGrid:
     return grid
 
 
+def require_matcher(spec: RunRequest) -> None:
+    """Raise ConfigError for a matcher that was asked for and that the graph mapper would not use."""
+    if spec.config.mapper == "graph" and spec.matcher_name != preset(spec.preset).matcher:
+        raise ConfigError(
+            f"the graph mapper has a matcher of its own and would not use {spec.matcher_name}; leave out --matcher, "
+            "or use --mapper point"
+        )
+
+
 def _mapper(spec: RunRequest, state: MapState | None) -> Mapper | PointMapper:
     if spec.config.mapper == "point":
         if spec.no_odometry:
             raise ConfigError("the point mapper predicts with odometry; leave out --no-odom, or use --mapper graph")
-        matcher = spec.config.make_matcher()
         start = IDENTITY if spec.initial_pose is None else spec.initial_pose
-        return PointMapper(matcher, spec.config.point_mapper, np.random.default_rng(spec.seed), start)
-    resume = None if state is None else Resume(state, None if spec.unknown_start else spec.initial_pose)
+        return PointMapper(spec.matcher, spec.config.point_mapper, np.random.default_rng(spec.seed), start)
+    config = spec.config
+    resume = None
+    if state is not None:
+        field = LikelihoodField.from_grid(state.grid, config.likelihood_field.sigma, config.likelihood_field.margin)
+        begin = None if spec.unknown_start else spec.initial_pose
+        resume = Resume(state, field, spec.matcher, config.localiser.relocaliser, begin)
     return Mapper(spec.mapping(), np.random.default_rng(spec.seed), resume)
 
 
 def _localiser(spec: RunRequest, grid: OccupancyGrid, likelihood: LikelihoodField, start: Pose2 | None) -> Estimator:
     from hsloc.localisation.localiser import Localiser
 
-    config = spec.config
     rng = np.random.default_rng(spec.seed)
-    _warm_up(config.make_matcher(), likelihood)
-    return Localiser(grid, likelihood, config.make_matcher(), config.localiser, rng, start)
+    _warm_up(spec.matcher, likelihood)
+    return Localiser(grid, likelihood, spec.matcher, spec.config.localiser, rng, start)
 
 
 def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:
     """Have the kernels compiled (once after an installation, up to a minute) before the clock of the replay starts."""
     points = np.zeros((1, 2))
     window = Window(likelihood.T_map_field, 0.1, 0.1, 0.1)
-    with _uninterrupted():
+    with interrupts_held_back():
         matcher.match(points, likelihood, window, np.random.default_rng(0))
 
 
 @contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Hold back Ctrl-C until the end: a compiler that is thrown out of its work may take the process with it."""
+def interrupts_held_back() -> Iterator[None]:
+    """Hold back Ctrl-C until the end: a compiler that is interrupted may take the process with it."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -1,4 +1,4 @@
-"""What a report shows, made ready once for the picture (report.png) and for the page (report.html)."""
+"""What a report shows, prepared once for report.png and report.html."""
 
 from __future__ import annotations
 
@@ -9,20 +9,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.errors import EvaluationError
 from hsloc.evaluation.association import interpolate_poses
-from hsloc.evaluation.metrics import compare
-from hsloc.model import IDENTITY, Pose2, Status, Trajectory
-from hsloc.model.pose2 import compose_poses
+from hsloc.model import IDENTITY, Status
 from hsloc.trajectory_io.tum import NS_PER_S
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import NDArray
 
-    from hsloc.evaluation.metrics import Comparison
-    from hsloc.model import ScanDiagnostics
+    from hsloc.evaluation import Comparison
+    from hsloc.model import ScanDiagnostics, Trajectory
 
     Floats = NDArray[np.float64]
 
@@ -40,30 +35,31 @@ class Curve:
 
     def thinned(self, most: int) -> Curve:
         """At most about `most` points, of which each stretch's lowest and highest are kept: no peak is lost."""
-        n = len(self.seconds)
-        if n <= most:
-            return self
-        edges = np.linspace(0, n, max(most // 2, 1) + 1).astype(int)
-        start, stretch = edges[:-1], np.repeat(np.arange(len(edges) - 1), np.diff(edges))
-        known = np.isfinite(self.values)
-        # By stretch, and within it by value; the sort is stable, so that of equal values the first counts.
-        lowest, highest = (
-            np.lexsort((np.where(known, sign * self.values, np.inf), stretch))[start] for sign in (1.0, -1.0)
-        )
-        nothing = ~np.logical_or.reduceat(known, start)
-        lowest[nothing] = highest[nothing] = start[nothing]
-        rows = np.unique(np.concatenate(([0, n - 1], lowest, highest)))
+        rows = peak_rows(self.values, most)
         return Curve(self.seconds[rows], self.values[rows])
+
+
+def peak_rows(values: Floats, most: int) -> NDArray[np.intp]:
+    """Rows of at most about `most` of n values in order: the lowest and highest of each stretch, and both ends."""
+    n = len(values)
+    if n <= most:
+        return np.arange(n)
+    edges = np.linspace(0, n, max(most // 2, 1) + 1).astype(int)
+    start, stretch = edges[:-1], np.repeat(np.arange(len(edges) - 1), np.diff(edges))
+    known = np.isfinite(values)
+    # By stretch, and within it by value; the sort is stable, so that of equal values the first counts.
+    lowest, highest = (np.lexsort((np.where(known, sign * values, np.inf), stretch))[start] for sign in (1.0, -1.0))
+    nothing = ~np.logical_or.reduceat(known, start)
+    lowest[nothing] = highest[nothing] = start[nothing]
+    return np.unique(np.concatenate(([0, n - 1], lowest, highest)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Errors:
-    """Errors against the reference over time: metres and degrees; and of odometry alone, if there is any."""
+    """Errors against the reference over time, in metres and degrees."""
 
     translation_m: Curve
     rotation_deg: Curve
-    comparison: Comparison
-    odometry_alone: Comparison | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,14 +85,13 @@ class Scans:
 class ReportData:
     """Everything in the frame of the map: metres, and seconds since the first pose.
 
-    `path` (n, 2) and `seconds` (n,) are the trajectory as it came; `believed` (n,) says where the robot knew its
-    pose. `odometry` sets out from the trajectory's first such pose; `reference` has been moved onto the
-    trajectory where an alignment was asked for.
+    `path` (n, 2) and `seconds` (n,) are the trajectory; `localised` (n,) marks its known poses.
+    `reference` has been moved onto the trajectory where an alignment was asked for.
     """
 
     path: Floats
     seconds: Floats
-    believed: NDArray[np.bool_]
+    localised: NDArray[np.bool_]
     duration_s: float
     length_m: float
     odometry: Floats | None
@@ -110,43 +105,32 @@ def prepare(
     odometry: Trajectory | None,
     reference: Trajectory | None,
     diagnostics: ScanDiagnostics | None,
-    metrics: Mapping[str, object],
+    comparison: Comparison | None = None,
+    localised: NDArray[np.bool_] | None = None,
 ) -> ReportData:
-    """Make ready what a report shows; where reference and trajectory do not meet in time there are no errors."""
+    """Prepare what a report shows; all poses in the map frame, but for the reference, which `comparison` aligns.
+
+    Without `comparison` there are no errors; without `localised` it is derived from the diagnostics.
+    """
     start_ns = int(trajectory.stamps_ns.min()) if len(trajectory) else _first(diagnostics)
     seconds = _since(trajectory.stamps_ns, start_ns)
     scans = None if diagnostics is None or not len(diagnostics) else _scans(diagnostics, trajectory, start_ns)
-    believed = np.ones(len(trajectory), dtype=bool)
-    for begin, end in () if scans is None else scans.lost:
-        believed &= (seconds < begin) | (seconds >= end)
-    placed = None if odometry is None else start_together(odometry, trajectory, believed)
-    errors = None if reference is None else _errors(trajectory, placed, reference, metrics, start_ns)
-    T_map_reference = IDENTITY if errors is None else errors.comparison.T_reference_estimate.inverse()
+    if localised is None:
+        localised = np.ones(len(trajectory), dtype=bool)
+        for begin, end in () if scans is None else scans.lost:
+            localised &= (seconds < begin) | (seconds >= end)
+    T_map_reference = IDENTITY if comparison is None else comparison.T_reference_estimate.inverse()
     return ReportData(
         path=trajectory.poses[:, :2],
         seconds=seconds,
-        believed=believed,
+        localised=localised,
         duration_s=float(seconds.max() - seconds.min()) if len(seconds) else 0.0,
         length_m=trajectory.length(),
-        odometry=None if placed is None else placed.poses[:, :2],
+        odometry=None if odometry is None else odometry.poses[:, :2],
         reference=None if reference is None else T_map_reference @ reference.poses[:, :2],
-        errors=errors,
+        errors=None if comparison is None else _errors(comparison, start_ns),
         scans=scans,
     )
-
-
-def start_together(odometry: Trajectory, trajectory: Trajectory, believed: NDArray[np.bool_]) -> Trajectory:
-    """Odometry moved as a whole, so that it agrees with the first pose in time that was believed.
-
-    Of a trajectory that never was, with its first pose.
-    """
-    if not len(odometry) or not len(trajectory):
-        return odometry
-    rows = np.flatnonzero(believed) if believed.any() else np.arange(len(trajectory))
-    row = int(rows[np.argmin(trajectory.stamps_ns[rows])])
-    there = interpolate_poses(odometry, trajectory.stamps_ns[row : row + 1])[0]
-    T_map_odom = Pose2.from_array(trajectory.poses[row]) @ Pose2.from_array(there).inverse()
-    return Trajectory(odometry.stamps_ns, compose_poses(T_map_odom.to_array(), odometry.poses))
 
 
 def status_counts(scans: Scans) -> dict[str, int]:
@@ -159,7 +143,7 @@ def status_counts(scans: Scans) -> dict[str, int]:
 def reason_counts(scans: Scans) -> list[tuple[str, str, int]]:
     """(status, reason, how many scans) for all scans that were not used, the most frequent first.
 
-    Reasons that differ in their figures alone are one; the first of them stands for the others.
+    Reasons that differ in their figures alone are one; the first is the example.
     """
     skipped: dict[tuple[str, str], list[str]] = {}
     for status, reason in zip(scans.status, scans.reason, strict=True):
@@ -188,36 +172,11 @@ def _since(stamps_ns: NDArray[np.int64], start_ns: int) -> Floats:
     return result
 
 
-def _errors(
-    trajectory: Trajectory,
-    odometry: Trajectory | None,
-    reference: Trajectory,
-    metrics: Mapping[str, object],
-    start_ns: int,
-) -> Errors | None:
-    limit = metrics.get("t_max_diff")
-    alignment = metrics.get("alignment")
-    method = "interpolation" if metrics.get("association") == "interpolation" else "nearest"
-    options = {
-        "max_difference_s": limit if isinstance(limit, float) else 0.01,
-        "alignment": alignment if isinstance(alignment, str) else "none",
-        "association": method,
-    }
-    try:
-        found = compare(trajectory, reference, **options)  # type: ignore[arg-type]
-    except EvaluationError:
-        return None
-    alone = None
-    if odometry is not None:
-        try:
-            alone = compare(odometry, reference, **options)  # type: ignore[arg-type]
-        except EvaluationError:
-            alone = None
-    order = np.argsort(found.pairs.stamps_ns, kind="stable")
-    seconds = _since(found.pairs.stamps_ns, start_ns)[order]
-    return Errors(
-        Curve(seconds, found.errors.trans_part[order]), Curve(seconds, found.errors.angle_deg[order]), found, alone
-    )
+def _errors(comparison: Comparison, start_ns: int) -> Errors:
+    order = np.argsort(comparison.pairs.stamps_ns, kind="stable")
+    seconds = _since(comparison.pairs.stamps_ns, start_ns)[order]
+    errors = comparison.errors
+    return Errors(Curve(seconds, errors.trans_part[order]), Curve(seconds, errors.angle_deg[order]))
 
 
 def _scans(diagnostics: ScanDiagnostics, trajectory: Trajectory, start_ns: int) -> Scans:

@@ -1,4 +1,4 @@
-"""report.html: all that is known of a run in one file that needs no network, for the screen and for paper."""
+"""report.html: a run in one file that needs no network, for the screen and for paper."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
+from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,18 +17,19 @@ from hsloc.atomic_write import write_text_atomically
 from hsloc.evaluation.metrics import format_json
 from hsloc.model import Status
 from hsloc.report.data import Curve, prepare, reason_counts, status_counts
-from hsloc.report.notes import remarks_html, text_of
-from hsloc.report.svg_charts import Chart, chart_svg, timeline_html
-from hsloc.report.svg_map import map_svg
-from hsloc.report.table import DASH, summary, table_rows
+from hsloc.report.svg import Chart, chart_svg, map_svg, timeline_html
+from hsloc.report.table import DASH, STATUS_WORDS, error_statistics, summary, table_rows
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
+    from hsloc.evaluation import Comparison
+    from hsloc.evaluation.error_metrics import ErrorMetrics
     from hsloc.model import OccupancyGrid, ScanDiagnostics, Trajectory
     from hsloc.report.data import ReportData
+    from hsloc.run_metrics import LaserMetrics, RunMetrics
 
     Floats = NDArray[np.float64]
 
@@ -63,7 +65,9 @@ def write_report_html(
     reference: Trajectory | None = None,
     grid: OccupancyGrid | None = None,
     diagnostics: ScanDiagnostics | None = None,
-    metrics: Mapping[str, object] | None = None,
+    metrics: RunMetrics | None = None,
+    comparison: Comparison | None = None,
+    localised: NDArray[np.bool_] | None = None,
     points: Floats | None = None,
     provenance: Provenance | None = None,
     convergence: Mapping[str, tuple[Floats, Floats]] | None = None,
@@ -73,24 +77,23 @@ def write_report_html(
     Arguments as for `draw_report`; `convergence` holds, by name, curves of the best fitness over the number of
     evaluations, two arrays of shape (n,). All text is escaped. Raises `OutputError` where it cannot be written.
     """
-    metrics = {} if metrics is None else metrics
     provenance = Provenance() if provenance is None else provenance
-    data = prepare(trajectory, odometry, reference, diagnostics, metrics)
+    data = prepare(trajectory, odometry, reference, diagnostics, comparison, localised)
     drawing, extent = map_svg(data, grid, points)
-    charts, end = time_charts(data, drifts=text_of(metrics, "run", "mode") == "slam"), _end(data)
+    charts, end = time_charts(data, drifts=metrics is not None and metrics.run.mode == "slam"), _end(data)
     fragments = {
         "title": escape(title),
-        "facts": "".join(f"<li>{escape(fact)}</li>" for fact in summary(data, metrics)),
+        "facts": _items([] if metrics is None else summary(metrics)),
         "map": drawing,
         "aspect": f"{min(max(extent.aspect, 0.7), 3.0):.4g}",
         "legend": _legend(data, grid, points),
-        "headline": _headline(data, metrics),
+        "headline": "" if metrics is None else _headline(metrics),
         "charts": "".join(_figure(chart, end) for chart in charts) + _convergence(convergence),
-        "remarks": remarks_html(metrics),
+        "quality": "" if metrics is None else _quality(metrics),
         "scans": _scans(data, end),
-        "statistics": _statistics(metrics),
+        "statistics": "" if metrics is None else _statistics(metrics),
         "provenance": _provenance(provenance),
-        "metrics": escape(format_json(metrics)) if metrics else "",
+        "metrics": "" if metrics is None else escape(format_json(metrics.to_json())),
         "data": _script_json(_page_data(data, charts)),
         "style": _template("report.css"),
         "script": _template("report.js"),
@@ -101,7 +104,7 @@ def write_report_html(
 def time_charts(data: ReportData, drifts: bool = False) -> list[Chart]:
     """All that is known over time: errors where there is truth, fitness, standard deviations, effort.
 
-    With `drifts` the standard deviations are those of a map that is being drawn, before its loops are closed.
+    With `drifts` the standard deviations are those of a map being built, before its loops are closed.
     """
     of = ", before loops are closed" if drifts else ""
     charts = []
@@ -189,14 +192,14 @@ def _legend(data: ReportData, grid: OccupancyGrid | None, points: Floats | None)
             if len(data.path)
             else ""
         )
-        + ('<span><i class="key guessed"></i>pose unknown</span>' if not data.believed.all() else "")
+        + ('<span><i class="key guessed"></i>pose unknown</span>' if not data.localised.all() else "")
     )
 
 
-def _headline(data: ReportData, metrics: Mapping[str, object]) -> str:
+def _headline(metrics: RunMetrics) -> str:
     rows = []
     paired = False
-    for row in table_rows(data, metrics):
+    for row in table_rows(metrics):
         if len(row.values) == 2 and not paired:
             paired = True
             rows.append('<tr><td></td><th scope="col">translation</th><th scope="col">rotation</th></tr>')
@@ -214,11 +217,11 @@ def _scans(data: ReportData, end: float) -> str:
     counts = status_counts(scans)
     spacing = float(np.median(np.diff(scans.seconds))) if len(scans.seconds) > 1 else 1.0
     rows = [
-        (name.replace("_", " "), count, STATUS_COLOURS.get(name, "blue"), scans.seconds[scans.where(name)])
+        (STATUS_WORDS.get(name, name), count, STATUS_COLOURS.get(name, "blue"), scans.seconds[scans.where(name)])
         for name, count in counts.items()
     ]
     table = "".join(
-        f'<tr><th scope="row">{escape(status.replace("_", " "))}</th>'
+        f'<tr><th scope="row">{escape(STATUS_WORDS.get(status, status))}</th>'
         f'<td class="words">{escape(reason) or "no reason given"}</td><td>{count}</td></tr>'
         for status, reason, count in reason_counts(scans)
     )
@@ -231,36 +234,67 @@ def _scans(data: ReportData, end: float) -> str:
     return f"<section><h2>Scans</h2>{timeline_html(rows, spacing, end)}{why}</section>"
 
 
-def _statistics(metrics: Mapping[str, object]) -> str:
-    rows = []
-    for key, entry in metrics.items():
-        if not isinstance(entry, dict):
-            continue
-        delta = f" per {entry['delta']:g} {entry.get('delta_unit', '')}" if "delta" in entry else ""
-        label = ("APE" if key == "ape" else "RPE" if key.startswith("rpe") else key) + delta
-        for name, unit in (("trans_part", "m"), ("angle_deg", "deg")):
-            values = entry.get(name)
-            if isinstance(values, dict):
-                cells = "".join(f"<td>{_cell(values.get(statistic))}</td>" for statistic in STATISTICS)
-                rows.append(f'<tr><th scope="row">{escape(label)} {name} ({unit})</th>{cells}</tr>')
+def _statistics(metrics: RunMetrics) -> str:
+    rows = [
+        f'<tr><th scope="row">{escape(label)} [{unit}]</th>'
+        + "".join(f"<td>{_cell(getattr(values, name))}</td>" for name in STATISTICS)
+        + "</tr>"
+        for label, unit, values in error_statistics(metrics)
+    ]
     if not rows:
         return ""
     head = "".join(f'<th scope="col">{name}</th>' for name in STATISTICS)
-    about = ", ".join(
-        f"{key.replace('_', ' ')} {metrics[key]}"
-        for key in ("alignment", "association", "t_max_diff", "matched", "unmatched_reference", "unmatched_estimate")
-        if key in metrics
-    )
+    about = "" if metrics.errors is None else _pairing(metrics.errors)
     return (
         f'<section><h2>Errors</h2><p class="muted">{escape(about)}</p>'
         f'<div class="scroll"><table><tr><td></td>{head}</tr>{"".join(rows)}</table></div></section>'
     )
 
 
-def _cell(value: object) -> str:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return DASH
+def _pairing(errors: ErrorMetrics) -> str:
+    return (
+        f"alignment {errors.alignment}, association {errors.association} within {errors.t_max_diff:g} s, "
+        f"{errors.matched} pairs; without a partner: {errors.unmatched_reference} poses of the reference, "
+        f"{errors.unmatched_estimate} of the estimate"
+    )
+
+
+def _cell(value: float) -> str:
     return str(value) if isinstance(value, int) else f"{value:.4f}" if value == value else DASH
+
+
+def _quality(metrics: RunMetrics) -> str:
+    """The verdict's reasons, warnings and losses, and what was read of the log."""
+    reasons = {(reason.code, reason.text): reason for reason in metrics.verdict_reasons}
+    warnings = [str(each) for each in metrics.warnings if (each.code, each.text) not in reasons]
+    warnings += [f"log: {line}" for line in metrics.losses.notes]
+    if metrics.evaluation_error is not None:
+        warnings.append(f"no comparison with the reference: {metrics.evaluation_error}")
+    lines = [f"{each.text}; {each.remedy}" if each.remedy else each.text for each in metrics.verdict_reasons]
+    verdict = f"<h2>Verdict: {metrics.verdict}</h2><ul>{_items(lines)}</ul>"
+    rows = [("scans", _laser(laser)) for laser in metrics.log.lasers]
+    rows += [("odometry", metrics.log.odometry or "none"), ("reference", metrics.log.reference or "none")]
+    run = metrics.run
+    rows.append(("algorithm", f"{run.matcher or 'graph mapper'}, preset {run.preset}, seed {run.seed}"))
+    table = "".join(
+        f'<tr><th scope="row">{escape(name)}</th><td class="words">{escape(value)}</td></tr>' for name, value in rows
+    )
+    return (
+        (f'<section class="warnings">{verdict}</section>' if lines else "")
+        + (f'<section class="warnings"><h2>Warnings</h2><ul>{_items(warnings)}</ul></section>' if warnings else "")
+        + f'<section><h2>What was read</h2><div class="scroll"><table>{table}</table></div></section>'
+    )
+
+
+def _items(lines: list[str]) -> str:
+    return "".join(f"<li>{escape(line)}</li>" for line in lines)
+
+
+def _laser(laser: LaserMetrics) -> str:
+    where = f"x {laser.x:.3f} m, y {laser.y:.3f} m, yaw {degrees(laser.yaw):.1f}°"
+    upside_down = ", upside down" if laser.upside_down else ""
+    source = "assumed" if laser.extrinsics == "identity" else f"from {laser.extrinsics}"
+    return f"{laser.topic}, laser at {where}{upside_down} ({source})"
 
 
 def _provenance(provenance: Provenance) -> str:
@@ -301,7 +335,7 @@ def _short(values: Floats) -> list[float | None]:
 
 
 def _script_json(values: dict[str, object]) -> str:
-    """JSON that cannot end the <script> element it stands in."""
+    """JSON that cannot end the <script> element around it."""
     text = json.dumps(values, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 

@@ -23,10 +23,10 @@ MARGIN = 0.05
 """Free room around what is shown, as a part of the larger side."""
 
 LEAST_SIZE = 0.5
-"""Metres: a robot that stood still gets some ground to stand on."""
+"""Smallest side of what is shown, in metres, for a robot that did not move."""
 
 SURROUNDINGS = 10.0
-"""Metres of map shown around the path at least, where there are so many; more around a path that is longer."""
+"""Metres of map that are shown around the path at least, if the map has them; more around a longer path."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,17 +103,17 @@ def shown_extent(data: ReportData, grid: OccupancyGrid | None, points: Floats | 
 
     Of a map that is far larger than the path only what lies within `SURROUNDINGS` of the path is shown.
     """
-    ways = _finite(np.concatenate((data.path, np.zeros((0, 2)) if data.reference is None else data.reference)))
+    paths = _finite(np.concatenate((data.path, np.zeros((0, 2)) if data.reference is None else data.reference)))
     ground = _finite(
         np.concatenate(
             (np.zeros((0, 2)) if points is None else points, np.zeros((0, 2)) if grid is None else _known_corners(grid))
         )
     )
-    if len(ways) and len(ground):
-        low, high = ways.min(axis=0), ways.max(axis=0)
+    if len(paths) and len(ground):
+        low, high = paths.min(axis=0), paths.max(axis=0)
         around = max(float((high - low).max()), SURROUNDINGS)
         ground = np.clip(ground, low - around, high + around)
-    every = np.concatenate((ways, ground))
+    every = np.concatenate((paths, ground))
     if len(every) == 0:
         return Extent(-1.0, -1.0, 1.0, 1.0)
     low, high = every.min(axis=0), every.max(axis=0)

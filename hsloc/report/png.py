@@ -1,4 +1,4 @@
-"""report.png: one picture that says where the robot went, and how sure one can be."""
+"""report.png: where the robot went, how large the errors are, and how certain the result is, in one picture."""
 
 from __future__ import annotations
 
@@ -14,31 +14,30 @@ from hsloc.atomic_write import write_atomically
 from hsloc.report import style
 from hsloc.report.data import prepare
 from hsloc.report.map_image import Extent, shown_extent
-from hsloc.report.png_charts import Panel, draw_panel, draw_table, time_panels
-from hsloc.report.png_map import draw_map
+from hsloc.report.png_panels import Panel, draw_map, draw_panel, draw_table, time_panels
 from hsloc.report.table import Row, summary, table_rows
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     import numpy as np
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
+    from hsloc.evaluation import Comparison
     from hsloc.model import OccupancyGrid, ScanDiagnostics, Trajectory
     from hsloc.report.data import ReportData
+    from hsloc.run_metrics import RunMetrics
 
 WIDTH, HEIGHT, DPI = 16.0, 10.0, 100
 """The picture is 1600 x 1000 pixels."""
 
 LEFT, LEFT_OF_AXES, RIGHT, BOTTOM, TOP = 0.015, 0.05, 0.985, 0.06, 0.9
-"""Edges as parts of the picture: of text, of axes (their numbers stand left of them), and of all below the head."""
+"""Edges as parts of the picture: of text, of axes (their numbers are left of them), and of all below the head."""
 
 LINE = 0.031
 """Height of a line of the table, as a part of the picture's."""
 
 WIDE = 2.1
-"""From this ratio of width to height on, the map takes the whole width, and the rest stands below it."""
+"""From this ratio of width to height on, the map takes the whole width, and the rest is below it."""
 
 SETTINGS_THAT_STAY = ("backend", "backend_fallback", "interactive", "toolbar", "webagg", "tk.", "savefig.directory")
 
@@ -52,17 +51,18 @@ def draw_report(
     reference: Trajectory | None = None,
     grid: OccupancyGrid | None = None,
     diagnostics: ScanDiagnostics | None = None,
-    metrics: Mapping[str, object] | None = None,
+    metrics: RunMetrics | None = None,
+    comparison: Comparison | None = None,
+    localised: NDArray[np.bool_] | None = None,
     points: NDArray[np.float64] | None = None,
 ) -> None:
     """Draw the report of a run as a PNG of 1600 x 1000 pixels: the same run gives the same bytes.
 
-    `metrics` is the content of metrics.json; its alignment and time difference rule the error curves. `points`,
-    shape (n, 2) in metres, are drawn as a map of points. All poses are in the map frame but for `odometry`,
-    which is moved to start where the trajectory starts. Raises `OutputError` where `path` cannot be written.
+    `comparison` of trajectory and reference gives the error curves, `localised` (n,) marks the known poses.
+    `points`, shape (n, 2) in metres, are drawn as a map of points. All poses are in the map frame, but for the
+    reference, which `comparison` aligns. Raises `OutputError` where `path` cannot be written.
     """
-    metrics = {} if metrics is None else metrics
-    data = prepare(trajectory, odometry, reference, diagnostics, metrics)
+    data = prepare(trajectory, odometry, reference, diagnostics, comparison, localised)
     # A user's matplotlibrc must not change the picture.
     defaults = {
         key: value for key, value in matplotlib.rcParamsDefault.items() if not key.startswith(SETTINGS_THAT_STAY)
@@ -71,7 +71,7 @@ def draw_report(
         warnings.catch_warnings(),
         matplotlib.rc_context({**defaults, "font.family": style.FONT, "axes.unicode_minus": True}),
     ):
-        # A letter that the font lacks becomes a box in the picture: no reason to speak to the user.
+        # A letter that the font lacks becomes a box in the picture: the user need not be warned.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         figure = _figure(title, data, grid, points, metrics)
         # Without the version of matplotlib in the file.
@@ -85,16 +85,17 @@ def _figure(
     data: ReportData,
     grid: OccupancyGrid | None,
     points: NDArray[np.float64] | None,
-    metrics: Mapping[str, object],
+    metrics: RunMetrics | None,
 ) -> Figure:
     figure = Figure(figsize=(WIDTH, HEIGHT), dpi=DPI, facecolor=style.PAPER)
     FigureCanvasAgg(figure)
-    extent, panels, rows = shown_extent(data, grid, points), time_panels(data), table_rows(data, metrics)
+    rows = [] if metrics is None else table_rows(metrics)
+    extent, panels = shown_extent(data, grid, points), time_panels(data)
     left, bottom, width, height = _place(figure, extent, panels, rows, data)
     axes = figure.add_axes((left, bottom, width, height))
     shown = extent.widened(width * WIDTH / (height * HEIGHT))
     draw_map(axes, data, grid, points, shown, max(width * WIDTH, height * HEIGHT) * DPI)
-    _draw_head(figure, axes, title, summary(data, metrics))
+    _draw_head(figure, axes, title, [] if metrics is None else summary(metrics))
     return figure
 
 
@@ -136,7 +137,7 @@ def _place(figure: Figure, extent: Extent, panels: list[Panel], rows: list[Row],
         return LEFT_OF_AXES, TOP - height, RIGHT - LEFT_OF_AXES, height
     width = min(max((TOP - BOTTOM) * HEIGHT * extent.aspect / WIDTH, 0.36), 0.64)
     column = LEFT_OF_AXES + width + 0.055
-    table = min(LINE * (len(rows) + 1), 0.45) if rows else 0.0
+    table = min(LINE * (len(rows) + 2), 0.5) if rows else 0.0
     above = TOP - BOTTOM - table - (0.065 if rows else 0.0)
     _draw_panels(figure, panels, data, (column, TOP - above, RIGHT - column, above))
     _draw_rows(figure, rows, (column, BOTTOM - 0.02 if panels else TOP - table, RIGHT - column, table))
@@ -144,7 +145,7 @@ def _place(figure: Figure, extent: Extent, panels: list[Panel], rows: list[Row],
 
 
 def _draw_panels(figure: Figure, panels: list[Panel], data: ReportData, box: Box) -> None:
-    """The panels one below the other; their headings stand within the box, the time of the last below it."""
+    """The panels one below the other; their headings are within the box, the time of the last below it."""
     left, bottom, width, height = box
     heading = 0.036
     each = height / max(len(panels), 1)

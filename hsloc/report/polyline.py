@@ -18,7 +18,7 @@ _BREAK = (float("nan"), float("nan"))
 
 
 def pieces_of(xy: Floats, finest: float) -> list[Floats]:
-    """A path (n, 2) in pieces (m, 2) where NaN breaks it, without points nearer than `finest` to the last one kept.
+    """A path (n, 2) in pieces (m, 2) where NaN breaks it, without points closer than `finest` to the last one kept.
 
     Distances are taken along the axes; the first and the last point of a piece are always kept.
     """

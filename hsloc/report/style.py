@@ -1,7 +1,7 @@
 """Colours and marks of the reports.
 
 The colours are those of M. Okabe and K. Ito, "Color Universal Design" (2008): they stay apart for colour-blind
-readers. Width, dash and mark tell the lines apart as well, so that the report can be read in grey.
+readers. Width, dash and mark distinguish the lines as well, so that the report can be read in grey.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The table of a report: the figures of metrics.json that a reader looks for first, with units that fit them."""
+"""The figures of a run under one name and in one unit: for the terminal, report.png, report.html and the web page."""
 
 from __future__ import annotations
 
@@ -10,16 +10,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.model import Status
-from hsloc.report.data import status_counts
-from hsloc.report.notes import text_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from hsloc.report.data import ReportData, Scans
+    from hsloc.evaluation import PoseStatistics, Statistics
+    from hsloc.run_metrics import MapMetrics, RunMetrics, ScanCounts
 
 DASH = "–"
 _YEAR_2000_NS, _YEAR_2100_NS = 946_684_800e9, 4_102_444_800e9
+STATUS_WORDS: dict[str, str] = {
+    Status.MATCHED: "matched",
+    Status.RELOCALISED: "relocalised",
+    Status.PREDICTED: "held by the motion gate",
+    Status.REJECTED: "rejected",
+    Status.NO_RETURNS: "without returns",
+    Status.SEARCHING: "searching",
+}
+"""What a scan's status is called."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,45 +36,31 @@ class Row:
     values: tuple[str, ...]
 
 
-def table_rows(data: ReportData, metrics: Mapping[str, object]) -> list[Row]:
-    """The most telling figures: those with two columns first, then those with one."""
-    return [*_pair_rows(data, metrics), *_single_rows(data, metrics)]
+def table_rows(metrics: RunMetrics) -> list[Row]:
+    """The most important figures: those with two columns first, then those with one."""
+    return [*_error_rows(metrics), *_single_rows(metrics)]
 
 
-def summary(data: ReportData, metrics: Mapping[str, object]) -> list[str]:
+def summary(metrics: RunMetrics) -> list[str]:
     """The facts under the title, the most important first."""
-    parts = [*_how(metrics), f"{format_length(data.length_m)} path", f"{format_duration(data.duration_s)}"]
-    if data.scans is not None:
-        parts.append(f"{len(data.scans.seconds):,} scans".replace(",", " "))
-    rmse = number(metrics, "ape", "trans_part", "rmse")
-    if rmse is not None:
-        believed = number(metrics, "localised_only", "ape", "trans_part", "rmse")
-        where = "" if believed is None else f", {format_length(believed)} where localised"
-        parts.append(f"APE rmse {format_length(rmse)}{where}")
+    log, errors = metrics.log, metrics.errors
+    parts = [f"verdict: {metrics.verdict}", *_how(metrics), f"{format_length(log.path_length_m)} path"]
+    parts += [format_duration(log.duration_s), f"{metrics.scans.total:,} scans".replace(",", " ")]
+    if errors is not None:
+        only = metrics.localised_only
+        where = "" if only is None else f", {format_length(only.ape.trans_part.rmse)} where localised"
+        parts.append(f"APE rmse {format_length(errors.ape.trans_part.rmse)}{where}")
     return parts
 
 
-def _how(metrics: Mapping[str, object]) -> list[str]:
+def _how(metrics: RunMetrics) -> list[str]:
     """What was done, and when the log begins where its clock is that of the calendar."""
-    mode, name = text_of(metrics, "run", "mode"), text_of(metrics, "run", "map")
-    words = {"localise": f"localised on {'the map of the log' if name == 'log' else name}", "slam": f"map {name}"}
-    parts = [words[mode]] if mode in words and name else []
-    stamp = number(metrics, "log", "first_stamp_ns")
+    name, stamp = metrics.run.map, metrics.log.first_stamp_ns
+    localised = f"localised on {'the map of the log' if name == 'log' else name}"
+    parts = [localised if metrics.run.mode == "localise" else f"map {name}"]
     if stamp is not None and _YEAR_2000_NS <= stamp < _YEAR_2100_NS:
         parts.append(f"{datetime.fromtimestamp(stamp // 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC")
     return parts
-
-
-def number(metrics: Mapping[str, object], *keys: str) -> float | None:
-    """The finite number under nested keys, or None."""
-    value: object = metrics
-    for key in keys:
-        if not isinstance(value, dict) or key not in value:
-            return None
-        value = value[key]
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    return float(value) if isfinite(value) else None
 
 
 def format_length(metres: float | None) -> str:
@@ -104,69 +96,97 @@ def _three_figures(value: float) -> str:
     return f"{value:.{decimals}f}"
 
 
-def _pair_rows(data: ReportData, metrics: Mapping[str, object]) -> list[Row]:
+def error_statistics(metrics: RunMetrics) -> list[tuple[str, str, Statistics]]:
+    """(label, unit, statistics) of all errors that were measured, translation and rotation each."""
+    found: list[tuple[str, PoseStatistics]] = []
+    for label, errors in (
+        ("", metrics.errors),
+        (" where localised", metrics.localised_only),
+        (" of odometry alone", metrics.odometry_alone),
+    ):
+        if errors is not None:
+            found.append((f"APE{label}", errors.ape))
+            found += [
+                (f"RPE per {each.delta}{label}", each.statistics) for each in (errors.rpe, errors.rpe_1m, errors.rpe_1s)
+            ]
+    if metrics.relations is not None:
+        found.append(("relations", metrics.relations.statistics))
+    return [
+        (f"{label}, {kind}", unit, values)
+        for label, pose in found
+        for kind, unit, values in (("translation", "m", pose.trans_part), ("rotation", "deg", pose.angle_deg))
+    ]
+
+
+def _error_rows(metrics: RunMetrics) -> list[Row]:
     rows = []
 
-    def add(label: str, *keys: str, name: str = "rmse") -> None:
-        trans, angle = number(metrics, *keys, "trans_part", name), number(metrics, *keys, "angle_deg", name)
-        if trans is not None or angle is not None:
-            rows.append(Row(label, (format_length(trans), format_angle(angle))))
+    def add(label: str, errors: PoseStatistics, name: str = "rmse") -> None:
+        values = getattr(errors.trans_part, name), getattr(errors.angle_deg, name)
+        if any(isfinite(value) for value in values):
+            rows.append(Row(label, (format_length(values[0]), format_angle(values[1]))))
 
-    add("APE rmse", "ape")
-    add("APE max", "ape", name="max")
-    add("APE rmse where localised", "localised_only", "ape")
-    if data.errors is not None and data.errors.odometry_alone is not None:
-        alone = data.errors.odometry_alone.errors.statistics()
-        rows.append(
-            Row("odometry alone, rmse", (format_length(alone.trans_part.rmse), format_angle(alone.angle_deg.rmse)))
-        )
-    for key in ("rpe_1m", "rpe_1s", "rpe"):
-        if number(metrics, key, "trans_part", "rmse") is not None:
-            add(f"RPE rmse per {_delta(metrics, key)}", key)
-            break
-    add("relations, mean", "relations", name="mean")
-    add("relations, std", "relations", name="std")
+    errors = metrics.errors
+    if errors is not None:
+        add("APE rmse", errors.ape)
+        if metrics.localised_only is not None:
+            add("APE rmse where localised", metrics.localised_only.ape)
+        add("APE max", errors.ape, "max")
+        if metrics.odometry_alone is not None:
+            add("APE rmse of odometry", metrics.odometry_alone.ape)
+        # A path that is shorter than a metre still has pieces of a second, or from frame to frame.
+        known = [each for each in (errors.rpe_1m, errors.rpe_1s, errors.rpe) if each.statistics.trans_part.count]
+        for relative in known[:1]:
+            add(f"RPE rmse per {relative.delta}", relative.statistics)
+    if metrics.relations is not None:
+        add("relations, mean", metrics.relations.statistics, "mean")
+        add("relations, std", metrics.relations.statistics, "std")
     return rows
 
 
-def _delta(metrics: Mapping[str, object], key: str) -> str:
-    value, entry = number(metrics, key, "delta"), metrics.get(key)
-    unit = entry.get("delta_unit", "") if isinstance(entry, dict) else ""
-    return f"{value:g} {unit}" if value is not None else str(unit)
-
-
-def _single_rows(data: ReportData, metrics: Mapping[str, object]) -> list[Row]:
+def _single_rows(metrics: RunMetrics) -> list[Row]:
     rows = []
-    axes = [number(metrics, "axis_rmse", axis) for axis in ("x", "y", "theta")]
-    if all(axis is not None for axis in axes):
-        x, y, theta = (axis or 0.0 for axis in axes)
-        rows.append(Row("rmse x, y, θ", (f"{format_length(x)}, {format_length(y)}, {format_angle(degrees(theta))}",)))
-    if data.scans is not None:
-        rows += _scan_rows(data.scans)
-        spent = data.scans.evaluations[data.scans.evaluations > 0]
-        if len(spent):
-            rows.append(Row("evaluations, median", (f"{np.median(spent):.0f}",)))
-        fitness = data.scans.fitness[np.isfinite(data.scans.fitness)]
-        if len(fitness):
-            rows.append(Row("fitness, median", (f"{np.median(fitness):.3f}",)))
-    median, p95 = (number(metrics, "map", "residuals", name) for name in ("median", "p95"))
-    if median is not None and p95 is not None:
-        # The distance is that from cell to cell: what falls into a wall's own cell is no nearer than that.
-        near = ["in the cell" if value == 0.0 else format_length(value) for value in (median, p95)]
+    if metrics.errors is not None:
+        axes = metrics.errors.axis_rmse
+        values = f"{format_length(axes.x)}, {format_length(axes.y)}, {format_angle(degrees(axes.theta))}"
+        rows.append(Row("rmse x, y, heading", (values,)))
+    share = metrics.localised.share_of_poses
+    if share < 1.0:
+        rows.append(Row("localised", (f"{100.0 * share:.1f} % of the poses",)))
+    rows += scan_rows(metrics.scans)
+    if metrics.evaluations.median_per_match is not None:
+        rows.append(Row("evaluations, median", (f"{metrics.evaluations.median_per_match:.0f}",)))
+    if metrics.fitness.median is not None:
+        rows.append(Row("fitness, median", (f"{metrics.fitness.median:.3f}",)))
+    return [*rows, *_map_rows(metrics.map)]
+
+
+def scan_rows(scans: ScanCounts) -> list[Row]:
+    """How many scans were matched, and what became of the others: together they are all scans."""
+    rows = [Row("scans matched", (f"{scans.used} of {scans.total}",))]
+    known = [status.value for status in Status]
+    names = [name for name in (*known, *sorted(set(scans.by_status) - set(known))) if scans.by_status.get(name)]
+    unused = [name for name in names if name not in (Status.MATCHED, Status.RELOCALISED)]
+    if unused:
+        words = ", ".join(f"{scans.by_status[name]} {STATUS_WORDS.get(name, name)}" for name in unused)
+        rows.append(Row("scans not matched", (words,)))
+    return rows
+
+
+def _map_rows(found: MapMetrics) -> list[Row]:
+    rows, residuals = [], found.residuals
+    if residuals.median is not None and residuals.p95 is not None and residuals.within_15_cm is not None:
+        # The distance is that from cell to cell: a point in an occupied cell has no smaller distance.
+        near = ["in the cell" if value == 0.0 else format_length(value) for value in (residuals.median, residuals.p95)]
         rows.append(Row("scan to map, median, 95 %", (", ".join(dict.fromkeys(near)),)))
-    thickness = number(metrics, "map", "crispness", "wall_thickness_median")
-    if thickness is not None:
-        rows.append(Row("wall thickness", (format_length(thickness),)))
-    precision, recall = (number(metrics, "map", "comparison", name) for name in ("precision", "recall"))
-    if precision is not None and recall is not None:
-        rows.append(Row("map precision, recall", (f"{100 * precision:.1f} %, {100 * recall:.1f} %",)))
+        rows.append(Row("points within 15 cm of a wall", (f"{100.0 * residuals.within_15_cm:.1f} %",)))
+    if found.mapping is not None:
+        loops = f"{found.mapping.keyscans} keyscans, {found.mapping.loops} loops"
+        rows.append(Row("map built from", (loops,)))
+    if found.crispness is not None and isfinite(found.crispness.wall_thickness_median):
+        rows.append(Row("wall thickness", (format_length(found.crispness.wall_thickness_median),)))
+    compared = found.comparison
+    if compared is not None and isfinite(compared.precision):
+        values = f"{100.0 * compared.precision:.1f} %, {100.0 * compared.recall:.1f} %"
+        rows.append(Row("map precision, recall", (values,)))
     return rows
-
-
-def _scan_rows(scans: Scans) -> list[Row]:
-    counts = status_counts(scans)
-    used = counts.get(Status.MATCHED, 0) + counts.get(Status.RELOCALISED, 0)
-    rows = [Row("scans matched", (f"{used} of {len(scans.seconds)}",))]
-    unused = (Status.REJECTED, Status.NO_RETURNS, Status.SEARCHING)
-    others = [f"{counts[name]} {name.replace('_', ' ')}" for name in unused if name in counts]
-    return [*rows, Row("scans not used", (", ".join(others),))] if others else rows

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.config import PRESETS, preset
+from hsloc.config import preset
 from hsloc.evaluation import evaluate
 from hsloc.model.estimate import Status
 from hsloc.model.trajectory import Trajectory
+from hsloc.options import PRESETS
 from hsloc.replay.engine import replay
 from hsloc.replay.run_history import RunHistory
 from hsloc.reproduction.localisation import MATCHERS, Path

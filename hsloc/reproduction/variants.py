@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.config import PRESETS, preset
+from hsloc.config import preset
 from hsloc.matching import HarmonySearch, Hide, Icp
 from hsloc.model.pose2 import wrap_angle
+from hsloc.options import PRESETS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

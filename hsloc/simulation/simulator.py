@@ -1,11 +1,11 @@
-"""Drive a scenario: what the robot does, what its wheels tell and what it sees, in order of time."""
+"""Simulate a scenario in order of time: the robot, its wheels and lidar, and the people in its way."""
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
 from itertools import islice, pairwise
-from math import ceil
+from math import ceil, tau
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +13,6 @@ import numpy as np
 from hsloc.model import Event, Odometry, Pose2, Scan, Truth
 from hsloc.model.pose2 import wrap_angles
 from hsloc.simulation.odometer import Odometer
-from hsloc.simulation.people import Walkers
 from hsloc.simulation.sensors import SensorNoise
 
 if TYPE_CHECKING:
@@ -137,3 +136,41 @@ def _poses_at(times: Array, steps: deque[_Step]) -> Array:
     motion[:, 2] = wrap_angles(motion[:, 2])
     poses: Array = before[index] + (times - index)[:, None] * motion[index]
     return poses
+
+
+LEG_RADIUS = 0.07
+STANCE = 0.1
+"""Metres from the middle of the body to each leg, sideways."""
+STRIDE = 0.22
+"""Metres that a leg swings forwards and backwards."""
+STEPS_PER_METRE = 0.75
+PERSONAL_SPACE = 0.4
+"""Nearer to the laser (metres) nobody walks: who would, has stepped aside and is not seen."""
+
+
+class Walkers:
+    """`count` people on the world's path, there and back without end, each with a pace and a side of their own."""
+
+    def __init__(self, path: Array, count: int, rng: np.random.Generator) -> None:
+        self._path = path
+        self._along = np.concatenate(((0.0,), np.cumsum(np.hypot(*np.diff(path, axis=0).T))))
+        length = float(self._along[-1])
+        self._start = rng.uniform(0.0, 2.0 * length, count)
+        self._pace = rng.uniform(0.7, 1.4, count)
+        self._aside = rng.uniform(-0.22, 0.22, count)
+
+    def legs(self, time_s: float, laser: Array) -> Array:
+        """Circles x y radius (metres), shape (k, 3), at `time_s` seconds; `laser` (2,) is the robot's place."""
+        length = float(self._along[-1])
+        walked = self._start + self._pace * time_s
+        there = np.mod(walked, 2.0 * length)
+        along = np.where(there < length, there, 2.0 * length - there)
+        leg = np.clip(np.searchsorted(self._along, along, side="right") - 1, 0, len(self._path) - 2)
+        delta = self._path[leg + 1] - self._path[leg]
+        forward = delta / np.hypot(delta[:, 0], delta[:, 1])[:, None]
+        left = np.column_stack((-forward[:, 1], forward[:, 0]))
+        body = self._path[leg] + (along - self._along[leg])[:, None] * forward + self._aside[:, None] * left
+        swing = STRIDE * np.sin(tau * STEPS_PER_METRE * walked)[:, None]
+        feet = np.concatenate((body + STANCE * left + swing * forward, body - STANCE * left - swing * forward))
+        feet = feet[np.hypot(feet[:, 0] - laser[0], feet[:, 1] - laser[1]) > PERSONAL_SPACE]
+        return np.column_stack((feet, np.full(len(feet), LEG_RADIUS)))

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.model import OccupancyGrid
+    from hsloc.warnings import RunWarning
 
     Array = NDArray[np.float64]
 
@@ -28,7 +29,7 @@ class World:
     `closed`, it goes on from the last to the first, lap after lap. `points` (k, 2) are what the report's sensor
     sees, whatever stands between, or None where the world has walls. `start_heading` is the robot's heading at the
     first waypoint in radians, or None: towards the second. `grid` is the map that the world was made from, if any,
-    and `notes` are what the user should know about it.
+    and `warnings` are those of its map.
     """
 
     name: str
@@ -38,7 +39,7 @@ class World:
     points: Array | None = None
     start_heading: float | None = None
     grid: OccupancyGrid | None = None
-    notes: tuple[str, ...] = ()
+    warnings: tuple[RunWarning, ...] = ()
 
     def path(self, laps: float = 1.0) -> Array:
         """The waypoints of `laps` laps, shape (k, 2); of a broken lap, its first part.

@@ -97,7 +97,9 @@ def _from_map(path: Path) -> World:
     xs, ys = (np.arange(-1, count + 2) * grid.resolution for count in (width, height))
     corners = outline(occupied, xs, ys).reshape(-1, 2)
     segments = np.asarray(grid.origin @ corners).reshape(-1, 4)
-    return World(path.stem, segments, plan_round_trip(grid.free(), grid), closed=True, grid=grid, notes=loaded.warnings)
+    return World(
+        path.stem, segments, plan_round_trip(grid.free(), grid), closed=True, grid=grid, warnings=loaded.warnings
+    )
 
 
 def _with_waypoints(world: World, path: Path) -> World:

@@ -62,7 +62,7 @@ def finish(
         return _empty(track)
     gathered = from_front_end(scans, stamps_ns, local, track, parameters)
     if resume is not None:
-        gathered = connect(resume.state, gathered, parameters, rng, resume.T_map_first)
+        gathered = connect(resume, gathered, parameters, rng)
     poses, loops, loop_edges = _close_loops(gathered, parameters, rng, lambda part: tell(0.5 * part))
     if resume is not None and not any(loop.accepted and _connects(loop, gathered) for loop in loops):
         raise MapError(unconnected(resume.state))

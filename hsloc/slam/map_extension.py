@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import MapError
-from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
-from hsloc.matching.hide import Hide
-from hsloc.matching.likelihood_field import LikelihoodField
+from hsloc.localisation.relocaliser import Relocaliser
 from hsloc.model.events import PairedScan
 from hsloc.model.pose2 import Pose2
 from hsloc.slam.loop_closer import LoopCloser
@@ -24,7 +22,7 @@ if TYPE_CHECKING:
     from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_session import MapSession
     from hsloc.slam.map_state import MapState
-    from hsloc.slam.parameters import GraphMapperParameters
+    from hsloc.slam.parameters import GraphMapperParameters, Resume
 
 _ATTEMPTS = 10
 """Places of the log, evenly chosen, from which the map is searched: it may begin outside of what was drawn."""
@@ -36,26 +34,21 @@ _AGREE = 2
 """So many places must be connected by a loop, where the log has so many."""
 
 
-def connect(
-    state: MapState,
-    log: MapSession,
-    parameters: GraphMapperParameters,
-    rng: Generator,
-    T_map_first: Pose2 | None = None,
-) -> MapSession:
-    """The saved map and the log in its frame, connected by loops; `T_map_first` is the log's start, if it is known.
+def connect(resume: Resume, log: MapSession, parameters: GraphMapperParameters, rng: Generator) -> MapSession:
+    """The saved map and the log in its frame, connected by loops.
 
     A place that is found is believed if loops between it and the old places around it pass all that is asked of a
     loop. Raises MapError if there is none.
     """
-    old = from_map_state(state, parameters)
-    found = _relocalised(state, log, parameters, rng) if T_map_first is None else iter([(T_map_first, 0)])
+    old = from_map_state(resume.state, parameters)
+    start = resume.T_map_first
+    found = _relocalised(resume, log, parameters, rng) if start is None else iter([(start, 0)])
     for T_map_front, scan in found:
         both = concatenate(old, log.moved(T_map_front))
         loops = _verified(both, both.first + scan, parameters, rng)
         if loops:
             return replace(both, known=(*both.known, *loops))
-    raise MapError(unconnected(state))
+    raise MapError(unconnected(resume.state))
 
 
 def unconnected(state: MapState) -> str:
@@ -67,12 +60,11 @@ def unconnected(state: MapState) -> str:
 
 
 def _relocalised(
-    state: MapState, log: MapSession, parameters: GraphMapperParameters, rng: Generator
+    resume: Resume, log: MapSession, parameters: GraphMapperParameters, rng: Generator
 ) -> Iterator[tuple[Pose2, int]]:
     """T_map_front by the relocaliser, and the keyscan of the log at which it was sure."""
-    field = LikelihoodField.from_grid(state.grid)
     noise = parameters.front_end.odometry_noise
-    relocaliser = Relocaliser(state.grid, field, Hide(), RelocaliserParameters(), noise, rng)
+    relocaliser = Relocaliser(resume.state.grid, resume.field, resume.matcher, resume.relocaliser, noise, rng)
     starts = log.places.start[:-1]
     for begin in starts[np.unique(np.linspace(0, len(starts) - 1, _ATTEMPTS).astype(np.int64))]:
         relocaliser.start()

@@ -11,6 +11,9 @@ from hsloc.slam.loop_matcher import LoopParameters
 from hsloc.slam.occupancy_mapper import OccupancyMapperParameters
 
 if TYPE_CHECKING:
+    from hsloc.localisation.relocaliser import RelocaliserParameters
+    from hsloc.matching.likelihood_field import LikelihoodField
+    from hsloc.matching.match import Matcher
     from hsloc.model.pose2 import Pose2
     from hsloc.slam.map_state import MapState
 
@@ -31,7 +34,13 @@ class GraphMapperParameters:
 
 @dataclass(frozen=True, slots=True)
 class Resume:
-    """A saved map to go on from, and where in it the log begins, if that is known."""
+    """A saved map to go on from, what searches it, and where in it the log begins, if that is known.
+
+    `field` is the likelihood field of the map; `matcher` and `relocaliser` find the log's place on it.
+    """
 
     state: MapState
+    field: LikelihoodField
+    matcher: Matcher
+    relocaliser: RelocaliserParameters
     T_map_first: Pose2 | None = None

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from hsloc.dataclass_json import Measured
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -22,35 +24,34 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class MappingQuality:
-    """How good a map is, as far as it can be told without the truth. NaN where nothing can be said.
+    """Consistency of a map, measured without the truth; NaN (null in JSON) where it cannot be measured."""
 
-    `residual_*` (m): distance of the scans' points to the nearest occupied cell of the final map. `scan_rms` (m):
-    of points to the walls of other scans, robustly weighted. `conflict`: part of the points that lie where
-    another scan looked through (people, doors, and wrong poses). `loop_*`: what the accepted loops measured against
-    where the final map has it (m, deg).
-    """
-
-    residual_median: float
-    residual_p95: float
-    scan_rms: float
-    conflict: float
+    residual_median: Measured
+    """Median distance from scan points to the nearest occupied cell of the map [m]."""
+    residual_p95: Measured
+    """Distance to the nearest occupied cell that 95 of 100 scan points stay below [m]."""
+    scan_rms: Measured
+    """Root mean square distance from points to the walls of other scans, robustly weighted [m]."""
+    conflict: Measured
+    """Fraction of the points that lie where another scan looked through, from 0 to 1."""
     loops: int
+    """Number of loops that were closed."""
     loops_refused: int
-    loop_median: float
-    loop_max: float
-    loop_angle_median_deg: float
-    loop_angle_max_deg: float
+    """Number of loop candidates that were rejected."""
+    loop_median: Measured
+    """Median distance between a loop's measurement and the final map [m]."""
+    loop_max: Measured
+    """Largest distance between a loop's measurement and the final map [m]."""
+    loop_angle_median_deg: Measured
+    """Median angle between a loop's measurement and the final map [deg]."""
+    loop_angle_max_deg: Measured
+    """Largest angle between a loop's measurement and the final map [deg]."""
     keyscans: int
+    """Number of scans that the map was built from."""
     passes: int
-    moved: float
-    """What 99 of 100 keyscans moved less than in the last round (m; rad: a fifth)."""
-
-    def to_dict(self) -> dict[str, float | int | None]:
-        """For JSON: NaN becomes None."""
-        from dataclasses import asdict
-        from math import isfinite
-
-        return {name: value if isfinite(value) else None for name, value in asdict(self).items()}
+    """Number of rounds of the joint registration."""
+    moved: Measured
+    """Distance that 99 of 100 keyscans moved less than in the last round [m; a rad counts as 5 m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,6 +9,7 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPool
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from hsloc.replay.run import interrupts_held_back
 from hsloc.sweep.runs import BROKEN, FAILED, STOP, Outcome, SweepRun, sweep
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def sweep_in_processes(
         if progress is not None and not _is_broken(outcome):
             progress(outcome)
 
-    with _threads(jobs), _interruptible(ProcessPoolExecutor(jobs, **_options())) as pool:
+    with _threads(jobs), _interruptible(_Pool(jobs, **_options())) as pool:
         outcomes = sweep(runs, folder, pool, tell)
     again = [index for index, outcome in enumerate(outcomes) if _is_broken(outcome)]
     if again:
@@ -54,6 +55,16 @@ def _options() -> dict[str, Any]:
 def _note_interrupts() -> None:
     """Ctrl-C ends a worker's run at its next scan: an exception out of the blue would leave halves behind."""
     signal.signal(signal.SIGINT, lambda *_: STOP.set())
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+class _Pool(ProcessPoolExecutor):
+    """Its processes hold back Ctrl-C until `_note_interrupts`: while they import, it would end in a traceback."""
+
+    def submit(self, call: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        with interrupts_held_back():
+            return super().submit(call, *arguments, **named)
 
 
 class _OneEach(Executor):
@@ -67,7 +78,7 @@ class _OneEach(Executor):
 
     @staticmethod
     def _alone(call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-        with ProcessPoolExecutor(1, **_options()) as pool:
+        with _Pool(1, **_options()) as pool:
             return pool.submit(call, *arguments, **named).result()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:

@@ -17,11 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.config import to_dict
 from hsloc.errors import HslocError
-from hsloc.export.results_folder import timings, write_results
+from hsloc.export.results_folder import write_results
 from hsloc.log import open_log
+from hsloc.options import OPTIONS
 from hsloc.replay.map_sources import map_file, state_file
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
+from hsloc.run_metrics import RunMetrics, RunTimings
 from hsloc.version import __version__
 
 if TYPE_CHECKING:
@@ -51,29 +53,32 @@ class SweepRun:
 class Outcome:
     """What became of a run: `done`, `skipped` (it was done before) or `failed` with the reason in `error`.
 
-    `metrics` and `timings` are the contents of the files of these names; None where the run failed.
+    `metrics` and `timings` are None where the run failed.
     """
 
     run: SweepRun
     state: str
     folder: Path
-    metrics: dict[str, Any] | None = None
-    timings: dict[str, Any] | None = None
+    metrics: RunMetrics | None = None
+    timings: RunTimings | None = None
     error: str = ""
 
     @property
     def data_lost(self) -> bool:
         """Whether part of the input could not be read."""
-        return self.metrics is not None and bool(self.metrics["losses"]["data_lost"])
+        return self.metrics is not None and self.metrics.losses.data_lost
 
 
 def plan(
     logs: Sequence[Path | Sequence[Path]],
-    configs: Mapping[str, Config],
+    configs: Mapping[str, Config | tuple[str, Config]],
     seeds: Iterable[int] = (0,),
     **common: Any,
 ) -> list[SweepRun]:
-    """All combinations; a sequence of paths is one log in parts. `common` are further fields of `RunRequest`."""
+    """All combinations; a sequence of paths is one log in parts. `common` are further options, or `read`.
+
+    A configuration may come with the name of its preset.
+    """
     runs: list[SweepRun] = []
     seeds = list(seeds)
     labels: dict[str, int] = {}
@@ -83,9 +88,11 @@ def plan(
         labels[label] = labels.get(label, 0) + 1
         if labels[label] > 1:
             label = f"{label}-{labels[label]}"
-        for name, config in configs.items():
+        for name, item in configs.items():
+            preset, config = item if isinstance(item, tuple) else ("default", item)
             for seed in seeds:
-                spec = RunRequest(logs=parts, config=config, seed=seed, **common)
+                values = {**common, "preset": preset, "config": config, "seed": seed}
+                spec = RunRequest.from_values(parts, values)
                 runs.append(SweepRun(f"{label}-{name}-seed{seed}".replace("/", "_"), label, name, spec))
     return runs
 
@@ -153,9 +160,9 @@ def do_run(item: SweepRun, folder: Path, key: str) -> Outcome:
     try:
         result = run(item.spec, _heed_stop)
         # Only what looks like a run of ours is replaced.
-        values = write_results(result, target, overwrite=(target / "metrics.json").exists(), progress=_heed_stop)
+        written = write_results(result, target, overwrite=(target / "metrics.json").exists(), progress=_heed_stop)
         (target / KEY_FILE).write_text(json.dumps({"key": key}) + "\n", encoding="utf-8")
-        return Outcome(item, DONE, target, values, timings(result))
+        return Outcome(item, DONE, target, written.metrics, written.timings)
     except HslocError as error:
         return Outcome(item, FAILED, target, error=str(error))
     except Exception as error:  # A defect of ours must not end the sweep; its trace is kept for the report of it.
@@ -176,11 +183,11 @@ def finished(item: SweepRun, folder: Path, key: str) -> Outcome | None:
     try:
         if json.loads((target / KEY_FILE).read_text(encoding="utf-8"))["key"] != key:
             return None
-        metrics = json.loads((target / "metrics.json").read_text(encoding="utf-8"))
-        times = json.loads((target / "timings.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, KeyError, TypeError):
+        metrics = RunMetrics.read(target / "metrics.json")
+        timings = RunTimings.from_json(json.loads((target / "timings.json").read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError, HslocError):
         return None
-    return Outcome(item, SKIPPED, target, metrics, times)
+    return Outcome(item, SKIPPED, target, metrics, timings)
 
 
 def run_key(spec: RunRequest, hashes: dict[Path, str] | None = None) -> str:
@@ -190,9 +197,11 @@ def run_key(spec: RunRequest, hashes: dict[Path, str] | None = None) -> str:
     """
     hashes = {} if hashes is None else hashes
     values: dict[str, Any] = {"hsloc": __version__}
+    limits = {option.target for option in OPTIONS if option.place == "check"}
     for item in fields(spec):
-        value = getattr(spec, item.name)
-        values[item.name] = to_dict(value) if item.name != "logs" else [path.name for path in value]
+        if item.name not in limits:  # They decide no file.
+            value = getattr(spec, item.name)
+            values[item.name] = to_dict(value) if item.name != "logs" else [path.name for path in value]
     if spec.map_path is not None:
         values["map_path"] = [
             spec.map_path.name,
@@ -200,6 +209,9 @@ def run_key(spec: RunRequest, hashes: dict[Path, str] | None = None) -> str:
         ]
     if spec.resume is not None:
         values["resume"] = [spec.resume.name, _digest(state_file(spec.resume), hashes)]
+    for name, path in (("relations", spec.relations), ("reference", spec.reference)):
+        if path is not None and Path(path).is_file():
+            values[name] = [Path(path).name, _digest(Path(path), hashes)]
     values["input"] = [_log_digest(path, hashes) for path in spec.logs]
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 

@@ -1,4 +1,4 @@
-"""The table that a sweep ends with: a row for each run, as text, CSV or JSON."""
+"""The table of a sweep: a row for each run, as text, CSV or JSON."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ COLUMNS = (
     "config",
     "seed",
     "state",
+    "verdict",
     "ape_m",
     "ape_deg",
     "rpe_m",
@@ -42,36 +43,42 @@ def rows(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:
-    metrics, times = outcome.metrics or {}, outcome.timings or {}
-
-    def value(*path: str, of: Any = metrics) -> Any:
-        for name in path:
-            of = of.get(name) if isinstance(of, dict) else None
-        return of
-
-    values = {
+    metrics, times = outcome.metrics, outcome.timings
+    errors = None if metrics is None else metrics.errors
+    relations = None if metrics is None else metrics.relations
+    values: dict[str, Any] = dict.fromkeys(COLUMNS)
+    values |= {
         "run": outcome.run.name,
         "log": outcome.run.log,
         "config": outcome.run.config,
         "seed": outcome.run.spec.seed,
         "state": outcome.state,
-        "ape_m": value("ape", "trans_part", "rmse"),
-        "ape_deg": value("ape", "angle_deg", "rmse"),
-        "rpe_m": value("rpe_1m", "trans_part", "rmse"),
-        "rpe_deg": value("rpe_1m", "angle_deg", "rmse"),
-        "relations_m": value("relations", "trans_part", "mean"),
-        "relations_deg": value("relations", "angle_deg", "mean"),
-        "scans": value("scans", "total"),
-        "used": value("scans", "used"),
-        "localised": value("localised", "share_of_odometry"),
-        "residual_m": value("map", "residuals", "median"),
-        "seconds": value("seconds", "replay", of=times),
-        "times_real_time": value("times_real_time", of=times),
         "data_lost": outcome.data_lost,
         "error": outcome.error,
     }
-    assert tuple(values) == COLUMNS
-    return values
+    if metrics is not None:
+        values |= {
+            "verdict": metrics.verdict.value,
+            "scans": metrics.scans.total,
+            "used": metrics.scans.used,
+            "localised": metrics.localised.share_of_poses,
+            "residual_m": metrics.map.residuals.median,
+        }
+    if errors is not None:
+        values |= {
+            "ape_m": errors.ape.trans_part.rmse,
+            "ape_deg": errors.ape.angle_deg.rmse,
+            "rpe_m": errors.rpe_1m.statistics.trans_part.rmse,
+            "rpe_deg": errors.rpe_1m.statistics.angle_deg.rmse,
+        }
+    if relations is not None:
+        values |= {
+            "relations_m": relations.statistics.trans_part.mean,
+            "relations_deg": relations.statistics.angle_deg.mean,
+        }
+    if times is not None:
+        values |= {"seconds": times.seconds["replay"], "times_real_time": times.times_real_time}
+    return {name: None if value != value else value for name, value in values.items()}
 
 
 def as_json(outcomes: Sequence[Outcome]) -> str:
@@ -91,6 +98,7 @@ def as_csv(outcomes: Sequence[Outcome]) -> str:
 _SHOWN = (
     ("run", "run", "{}"),
     ("state", "state", "{}"),
+    ("verdict", "verdict", "{}"),
     ("ape_m", "APE [m]", "{:.4f}"),
     ("ape_deg", "APE [deg]", "{:.3f}"),
     ("rpe_m", "RPE [m]", "{:.4f}"),
@@ -102,7 +110,7 @@ _SHOWN = (
 
 
 def as_text(outcomes: Sequence[Outcome]) -> str:
-    """For people; columns that no run has a value for are left out, and reasons of failures stand below."""
+    """For people; columns that no run has a value for are left out, and reasons of failures are below."""
     found = rows(outcomes)
     shown = [item for item in _SHOWN if any(row[item[0]] is not None for row in found)]
     lines = [[title for _, title, _ in shown]]

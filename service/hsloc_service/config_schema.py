@@ -88,10 +88,11 @@ def _wrong(where: str, what: str) -> ServiceError:
 
 
 def _describe() -> dict[str, Any]:
-    from hsloc.config import MAPPERS, MATCHERS, PRESETS, Config, preset, to_dict
+    from hsloc.config import Config, preset, to_dict
+    from hsloc.options import MAPPERS, MATCHER_ALIASES, MATCHERS, PRESETS
 
     schema = _schema(Config, Config())
-    schema["properties"]["matcher"]["enum"] = list(MATCHERS)
+    schema["properties"]["matcher"]["enum"] = [*MATCHERS, *MATCHER_ALIASES]
     schema["properties"]["mapper"]["enum"] = list(MAPPERS)
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     return {"config_schema": schema, "presets": {name: to_dict(preset(name)) for name in PRESETS}}

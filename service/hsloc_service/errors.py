@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import sqlite3
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sqlalchemy.exc import OperationalError
+
 
 class ServiceError(Exception):
     """An answer other than success: HTTP status, a word for programs, a sentence for people."""
@@ -29,6 +35,11 @@ def busy(message: str, retry_after_s: float) -> ServiceError:
 def no_space(message: str) -> ServiceError:
     """The disk, or the tenant's part of it, is full."""
     return ServiceError(507, "no_space", message, {"Retry-After": "60"})
+
+
+def is_disk_full(error: OperationalError) -> bool:
+    """Whether SQLite failed because the disk is full, by its error code and not by its words."""
+    return getattr(error.orig, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
 
 
 class StoreError(Exception):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy.exc import OperationalError
 
-from hsloc_service.errors import no_space
+from hsloc_service.errors import is_disk_full, no_space
 from hsloc_service.settings import SettingsError
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class Storage:
         try:
             work()
         except OperationalError as error:
-            if "full" not in str(error.orig):
+            if not is_disk_full(error):
                 raise
             self.drop_ballast()
             work()

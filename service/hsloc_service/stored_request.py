@@ -4,18 +4,25 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from hsloc.options import OPTIONS
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 MAP_STATE = "map.npz"
 """The asset of a mapping run that a later run extends."""
-LATER = ("log", "logs", "relations", "resume")
-"""Keys that are left out where they are None: an Idempotency-Key from before they were there still fits its request."""
+UPLOADS = tuple(each.name for each in OPTIONS if each.is_upload)
+"""Options that name an upload."""
+ALWAYS = (
+    "mode", "matcher", "mapper", "preset", "seed", "initial_pose", "unknown_start", "no_odometry", "alignment", "read",
+    "config", "map", "webhook",
+)  # fmt: skip
+"""Keys that are kept where they are None, as in version 0.1: an Idempotency-Key from then still fits its request."""
 
 
 def plain(request: Mapping[str, Any]) -> dict[str, Any]:
     """The request as it is kept."""
-    return {key: value for key, value in request.items() if key not in LATER or value is not None}
+    return {key: value for key, value in request.items() if key in ALWAYS or value is not None}
 
 
 def logs_of(request: Mapping[str, Any]) -> list[str]:
@@ -26,5 +33,5 @@ def logs_of(request: Mapping[str, Any]) -> list[str]:
 def files_of(request: Mapping[str, Any]) -> list[str]:
     """Ids of all uploads that the job reads."""
     chart = request.get("map") or {}
-    relations = request.get("relations")
-    return [*logs_of(request), *chart.values(), *([] if relations is None else [relations])]
+    more = [request[name] for name in UPLOADS if request.get(name) is not None]
+    return [*logs_of(request), *chart.values(), *more]

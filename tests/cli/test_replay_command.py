@@ -18,7 +18,7 @@ def test_replay_prints_a_table_and_links_the_latest(tmp_path, monkeypatch, capsy
     monkeypatch.chdir(tmp_path)
     assert main(["replay", SLIP, "--end", "12"]) == 0
     printed = capsys.readouterr()
-    assert "APE [m]" in printed.out
+    assert "APE rmse" in printed.out
     assert "results: results/slip-" in printed.out
     assert printed.err == ""
     latest = tmp_path / "results" / "latest"

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hsloc.dataclass_json import to_json
 from hsloc.errors import EvaluationError
-from hsloc.evaluation.map_quality import Residuals, compare_maps, crispness
+from hsloc.evaluation.map_quality import compare_maps, crispness
 from hsloc.model import OccupancyGrid, Pose2
 
 
@@ -23,13 +24,6 @@ def walls(*columns, height=80, width=40, resolution=0.05):
     cells = np.zeros((height, width), dtype=np.int8)
     cells[:, list(columns)] = 100
     return OccupancyGrid(cells, resolution)
-
-
-def test_residuals_by_hand():
-    residuals = Residuals.of(np.array([[0.0, 0.1], [0.2, np.inf]]))
-    assert (residuals.median, residuals.mean, residuals.count) == pytest.approx((0.1, 0.1, 3))
-    assert residuals.p95 == pytest.approx(0.19)
-    assert Residuals.of(np.array([])).to_dict() == {"median": None, "p95": None, "mean": None, "count": 0}
 
 
 def test_a_wall_reads_its_own_thickness():
@@ -82,10 +76,10 @@ def test_occupancy_entropy():
 
 def test_a_map_without_walls():
     empty = picture("... ...")
-    assert crispness(empty).to_dict()["wall_thickness_median"] is None
+    assert to_json(crispness(empty))["wall_thickness_median"] is None
     with pytest.raises(EvaluationError, match="true map holds no occupied cell"):
         compare_maps(walls(3), empty)
-    result = compare_maps(empty, walls(3)).to_dict()
+    result = to_json(compare_maps(empty, walls(3)))
     assert (result["precision"], result["recall"], result["map_cells"]) == (None, 0.0, 0)
 
 

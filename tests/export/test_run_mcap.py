@@ -89,7 +89,7 @@ def test_the_page_tells_what_was_read_how_it_converged_and_where_the_origin_is(r
     assert '<g class="axes"' in page
     (name,) = re.findall(r"Convergence: (.*?) <", page)
     assert name == "HIDE, 25 scans, ±0.5 m, ±20°"
-    assert "Remarks" not in page
+    assert "<h2>Warnings</h2>" not in page
 
 
 def test_the_page_tells_warnings_and_the_checksums_of_a_map_that_was_given(results, tmp_path):
@@ -105,6 +105,7 @@ def test_the_page_tells_warnings_and_the_checksums_of_a_map_that_was_given(resul
         assert f"{name}</th>" in page
         assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() in page
     (warning,) = json.loads((out / "metrics.json").read_text())["warnings"]
-    assert "free_thresh 0.25" in warning
-    assert re.search(r"<h2>Remarks</h2><ul><li>[^<]*free_thresh 0\.25", page)
+    assert warning["code"] == "map_unknown_read_as_free"
+    assert "free_thresh 0.25" in warning["text"]
+    assert re.search(r"<h2>Warnings</h2><ul><li>[^<]*free_thresh 0\.25", page)
     assert "Convergence" not in page  # ICP does not search

@@ -294,6 +294,6 @@ def test_real_logs() -> None:
         pytest.skip("no real logs; set HSLOC_DATA")
     intel = found(DATA / "intel" / "intel.clf.gz")
     assert intel["stamp_backwards"][0] == "error"
-    assert "opening_0" in intel  # nothing says where the laser stands
+    assert "no_extrinsic" in intel
     turtlebot = check_log(open_log(DATA / "turtlebot4" / "mcap_zstd", ALL))
     assert not turtlebot.has_errors

@@ -110,7 +110,7 @@ def test_a_map_that_cannot_be_used_is_told(tmp_path: Path, capsys: pytest.Captur
     fields = [{"name": "value", "offset": 0, "type": 7}]
     logs = [str(without_map(tmp_path / "hall.mcap")), str(grid_log(tmp_path / "grid.mcap", fields=fields))]
     assert main(["replay", *logs, "--end", "2", "--out", str(tmp_path / "out")]) == 0
-    assert "cannot use /map (foxglove.Grid), so one is drawn; to localise on a map give it with --map" in (
+    assert "cannot use /map (foxglove.Grid), so a map is built; to localise on a map give it with --map" in (
         capsys.readouterr().err
     )
     assert main(["replay", *logs, "--mode", "localise", "--out", str(tmp_path / "no")]) == 1
@@ -122,12 +122,12 @@ def test_a_map_beside_the_log_is_told_but_not_taken(tmp_path: Path, capsys: pyte
     options = ["--end", "2", "--overwrite", "--out", str(tmp_path / "out" / "run")]
     (tmp_path / "config.yaml").write_text("resolution: 1\n")
     assert main(["replay", log, *options]) == 0
-    assert "draw" not in capsys.readouterr().err
+    assert "built" not in capsys.readouterr().err
     (tmp_path / "floor.yaml").write_text("image: floor.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
     assert main(["replay", log, *options]) == 0
     captured = capsys.readouterr()
-    assert f"so one is drawn; to localise on a map give it with --map {tmp_path / 'floor.yaml'}" in captured.err
-    assert "map drawn from" in captured.out
+    assert f"so a map is built; to localise on a map give it with --map {tmp_path / 'floor.yaml'}" in captured.err
+    assert "map built from" in captured.out
     # Asked for, or with the map of the log, there is nothing to tell.
     assert main(["replay", log, *options, "--mode", "slam"]) == 0
-    assert "draw" not in capsys.readouterr().err
+    assert "built" not in capsys.readouterr().err

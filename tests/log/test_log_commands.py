@@ -36,7 +36,7 @@ def test_info_says_what_is_there_and_what_is_read(tmp_path: Path, capsys: pytest
     assert "frames: odom -> base_link -> laser" in lines
     assert "laser: x 0.200 m, y 0.000 m, yaw 0.5000 rad (/tf_static)" in lines
     assert "events: 80 odometry, 40 scan, 40 truth" in lines
-    assert "no remarks" in lines
+    assert "no warnings" in lines
 
 
 def test_info_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -54,7 +54,7 @@ def test_info_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert report["events"] == {"odometry": 1, "scan": 1}
     assert report["scan_topic"] == "/scan"
     assert report["data_lost"] is False
-    assert "--laser-pose" in report["warnings"][0]
+    assert "--laser-pose" in report["warnings"][0]["remedy"]
 
 
 def test_info_of_a_damaged_log_names_the_damage_once_and_ends_with_3(

@@ -29,6 +29,7 @@ from hsloc.log.summary import Losses, ReadOptions
 from hsloc.log.transforms import Transform3
 from hsloc.log.writer import LogWriter
 from hsloc.model import IDENTITY, OccupancyGrid, Odometry, Pose2, Scan, Truth
+from hsloc.warnings import WarningCode
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -140,7 +141,8 @@ def test_a_tilted_laser_is_warned_of(tmp_path: Path) -> None:
         [("base_link", "laser", Transform3((0, 0, 0), (0.0, np.sin(tilt / 2), 0.0, np.cos(tilt / 2))))],
     )
     (warning,) = open_log(path).summary.warnings
-    assert "tilted by 10.0 deg" in warning
+    assert warning.code == WarningCode.LASER_TILTED
+    assert "tilted by 10.0 deg" in warning.text
 
 
 def test_the_mounting_may_stand_in_tf(tmp_path: Path) -> None:
@@ -160,7 +162,7 @@ def test_a_mounting_that_moves_is_warned_of(tmp_path: Path) -> None:
         log.transforms(START + 1, [("base_link", "laser", Pose2(0, 0, 1))])
     summary = open_log(path).summary
     assert summary.T_base_laser.theta == pytest.approx(1.0)
-    assert "mounting moves" in summary.warnings[0]
+    assert summary.warnings[0].code == WarningCode.LASER_MOVES
 
 
 def test_without_a_transform_the_laser_is_in_the_base_and_a_warning_says_so(tmp_path: Path) -> None:
@@ -168,8 +170,9 @@ def test_without_a_transform_the_laser_is_in_the_base_and_a_warning_says_so(tmp_
     summary = open_log(path).summary
     assert (summary.extrinsics, summary.T_base_laser) == ("identity", IDENTITY)
     (warning,) = summary.warnings
-    assert "from base_link to laser" in warning
-    assert "--laser-pose" in warning
+    assert warning.code == WarningCode.EXTRINSICS_ASSUMED
+    assert "from base_link to laser" in warning.text
+    assert "--laser-pose" in warning.remedy
 
 
 def test_frames_of_ros_1_lose_their_slash(tmp_path: Path) -> None:
@@ -334,7 +337,8 @@ def test_two_scan_topics_must_be_chosen_from(tmp_path: Path) -> None:
     assert open_log(path, ReadOptions(scan_topic="scan_rear")).summary.scan_topic == "/scan_rear"
     summary = open_log(path, ALL).summary
     assert summary.scan_topic is None
-    assert "--scan-topic" in summary.warnings[0]
+    assert summary.warnings[0].code == WarningCode.TOPIC_AMBIGUOUS
+    assert "--scan-topic" in summary.warnings[0].remedy
 
 
 def test_two_odometry_topics_must_be_chosen_from(tmp_path: Path) -> None:
@@ -358,7 +362,7 @@ def test_no_odometry_is_an_error_unless_it_is_allowed(tmp_path: Path) -> None:
         open_log(path)
     log = open_log(path, ReadOptions(require_odometry=False))
     assert [type(event) for event in log.events()] == [Scan]
-    assert any("no odometry topic" in warning for warning in log.summary.warnings)
+    assert any(warning.code == WarningCode.TOPIC_MISSING for warning in log.summary.warnings)
 
 
 @pytest.mark.parametrize(
@@ -518,7 +522,7 @@ def test_different_clocks_are_warned_of(tmp_path: Path) -> None:
     with LogWriter(path) as log:
         log.odometry(START, Pose2())
         log.scan(make_scan(36 * SECOND), log_time_ns=START)
-    assert any("may be of different clocks" in warning for warning in open_log(path).summary.warnings)
+    assert any(warning.code == WarningCode.CLOCKS_APART for warning in open_log(path).summary.warnings)
 
 
 # Mistakes

@@ -118,7 +118,7 @@ def test_a_gap_of_hours_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[st
     late = copy(source, tmp_path / "late.mcap", lambda topic, seconds: 20.0 <= seconds < 40.0, later_s=7500)
     assert main(["info", str(early), str(late)]) == 0
     text = capsys.readouterr().out
-    assert f"{late} begins 2 h 05 min after {early} ends: if that is another drive, run each by itself" in text
+    assert f"{late} begins 2 h 05 min after {early} ends; if that is another run, replay each file by itself" in text
     assert f"part:      7520.000 to 7539.960 s: {late}" in text
     assert main(["info", str(early), str(late), "--json"]) == 0
     parts = json.loads(capsys.readouterr().out)["parts"]
@@ -134,7 +134,7 @@ def test_a_gap_of_hours_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[st
         (100.0, 0.1, "refused"),
         (100.0, 30.0, "the odometry is 97.1 m away when .* goes on, 30.0 s from the end of"),
         (4.5, 0.1, "the odometry is 1.6 m away"),
-        (0.0, 10.0, "the odometry begins anew with .*late.mcap"),
+        (0.0, 10.0, "the odometry starts again from zero with .*late.mcap"),
         (8.0, 10.0, None),
     ],
 )
@@ -159,7 +159,7 @@ def test_odometry_that_is_elsewhere(tmp_path: Path, odometry: str, x: float, gap
         with pytest.raises(LogError, match=r"the odometry is 97\.1 m away .* so they are not parts of one run"):
             open_log([early, late])
         return
-    warnings = [line for line in open_log([early, late]).summary.warnings if "odometry" in line]
+    warnings = [str(each) for each in open_log([early, late]).summary.warnings if "odometry" in each.code]
     if told is None:
         assert warnings == []
     else:
@@ -185,6 +185,6 @@ def test_odometry_that_begins_anew_far_away_is_a_driver_that_was_started_again(t
                 log.odometry(stamp, Pose2(begin + n / 10.0, 0.0, 0.0))
                 log.scan(make_scan(stamp, n))
     warnings = open_log(parts).summary.warnings
-    assert [line for line in warnings if "odometry" in line] == [
-        f"the odometry begins anew with {parts[1]}: if that is another drive, run each by itself"
+    assert [str(each) for each in warnings if "odometry" in each.code] == [
+        f"the odometry starts again from zero with {parts[1]}; if that is another run, replay each file by itself"
     ]

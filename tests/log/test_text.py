@@ -78,7 +78,7 @@ def test_each_line_is_an_event_in_the_order_of_the_file(tmp_path: Path, name: st
     summary = log.summary
     assert (summary.format, summary.scan_topic, summary.odom_topic) == ("CARMEN", "FLASER", "ODOM")
     assert (summary.order, summary.extrinsics) == ("log", "identity")
-    assert "--laser-pose" in summary.warnings[0]
+    assert "--laser-pose" in summary.warnings[0].remedy
 
 
 def test_the_laser_pose_may_be_given(tmp_path: Path) -> None:

@@ -6,20 +6,23 @@ import base64
 import io
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from evaluation_paths import diagnostics_of, drive, estimate_of, odometry_of, office
 from PIL import Image
+from sample_metrics import sample_metrics
 
 from hsloc.errors import OutputError
-from hsloc.evaluation.metrics import evaluate
+from hsloc.evaluation.metrics import compare
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
+from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.report.data import prepare
 from hsloc.report.html import Provenance, time_charts, write_report_html
-from hsloc.report.svg_charts import Chart, chart_svg, runs, ticks
-from hsloc.report.svg_map import MOST_MARKS, map_svg
+from hsloc.report.svg import MOST_MARKS, Chart, chart_svg, map_svg, runs, ticks
+from hsloc.warnings import RunWarning
 
 NASTY = "<script>alert('x')</script> & \"quoted\" {{data}} {{nothing}} ]]> <b>"
 VOID = {"meta", "input", "br", "link"}
@@ -30,13 +33,17 @@ def run():
     rng = np.random.default_rng(3)
     truth = drive([(-10, -4), (-10, 0), (0, 0), (0, 4), (0, 0), (8, 0)], rate_hz=20.0)
     estimate = estimate_of(rng, truth)
+    comparison = compare(estimate, truth)
+    odometry, grid = odometry_of(rng, truth), office(rng)
+    diagnostics = diagnostics_of(rng, truth, lost=((10.0, 15.0),), rejected=0.03)
     return {
         "trajectory": estimate,
-        "odometry": odometry_of(rng, truth),
+        "odometry": odometry,
         "reference": truth,
-        "grid": office(rng),
-        "diagnostics": diagnostics_of(rng, truth, lost=((10.0, 15.0),), rejected=0.03),
-        "metrics": evaluate(estimate, truth).to_dict(),
+        "grid": grid,
+        "diagnostics": diagnostics,
+        "metrics": sample_metrics(comparison, diagnostics),
+        "comparison": comparison,
     }
 
 
@@ -91,7 +98,23 @@ def test_it_is_whole_the_same_and_loads_nothing(run, tmp_path):
     layers = {attributes.get("data-layer") for attributes in page.all("g")}
     assert layers >= {"map", "trajectory", "reference", "odometry", "rejected", "relocalised"}
     assert {attributes["data-toggle"] for attributes in page.all("input")} <= layers
-    assert f"{run['metrics']['ape']['trans_part']['rmse']:.4f}" in page.within("td")
+    assert f"{run['metrics'].errors.ape.trans_part.rmse:.4f}" in page.within("td")
+
+
+def nasty_metrics(run):
+    metrics = run["metrics"]
+    warning, reason = RunWarning(NASTY, NASTY, NASTY), VerdictReason(Verdict.CHECK, NASTY, NASTY + "!", NASTY)
+    return replace(
+        metrics,
+        verdict=Verdict.CHECK,
+        verdict_reasons=(reason,),
+        run=replace(metrics.run, map=NASTY, matcher=NASTY),
+        log=replace(metrics.log, reference=NASTY, lasers=(replace(metrics.log.lasers[0], topic=NASTY),)),
+        scans=replace(metrics.scans, by_status={NASTY: 1}),
+        losses=replace(metrics.losses, notes=(NASTY,)),
+        warnings=(warning,),
+        evaluation_error=NASTY,
+    )
 
 
 def test_text_is_text(run, tmp_path):
@@ -99,7 +122,7 @@ def test_text_is_text(run, tmp_path):
     reasons = tuple(NASTY if reason else "" for reason in diagnostics.reason)
     object.__setattr__(diagnostics, "reason", reasons)
     provenance = Provenance(NASTY, NASTY, {NASTY: NASTY}, {NASTY: NASTY})
-    arguments = {**run, "diagnostics": diagnostics, "metrics": {**run["metrics"], NASTY: {"trans_part": {"rmse": 1.0}}}}
+    arguments = {**run, "diagnostics": diagnostics, "metrics": nasty_metrics(run)}
     text, page = write(tmp_path, **{**arguments, "title": NASTY}, provenance=provenance, convergence={
         NASTY: (np.arange(5.0), np.linspace(0.5, 0.9, 5))
     })  # fmt: skip
@@ -121,12 +144,14 @@ def test_the_script_finds_its_data(run, tmp_path):
     curve = data["charts"]["error_cm"]
     assert len(curve["t"]) == len(curve["v"])
     assert np.sqrt(np.mean(np.square(curve["v"]))) / 100 == pytest.approx(
-        run["metrics"]["ape"]["trans_part"]["rmse"], rel=0.2
+        run["metrics"].errors.ape.trans_part.rmse, rel=0.2
     )
     assert data["path"]["x"][0] == pytest.approx(run["trajectory"].poses[0, 0], abs=1e-5)
 
 
-@pytest.mark.parametrize("kept", [(), ("grid",), ("diagnostics",), ("reference",), ("odometry", "metrics")])
+@pytest.mark.parametrize(
+    "kept", [(), ("grid",), ("diagnostics",), ("reference",), ("odometry", "metrics"), ("reference", "comparison")]
+)
 def test_any_part_may_be_missing(run, tmp_path, kept):
     write(tmp_path, trajectory=run["trajectory"], **{name: run[name] for name in kept})
     nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
@@ -159,7 +184,7 @@ def test_the_embedded_map_is_the_map():
     cells[1:5, 2:7] = 0
     cells[1, 3] = 100
     svg, _ = map_svg(
-        prepare(Trajectory(np.zeros(0, np.int64), np.zeros((0, 3))), None, None, None, {}),
+        prepare(Trajectory(np.zeros(0, np.int64), np.zeros((0, 3))), None, None, None),
         OccupancyGrid(cells, 0.5, Pose2(10.0, 20.0, 0.0)),
         None,
     )
@@ -180,7 +205,7 @@ def test_a_path_is_drawn_true_and_thin():
     n = 200_000
     poses = np.column_stack((np.cumsum(rng.normal(0, 0.01, (n, 2)), axis=0) + 5e5, np.zeros(n)))
     path = Trajectory(np.arange(n, dtype=np.int64) * 10**7, poses)
-    svg, extent = map_svg(prepare(path, None, None, None, {}), None, None)
+    svg, extent = map_svg(prepare(path, None, None, None), None, None)
     assert len(svg) < 800_000
     (d,) = re.findall(r'class="trajectory" d="M([^"]*)"', svg)
     drawn = np.array([[float(number) for number in point.split()] for point in d.split("L")])
@@ -199,7 +224,7 @@ def test_many_marks_are_thinned(run):
     rng = np.random.default_rng(0)
     path = Trajectory(np.arange(n, dtype=np.int64) * 10**8, np.cumsum(rng.normal(0, 1, (n, 3)), axis=0))
     diagnostics = diagnostics_of(rng, path, every=1, rejected=1.0)
-    svg, _ = map_svg(prepare(path, None, None, diagnostics, {}), None, None)
+    svg, _ = map_svg(prepare(path, None, None, diagnostics), None, None)
     assert svg.count("rejected at") <= MOST_MARKS
 
 
@@ -217,7 +242,7 @@ def test_charts_by_hand():
 
 
 def test_a_chart_breaks_where_the_pose_was_lost(run):
-    data = prepare(run["trajectory"], None, None, run["diagnostics"], {})
+    data = prepare(run["trajectory"], None, None, run["diagnostics"])
     (fitness,) = [chart for chart in time_charts(data) if chart.name == "fitness"]
     svg = chart_svg(fitness, 30.0)
     (d,) = re.findall(r'class="line green" d="([^"]*)"', svg)
@@ -226,7 +251,7 @@ def test_a_chart_breaks_where_the_pose_was_lost(run):
 
 
 def test_a_wide_range_is_drawn_on_powers_of_ten(run):
-    data = prepare(run["trajectory"], None, run["reference"], None, {})
+    data = prepare(run["trajectory"], None, run["reference"], None, run["comparison"])
     (chart,) = [chart for chart in time_charts(data) if chart.name == "error_cm"]
     chart.curve.values[10] = 5000.0
     labels = re.findall(r'text-anchor="end">([\d.]+)<', chart_svg(Chart("a", "a", "cm", chart.curve), 30.0))

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import matplotlib
 import numpy as np
 import pytest
 from evaluation_paths import diagnostics_of, drive, estimate_of, odometry_of, office
 from PIL import Image
+from sample_metrics import sample_metrics
 
 from hsloc.errors import OutputError
-from hsloc.evaluation.metrics import evaluate
+from hsloc.evaluation import PoseStatistics, RelationsResult, Statistics
+from hsloc.evaluation.map_quality import MapComparison
+from hsloc.evaluation.metrics import compare
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
 from hsloc.model.pose2 import compose_poses
 from hsloc.report.data import Curve, prepare, reason_counts, status_counts
 from hsloc.report.map_image import darkest_of_blocks, grey_levels, line_width, shown_extent
 from hsloc.report.png import draw_report
-from hsloc.report.png_charts import time_panels
-from hsloc.report.png_map import format_round_length, round_length
+from hsloc.report.png_panels import format_round_length, round_length, time_panels
 from hsloc.report.table import format_angle, format_duration, format_length, table_rows
+from hsloc.run_metrics import MapMetrics, ResidualMetrics
 
 NOTHING = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
 
@@ -27,13 +32,17 @@ def run():
     rng = np.random.default_rng(3)
     truth = drive([(-10, -4), (-10, 0), (0, 0), (0, 4), (0, 0), (8, 0)], rate_hz=20.0)
     estimate = estimate_of(rng, truth)
+    comparison = compare(estimate, truth)
+    odometry, grid = odometry_of(rng, truth), office(rng)
+    diagnostics = diagnostics_of(rng, truth, lost=((10.0, 15.0),), rejected=0.03)
     return {
         "trajectory": estimate,
-        "odometry": odometry_of(rng, truth),
+        "odometry": odometry,
         "reference": truth,
-        "grid": office(rng),
-        "diagnostics": diagnostics_of(rng, truth, lost=((10.0, 15.0),), rejected=0.03),
-        "metrics": evaluate(estimate, truth).to_dict(),
+        "grid": grid,
+        "diagnostics": diagnostics,
+        "metrics": sample_metrics(comparison, diagnostics),
+        "comparison": comparison,
     }
 
 
@@ -59,10 +68,10 @@ def test_the_same_run_gives_the_same_bytes(run, tmp_path):
     "without",
     [
         (),
-        ("reference", "metrics"),
+        ("reference", "metrics", "comparison"),
         ("grid",),
         ("odometry", "diagnostics"),
-        ("odometry", "reference", "grid", "diagnostics", "metrics"),
+        ("odometry", "reference", "grid", "diagnostics", "metrics", "comparison"),
     ],
 )
 def test_any_part_may_be_missing(run, tmp_path, without):
@@ -97,8 +106,7 @@ def test_no_pose_one_pose_and_a_reference_of_another_time(run, tmp_path):
     )
     draw_report(tmp_path / "a.png", title="one", trajectory=one, reference=one, odometry=one)
     other = Trajectory(run["reference"].stamps_ns + 10**12, run["reference"].poses)
-    data = prepare(run["trajectory"], None, other, None, {})
-    assert data.errors is None
+    assert prepare(run["trajectory"], None, other, None).errors is None
     draw_report(tmp_path / "a.png", title="other", trajectory=run["trajectory"], reference=other)
 
 
@@ -112,7 +120,7 @@ def test_an_unknown_map_and_a_turned_one(run, tmp_path):
     unknown = OccupancyGrid(np.full((10, 10), -1, dtype=np.int8), 0.05)
     draw_report(tmp_path / "a.png", title="unknown", trajectory=run["trajectory"], grid=unknown)
     turned = OccupancyGrid(grid.cells, grid.resolution, Pose2(1.0, 2.0, 0.5))
-    extent = shown_extent(prepare(NOTHING, None, None, None, {}), turned, None)
+    extent = shown_extent(prepare(NOTHING, None, None, None), turned, None)
     known = turned.centres(grid.cells >= 0)
     assert extent.x0 < known[:, 0].min()
     assert extent.y1 > known[:, 1].max()
@@ -121,15 +129,15 @@ def test_an_unknown_map_and_a_turned_one(run, tmp_path):
 def test_only_the_surroundings_of_a_short_path_are_shown(run):
     grid = office(np.random.default_rng(0), width_m=300.0, height_m=60.0, resolution=0.2, noise=False)
     short = Trajectory(run["trajectory"].stamps_ns[:2], np.array([[100.0, 0.0, 0.0], [104.0, 0.0, 0.0]]))
-    extent = shown_extent(prepare(short, None, None, None, {}), grid, None)
+    extent = shown_extent(prepare(short, None, None, None), grid, None)
     assert (extent.x0, extent.x1) == pytest.approx((90.0 - 1.2, 114.0 + 1.2))
     assert (extent.y0, extent.y1) == pytest.approx((-10.0 - 1.2, 10.0 + 1.2))
-    path = prepare(run["trajectory"], None, None, None, {})
+    path = prepare(run["trajectory"], None, None, None)
     extent = shown_extent(path, run["grid"], None)
     assert extent.width == pytest.approx(24.0 * 1.1, rel=0.01)
     assert line_width(path, extent) == 3.0
     many_laps = Trajectory(np.arange(4000, dtype=np.int64), np.tile([[0.0, 0, 0], [5, 0, 0]], (2000, 1)))
-    assert line_width(prepare(many_laps, None, None, None, {}), extent) == pytest.approx(1.6)
+    assert line_width(prepare(many_laps, None, None, None), extent) == pytest.approx(1.6)
 
 
 def test_where_it_cannot_be_written(run, tmp_path):
@@ -138,28 +146,27 @@ def test_where_it_cannot_be_written(run, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_odometry_sets_out_from_the_first_believed_pose(run):
-    data = prepare(run["trajectory"], run["odometry"], None, run["diagnostics"], {})
-    np.testing.assert_allclose(data.odometry[0], data.path[0], atol=1e-9)
+def test_poses_are_known_where_the_result_says_so_else_where_no_scan_was_lost(run):
+    known = np.arange(len(run["trajectory"])) > 7
+    assert prepare(run["trajectory"], None, None, run["diagnostics"], localised=known).localised is known
     lost = diagnostics_of(np.random.default_rng(1), run["reference"], lost=((0.0, 5.0),))
-    data = prepare(run["trajectory"], run["odometry"], None, lost, {})
-    row = int(np.argmax(data.believed))
-    assert data.seconds[row] == pytest.approx(5.0, abs=0.3)
-    np.testing.assert_allclose(data.odometry[row], data.path[row], atol=1e-9)
+    data = prepare(run["trajectory"], None, None, lost)
+    assert data.seconds[int(np.argmax(data.localised))] == pytest.approx(5.0, abs=0.3)
 
 
 def test_an_aligned_reference_is_drawn_over_the_trajectory(run):
     away = Trajectory(
         run["reference"].stamps_ns, compose_poses(Pose2(30.0, 5.0, 1.0).to_array(), run["reference"].poses)
     )
-    data = prepare(run["trajectory"], None, away, None, {"alignment": "se2"})
+    data = prepare(run["trajectory"], None, away, None, compare(run["trajectory"], away, alignment="se2"))
     assert np.abs(data.reference - data.path).max() < 0.1
     assert data.errors.translation_m.values.max() < 0.1
-    assert prepare(run["trajectory"], None, away, None, {}).errors.translation_m.values.max() > 10.0
+    unaligned = compare(run["trajectory"], away)
+    assert prepare(run["trajectory"], None, away, None, unaligned).errors.translation_m.values.max() > 10.0
 
 
 def test_lost_spans_and_counts(run):
-    scans = prepare(run["trajectory"], None, None, run["diagnostics"], {}).scans
+    scans = prepare(run["trajectory"], None, None, run["diagnostics"]).scans
     ((begin, until),) = scans.lost
     assert (begin, until) == pytest.approx((10.0, 15.0), abs=0.3)
     counts = status_counts(scans)
@@ -172,16 +179,16 @@ def test_reasons_that_differ_in_figures_are_one(run):
     diagnostics = diagnostics_of(np.random.default_rng(0), run["reference"], rejected=0.2)
     reasons = [f"fitness {0.3 + i / 1e4:.4f} below 0.55" if r else "" for i, r in enumerate(diagnostics.reason)]
     object.__setattr__(diagnostics, "reason", tuple(reasons))
-    scans = prepare(run["trajectory"], None, None, diagnostics, {}).scans
+    scans = prepare(run["trajectory"], None, None, diagnostics).scans
     counted = {status: (reason, count) for status, reason, count in reason_counts(scans)}
     first = next(reason for reason, status in zip(reasons, diagnostics.status, strict=True) if status == "rejected")
     assert counted["rejected"] == (f"fitness … below … (first: {first})", diagnostics.status.count("rejected"))
 
 
 def test_the_curves_are_the_errors(run):
-    data = prepare(run["trajectory"], None, run["reference"], None, run["metrics"])
+    data = prepare(run["trajectory"], None, run["reference"], None, run["comparison"])
     rmse = float(np.sqrt(np.mean(data.errors.translation_m.values**2)))
-    assert rmse == pytest.approx(run["metrics"]["ape"]["trans_part"]["rmse"])
+    assert rmse == pytest.approx(run["metrics"].errors.ape.trans_part.rmse)
     assert [panel.title for panel in time_panels(data)] == ["translation error [cm]", "rotation error [deg]"]
 
 
@@ -222,22 +229,23 @@ def test_other_formats():
     assert [format_round_length(x) for x in (0.005, 0.2, 5.0, 2000.0)] == ["5 mm", "20 cm", "5 m", "2 km"]
 
 
-def test_the_table_takes_what_metrics_hold(run):
-    data = prepare(run["trajectory"], run["odometry"], run["reference"], run["diagnostics"], run["metrics"])
-    metrics = {
-        **run["metrics"],
-        "relations": {"trans_part": {"mean": 0.031, "std": 0.026}, "angle_deg": {"mean": 1.3, "std": 4.7}},
-        "map": {"residuals": {"median": 0.012, "p95": 0.06}, "comparison": {"precision": 0.98, "recall": None}},
-    }
-    rows = {row.label: row.values for row in table_rows(data, metrics)}
-    assert rows["relations, mean"] == ("3.10 cm", "1.30°")
-    assert rows["scan to map, median, 95 %"] == ("1.20 cm, 6.00 cm",)
-    assert rows["APE rmse"][0] == format_length(metrics["ape"]["trans_part"]["rmse"])
-    assert rows["RPE rmse per 1 m"][0] == format_length(metrics["rpe_1m"]["trans_part"]["rmse"])
-    assert "odometry alone, rmse" in rows
+def test_the_table_shows_what_metrics_hold(run):
+    errors = PoseStatistics(Statistics.of(np.array([0.03, 0.05])), Statistics.of(np.array([1.0, 1.6])))
+    map_metrics = MapMetrics(
+        residuals=ResidualMetrics(points=10, median=0.01, p95=0.06, within_15_cm=0.985),
+        comparison=MapComparison(np.nan, 0.0, 0.0, np.nan, np.nan, 0.1, 0, 5),
+    )
+    metrics = replace(run["metrics"], relations=RelationsResult(2, 0, errors), map=map_metrics)
+    rows = {row.label: row.values for row in table_rows(metrics)}
+    assert rows["relations, mean"] == ("4.00 cm", "1.30°")
+    assert rows["scan to map, median, 95 %"] == ("1.00 cm, 6.00 cm",)
+    assert rows["points within 15 cm of a wall"] == ("98.5 %",)
+    assert rows["APE rmse"][0] == format_length(metrics.errors.ape.trans_part.rmse)
+    assert rows["RPE rmse per 1 m"][0] == format_length(metrics.errors.rpe_1m.statistics.trans_part.rmse)
     assert "map precision, recall" not in rows
-    odd = {"ape": 3, "rpe": {"trans_part": "x"}, "axis_rmse": {"x": True}, "map": None}
-    assert "APE rmse" not in {row.label for row in table_rows(data, odd)}
+    assert "APE rmse of odometry" not in rows
+    alone = replace(metrics, odometry_alone=metrics.errors, errors=None)
+    assert "APE rmse" not in {row.label for row in table_rows(alone)}
 
 
 def test_pyplot_stays_out():

@@ -148,5 +148,5 @@ def test_a_warning_names_the_map_and_not_the_servers_folder(make_client: Callabl
     log = upload(client, (RECORDINGS / "paper.mcap").read_bytes(), "paper.mcap")
     job = client.post("/v1/jobs", json={"log": log, "map": chart, "read": {"end_s": 1.0}}).json()["id"]
     ended = wait(client, job, 30.0)
-    assert any(text.startswith("office.yaml: free_thresh") for text in ended["summary"]["warnings"]), ended
+    assert any(each["text"].startswith("office.yaml: free_thresh") for each in ended["summary"]["warnings"]), ended
     assert "/data/" not in client.get(f"/v1/jobs/{job}/results/metrics.json").text

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import sqlite3
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pytest
 from live_service import settings, submit, wait
+from sqlalchemy.exc import OperationalError
 
 from hsloc_service.housekeeping import Housekeeping
 from hsloc_service.settings import SettingsError, from_environment, parse_size
+from hsloc_service.storage import Storage
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from fastapi.testclient import TestClient
-
-import pytest
 
 
 def test_old_jobs_go_with_results_and_uploads_but_active_ones_stay(make_client: Callable[..., TestClient]) -> None:
@@ -56,3 +58,36 @@ def test_settings_from_variables(tmp_path: Path) -> None:
         with pytest.raises(SettingsError):
             from_environment({f"HSLOC_{name}": value})
     assert settings(tmp_path).retention_s is None
+
+
+@pytest.mark.parametrize(
+    ("code", "words", "full"),
+    [
+        (sqlite3.SQLITE_FULL, "in other words", True),
+        (sqlite3.SQLITE_ERROR, "no such table: full", False),
+        (None, "database or disk is full", False),
+    ],
+)
+def test_a_full_disk_is_known_by_its_code_and_not_by_words(
+    tmp_path: Path, code: int | None, words: str, full: bool
+) -> None:
+    storage = Storage(tmp_path, 0)
+    storage.restore_ballast()
+    (tmp_path / "ballast").touch()
+    cause = sqlite3.OperationalError(words)
+    if code is not None:
+        cause.sqlite_errorcode = code
+    tries = []
+
+    def work() -> None:
+        tries.append((tmp_path / "ballast").exists())
+        if len(tries) == 1:
+            raise OperationalError("delete", {}, cause)
+
+    if full:
+        storage.with_room(work)
+        assert tries == [True, False]
+    else:
+        with pytest.raises(OperationalError):
+            storage.with_room(work)
+    storage.close()

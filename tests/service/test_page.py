@@ -103,7 +103,7 @@ def test_upload_watch_look_download(
     assert page.locator("#jobs img, #job img").count() == 0
     assert inked(page, "#view") > 5
     assert inked(page, "#plot") > 3
-    assert re.search(r"rmse \d+\.\d cm", page.text_content("#metrics") or "")
+    assert re.search(r"APE rmse\d+\.\d+ cm, \d+\.\d+°", page.text_content("#metrics") or "")
     picture(page, "3-result")
     with page.expect_download() as download:
         page.click("text=trajectory.tum")

@@ -9,8 +9,8 @@ import pytest
 
 from hsloc.model import Pose2
 from hsloc.simulation.floor_plan import polygon
-from hsloc.simulation.people import LEG_RADIUS, PERSONAL_SPACE, Walkers
 from hsloc.simulation.sensors import RANGE_STEP, Lidar, PointSensor, SensorNoise, within_reach
+from hsloc.simulation.simulator import LEG_RADIUS, PERSONAL_SPACE, Walkers
 from hsloc.simulation.world import World
 
 WAY = np.array([(1.0, 1.0), (2.0, 1.0)])

@@ -20,6 +20,7 @@ import hsloc.sweep.runs as sweeping
 from hsloc.cli.main import main
 from hsloc.config import Config
 from hsloc.log import ReadOptions
+from hsloc.run_metrics import RunMetrics
 from hsloc.sweep.process_pool import sweep_in_processes
 from hsloc.sweep.runs import DONE, FAILED, SKIPPED, plan, run_key, sweep
 from hsloc.sweep.table import COLUMNS, as_csv, as_json, as_text
@@ -64,7 +65,7 @@ def test_finished_runs_are_known_again_and_others_are_not(tmp_path):
     first = sweep_in_threads(runs, tmp_path, progress=seen.append)
     assert states(first) == [DONE, DONE]
     assert {outcome.run.name for outcome in seen} == {item.name for item in runs}
-    assert first[0].metrics == json.loads((tmp_path / "office-default-seed0" / "metrics.json").read_text())
+    assert first[0].metrics == RunMetrics.read(tmp_path / "office-default-seed0" / "metrics.json")
     written = (tmp_path / "office-default-seed0" / "report.html").stat().st_mtime_ns
     second = sweep_in_threads(runs, tmp_path)
     assert states(second) == [SKIPPED, SKIPPED]
@@ -99,7 +100,7 @@ def test_the_bytes_of_log_and_map_are_in_the_key(tmp_path):
     log.write_bytes(b"one")
     image.write_bytes(b"P5")
     yaml.write_text("image: map.pgm\n")
-    (item,) = plan([log], DEFAULT, map_path=yaml)
+    (item,) = plan([log], DEFAULT, map=yaml)
     keys = [run_key(item.spec)]
     for path in (log, image, yaml):
         path.write_bytes(path.read_bytes() + b"\n")
@@ -144,7 +145,9 @@ def test_the_table_in_three_forms(tmp_path):
     outcomes = sweep_in_threads(plan([OFFICE, tmp_path / "missing.mcap"], DEFAULT, read=SHORT), tmp_path)
     good, bad = json.loads(as_json(outcomes))
     assert tuple(good) == COLUMNS
-    assert good["ape_m"] == outcomes[0].metrics["ape"]["trans_part"]["rmse"]
+    assert good["ape_m"] == outcomes[0].metrics.errors.ape.trans_part.rmse
+    assert good["localised"] == 1.0
+    assert good["verdict"] == "good"
     assert good["rpe_m"] is not None
     assert (bad["state"], bad["ape_m"]) == ("failed", None)
     table = list(csv.DictReader(io.StringIO(as_csv(outcomes))))
@@ -184,7 +187,7 @@ def test_the_command_varies_what_it_is_told_to(tmp_path, capsys):
         (["--seeds", "9-0"], 2, "not a list of seeds"),
         (["--seeds", "x"], 2, "not a list of seeds"),
         (["--jobs", "0"], 2, "whole number of 1 or more"),
-        (["--vary", "hide.budgets=1"], 1, "unknown key 'budgets'"),
+        (["--vary", "hide.budgets=1"], 1, "there is no parameter hide.budgets; did you mean hide.budget?"),
         (["--vary", "hide.budget=many"], 1, "must be of type int"),
         (["--vary", "hide.budget"], 1, "is not KEY=V1,V2"),
         (["--config", "nowhere.yaml"], 1, "nowhere.yaml: cannot be read"),
@@ -221,3 +224,18 @@ def test_interrupted_sweeps_keep_what_is_finished(tmp_path, capsys):
     assert all((tmp_path / "out" / name / "metrics.json").exists() for name in finished), finished
     code, out, _ = command(capsys, OFFICE, "--out", tmp_path / "out", "--seeds", "0", "--end", "3", "--json")
     assert (code, json.loads(out)[0]["state"]) == (0, "skipped")
+
+
+@pytest.mark.parametrize("after_s", [1.2, 2.2, 3.5])
+def test_an_interrupt_ends_a_sweep_with_one_line(tmp_path, after_s):
+    """Workers that were still importing ended in tracebacks of 60 to 97 lines."""
+    command = [sys.executable, "-m", "hsloc.cli.main", "sweep", str(OFFICE), str(HALL), "--seeds", "0-9", "--jobs", "2"]
+    process = subprocess.Popen(
+        [*command, "--out", str(tmp_path / "out")], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        start_new_session=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    time.sleep(after_s)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode in (130, -signal.SIGINT)  # a shell says 130 to both
+    assert err == "hsloc: interrupted\n"

@@ -104,7 +104,7 @@ def test_the_reports_own_set_up_is_localised_better_than_published():
 
 def test_the_files_say_what_the_result_says(tmp_path):
     found = result("office")
-    metrics = write_results(found, tmp_path / "out")
+    metrics = write_results(found, tmp_path / "out").metrics
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {
         "trajectory.tum", "odometry.tum", "reference.tum", "metrics.json", "timings.json", "config.yaml",
@@ -115,8 +115,8 @@ def test_the_files_say_what_the_result_says(tmp_path):
     assert np.array_equal(written.stamps_ns, found.trajectory.stamps_ns)
     np.testing.assert_allclose(written.poses[:, :2], found.trajectory.poses[:, :2], atol=1e-8)
     assert len(written) == len(found.odometry)
-    assert metrics["ape"]["trans_part"]["rmse"] == evaluate(found.trajectory, found.reference).ape.trans_part.rmse
-    assert metrics["map"]["residuals"]["within_0.15_m"] > 0.99
+    assert metrics.errors.ape.trans_part.rmse == evaluate(found.trajectory, found.reference).ape.trans_part.rmse
+    assert metrics.map.residuals.within_15_cm > 0.99
 
 
 def test_the_recording_of_a_run_is_itself_a_log(tmp_path):
@@ -144,4 +144,4 @@ def test_the_same_command_writes_the_same_bytes(tmp_path, threads):
     same, different, missing = filecmp.cmpfiles(tmp_path / "here", tmp_path / "there", names, shallow=False)
     assert (different, missing) == ([], [])
     assert len(same) == len(names)
-    assert found["scans"]["total"] == 601
+    assert found.metrics.scans.total == 601

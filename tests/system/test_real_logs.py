@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from hsloc.export.results_folder import metrics, write_recording
+from hsloc.analysis import analyse
 from hsloc.log import ReadOptions
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
@@ -31,16 +31,15 @@ def test_wean_hall_from_an_unknown_start(data: Path, name):
 
 
 @pytest.mark.parametrize("log", ["mcap_zstd/mcap_zstd.mcap", "macfirst_floor_take_2/macfirst_floor_take_2_0.db3"])
-def test_turtlebot_from_an_unknown_start(data: Path, tmp_path, log):
+def test_turtlebot_from_an_unknown_start(data: Path, log):
     folder = data / "turtlebot4"
     spec = RunRequest(
         logs=(folder / log,), map_path=folder / "mac_1st_floor_final.yaml", read=ReadOptions(), unknown_start=True
     )
     found = run(spec)
     assert found.localised.all()
-    review = write_recording(found, tmp_path / "run.mcap")
-    residuals = review.residuals
-    assert review.doubts == []
-    values = metrics(found, residuals)
-    assert values["map"]["residuals"]["within_0.15_m"] >= 0.85
-    assert any("free_thresh" in warning for warning in found.warnings)
+    metrics = analyse(found).metrics
+    assert metrics.verdict == "good"
+    assert metrics.warnings == found.warnings
+    assert metrics.map.residuals.within_15_cm >= 0.85
+    assert any(warning.code == "map_unknown_read_as_free" for warning in found.warnings)

@@ -49,9 +49,9 @@ def test_the_second_part_is_right_in_the_frame_of_the_first(first, second, tmp_p
     assert len(errors) > 2800
     assert np.sqrt((errors**2).mean()) < 0.05
     assert errors.max() < 0.1
-    values = write_results(second, tmp_path / "out")
-    assert values["map"]["comparison"]["precision"] > 0.95
-    assert values["run"]["map"] == "out, extended"
+    metrics = write_results(second, tmp_path / "out").metrics
+    assert metrics.map.comparison.precision > 0.95
+    assert metrics.run.map == "out, extended"
     whole = first[0].mapping.quality.keyscans + int((second.diagnostics.fitness > 0).sum())
     assert second.mapping.quality.keyscans == pytest.approx(whole, abs=2)
     assert second.grid.free().sum() > first[0].grid.free().sum() + 5000, "25 square metres that were not seen before"

@@ -28,10 +28,10 @@ def ape(found):
 def test_a_map_is_drawn_and_the_way_is_right(tmp_path, name):
     found = run(RunRequest(logs=(RECORDINGS / f"{name}.mcap",), mode="slam"))
     assert ape(found).rmse < 0.03
-    values = write_results(found, tmp_path / "out")
-    assert values["run"]["mode"] == "slam"
-    assert values["map"]["comparison"]["precision"] > 0.95
-    assert values["map"]["residuals"]["within_0.15_m"] > 0.95
+    metrics = write_results(found, tmp_path / "out").metrics
+    assert metrics.run.mode == "slam"
+    assert metrics.map.comparison.precision > 0.95
+    assert metrics.map.residuals.within_15_cm > 0.95
     assert np.array_equal(load_map(tmp_path / "out" / "map.yaml").cells == 100, found.grid.occupied())
     assert (tmp_path / "out" / "graph.g2o").stat().st_size > 1000
 

@@ -14,6 +14,7 @@ from hsloc.log.checks.topics import OdometryCheck, ScanCheck, TopicCheck
 from hsloc.log.checks.transforms import TransformCheck
 from hsloc.log.messages.decode import OdometryMessage, ScanMessage
 from hsloc.log.session.event_builders import MAP_FRAME
+from hsloc.warnings import WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -109,6 +110,10 @@ def _check_coverage(
             )  # fmt: skip
 
 
+_CHECKED_HERE = (WarningCode.TOPIC_MISSING, WarningCode.TOPIC_AMBIGUOUS, WarningCode.EXTRINSICS_ASSUMED)
+"""Warnings of the opening that the checks have findings of their own for."""
+
+
 def _check_summary(summary: LogSummary, has_scans: bool, findings: Findings) -> None:
     """What was missing or had to be assumed when the log was opened."""
     if not has_scans:
@@ -132,10 +137,11 @@ def _check_summary(summary: LogSummary, has_scans: bool, findings: Findings) -> 
                 f"no transform from {summary.base_frame or 'the base'} to {laser.frame or 'the laser'}",
                 "record /tf_static, or give --laser-pose x,y,yaw",
             )  # fmt: skip
-    told = ("no scan topic", "scan topics (", "no odometry topic", "no transform from")
-    for number, warning in enumerate(summary.warnings):
-        if not any(part in warning for part in told):
-            findings.add(Severity.WARNING, f"opening_{number}", "", warning, "see `hsloc info`")
+    for warning in summary.warnings:
+        if warning.code == WarningCode.EXTRINSICS_ASSUMED and not summary.lasers:  # a text log
+            findings.add(Severity.WARNING, "no_extrinsic", "", warning.text, warning.remedy)
+        elif warning.code not in _CHECKED_HERE:
+            findings.add(Severity.WARNING, warning.code, "", warning.text, warning.remedy or "see `hsloc info`")
 
 
 def _check_damage(log: Log, losses: Losses, findings: Findings) -> None:

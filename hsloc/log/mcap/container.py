@@ -21,6 +21,7 @@ from hsloc.log.mcap.index_scan import IndexScan, Segment
 from hsloc.log.mcap.records import ChunkHead, Damage, Opcode, UnknownCompression
 from hsloc.log.messages.definitions import long_name
 from hsloc.log.summary import Losses
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -43,7 +44,7 @@ class McapContainer:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.warnings: list[str] = []
+        self.warnings: list[RunWarning] = []
         self._unpacked = 0
         try:
             self._size = path.stat().st_size
@@ -59,7 +60,12 @@ class McapContainer:
         self.channels = {number: self._channel(record) for number, record in sorted(self._directory.channels.items())}
         unknown = self._indexed() - self.channels.keys()
         if unknown:
-            self.warnings.append(f"{path}: messages on {len(unknown)} channels without definition are ignored")
+            self.warnings.append(
+                RunWarning(
+                    WarningCode.CHANNELS_UNDEFINED,
+                    f"{path}: messages on {len(unknown)} channels without definition are ignored",
+                )
+            )
 
     def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
         """As `Container.messages`."""

@@ -12,6 +12,7 @@ from hsloc.log.session.topic_selection import TF, TF_STATIC, carries
 from hsloc.log.summary import Losses
 from hsloc.log.transforms import FrameTree, Mounting, Transform3, laser_mounting
 from hsloc.model import IDENTITY, Pose2
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -26,11 +27,11 @@ TILT_WARNING = radians(3.0)
 
 
 def read_links(
-    containers: Sequence[Container], topic: str, limit: int | None = None, problems: list[str] | None = None
+    containers: Sequence[Container], topic: str, limit: int | None = None, warnings: list[RunWarning] | None = None
 ) -> Iterator[LinkMessage]:
     """All transforms on a topic, in the order of the log; at most `limit` messages of each file.
 
-    A log can be read without them: what stands in the way goes to `problems`.
+    A log can be read without them: what prevents reading them is added to `warnings`.
     """
     for container in containers:
         decoders: dict[int, Decoder] = {}
@@ -41,8 +42,8 @@ def read_links(
                 if is_decodable(channel):
                     decoders[channel.id] = decoder_for(channel)
             except LogFormatError as error:
-                if problems is not None:
-                    problems.append(f"transforms are not read: {error}")
+                if warnings is not None:
+                    warnings.append(RunWarning(WarningCode.TRANSFORMS_UNREADABLE, f"transforms are not read: {error}"))
         if not decoders:
             continue
         # Damage is counted when the log is read for its events.
@@ -62,8 +63,8 @@ class Extrinsics:
         self._containers = containers
         self._override = override
         self._static = FrameTree()
-        self.warnings: list[str] = []
-        for link in read_links(containers, TF_STATIC, problems=self.warnings):
+        self.warnings: list[RunWarning] = []
+        for link in read_links(containers, TF_STATIC, warnings=self.warnings):
             self._static.add(link.parent, link.child, link.transform)
         self._all: FrameTree | None = None
         self._known: dict[str, tuple[Mounting, str]] = {}
@@ -106,13 +107,20 @@ class Extrinsics:
                 mounting = laser_mounting(transform)
                 if mounting.tilt > TILT_WARNING:
                     self.warnings.append(
-                        f"the laser {laser} is tilted by {degrees(mounting.tilt):.1f} deg; "
-                        "ranges are used as if it were level"
+                        RunWarning(
+                            WarningCode.LASER_TILTED,
+                            f"the laser {laser} is tilted by {degrees(mounting.tilt):.1f} deg; "
+                            "ranges are used as if it were level",
+                        )
                     )
                 return mounting, source
         self.warnings.append(
-            f"no transform from {base or 'the base'} to {laser or 'the laser'} in /tf_static or /tf: the laser is "
-            "taken to stand in the base's place; give --laser-pose x,y,yaw"
+            RunWarning(
+                WarningCode.EXTRINSICS_ASSUMED,
+                f"no transform from {base or 'the base'} to {laser or 'the laser'} in /tf_static or /tf: the laser is "
+                "assumed to be at the origin of the base",
+                "give --laser-pose x,y,yaw",
+            )
         )
         return Mounting(IDENTITY), "identity"
 
@@ -121,7 +129,7 @@ class Extrinsics:
         if self._all is None:
             self._all = FrameTree()
             static = self._static.children()
-            for link in read_links(self._containers, TF, problems=self.warnings):
+            for link in read_links(self._containers, TF, warnings=self.warnings):
                 if link.child not in static:
                     self._all.add(link.parent, link.child, link.transform)
             for link in read_links(self._containers, TF_STATIC):
@@ -133,7 +141,10 @@ class Extrinsics:
         moving = sorted(frame for frame in (path[0] + path[1] if path else ()) if tree.is_moving(frame))
         if moving:
             self.warnings.append(
-                f"the laser's mounting moves during the log ({', '.join(moving)}); its last pose is taken for all"
+                RunWarning(
+                    WarningCode.LASER_MOVES,
+                    f"the laser's mounting moves during the log ({', '.join(moving)}); its last pose is used for all",
+                )
             )
 
     def _guessed_base(self) -> str | None:

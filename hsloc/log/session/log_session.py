@@ -13,6 +13,7 @@ from hsloc.log.session.split_recordings import check_parts
 from hsloc.log.session.topic_selection import TF, TRUTH_TYPES, carries, choose_topics, is_truth_name, of_type
 from hsloc.log.summary import LaserSummary, LogSummary, Losses, ReadOptions, TopicSummary
 from hsloc.model import IDENTITY
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -60,7 +61,7 @@ class LogSession:
     def __init__(self, containers: Sequence[Container], options: ReadOptions) -> None:
         self.containers = containers
         self.options = options
-        self._warnings = [warning for container in containers for warning in container.warnings]
+        self._warnings: list[RunWarning] = [warning for container in containers for warning in container.warnings]
         self._decoders: dict[tuple[int, int], Decoder] = {}
         self.active = [
             channel
@@ -75,10 +76,10 @@ class LogSession:
         if len(containers) > 1:
             where += f" and {len(containers) - 1} more"
         self.choice = choose_topics(where, self.active, options, self.tf_frames is not None)
-        self._warnings += self.choice.problems
+        self._warnings += self.choice.warnings
         frames = self.tf_frames if self.choice.odom == TF else None
-        self._parts, doubts = check_parts(containers, self.choice.scans, self.choice.odom, frames)
-        self._warnings += doubts
+        self._parts, of_parts = check_parts(containers, self.choice.scans, self.choice.odom, frames)
+        self._warnings += of_parts
         self.scans = {topic: self._first(topic, definitions.LASER_SCAN) for topic in self.choice.scans}
         self.odom_type = self._pose_type(self.choice.odom)
         self.odom = self._first(self.choice.odom, self.odom_type)
@@ -161,7 +162,11 @@ class LogSession:
         transform = self.mountings.between(child, base)
         if transform is None:
             self._warnings.append(
-                f"no transform from {child}, which the odometry speaks of, to {base}: they are taken to be one"
+                RunWarning(
+                    WarningCode.ODOMETRY_FRAME_ASSUMED,
+                    f"no transform from {child}, the odometry's child frame, to {base}: they are assumed to be the "
+                    "same",
+                )
             )
             return None
         return transform.to_pose2()
@@ -170,7 +175,9 @@ class LogSession:
         statistics = self._topics()
         lasers = [self._laser(topic, first) for topic, first in self.scans.items() if first is not None]
         if len(lasers) > 1 and self.options.laser_pose is not None:
-            self._warnings.append(f"--laser-pose is taken for all {len(lasers)} lasers")
+            self._warnings.append(
+                RunWarning(WarningCode.LASER_POSE_SHARED, f"--laser-pose is used for all {len(lasers)} lasers")
+            )
         laser = lasers[0] if lasers else LaserSummary("", "", IDENTITY, False, "identity")
         converted = any(c.metadata.get(CONVERTED, {}).get("order") == "log" for c in self.containers)
         self._warn_of_clocks()
@@ -266,8 +273,11 @@ class LogSession:
             apart = (first.stamp_ns - first.log_time_ns) - (self.odom.stamp_ns - self.odom.log_time_ns)
             if abs(apart) > _CLOCKS_APART_NS:
                 self._warnings.append(
-                    f"the stamps of {topic} and {self.choice.odom} are {apart / 1e9:.1f} s apart, measured by the "
-                    "log's clock: they may be of different clocks"
+                    RunWarning(
+                        WarningCode.CLOCKS_APART,
+                        f"the stamps of {topic} and {self.choice.odom} are {apart / 1e9:.1f} s apart, measured by the "
+                        "log's clock: they may come from different clocks",
+                    )
                 )
 
 

@@ -16,6 +16,7 @@ from hsloc.log.messages.decode import OdometryMessage, PoseMessage
 from hsloc.log.messages.decoders import Undecodable, decoder_for, is_decodable
 from hsloc.log.session.topic_selection import carries
 from hsloc.log.summary import NANOSECONDS, Losses, PartSummary
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -40,6 +41,7 @@ _RESET, _AWAY = 0.01, 0.5
 """Odometry within so many metres of zero has begun anew, if it was farther away than the second before."""
 _ENDS = 200
 """Messages looked at on either end of a part."""
+_ANOTHER_RUN = "if that is another run, replay each file by itself"
 
 
 class _Edge(NamedTuple):
@@ -54,8 +56,8 @@ def check_parts(
     scan_topics: Iterable[str],
     odom_topic: str | None,
     tf_frames: tuple[str, str] | None,
-) -> tuple[tuple[PartSummary, ...], list[str]]:
-    """The files in the order of time, and what is doubtful about their being parts of one run.
+) -> tuple[tuple[PartSummary, ...], list[RunWarning]]:
+    """The files in the order of time, and warnings where they may not be parts of one run.
 
     `tf_frames` are the frames of the odometry where `odom_topic` is /tf. Raises LogError for files that are not.
     """
@@ -97,15 +99,16 @@ def _refuse_same_time(a: PartSummary, b: PartSummary, topic: str) -> None:
         )
 
 
-def _gaps(parts: Sequence[PartSummary]) -> list[str]:
+def _gaps(parts: Sequence[PartSummary]) -> list[RunWarning]:
     warnings = []
     last = parts[0]
     for part in parts[1:]:
         gap = part.start_ns - last.end_ns
         if gap > GAP_NS:
             warnings.append(
-                f"{part.path} begins {_duration(gap)} after {last.path} ends: if that is another drive, run each by "
-                "itself"
+                RunWarning(
+                    WarningCode.PARTS_GAP, f"{part.path} begins {_duration(gap)} after {last.path} ends", _ANOTHER_RUN
+                )
             )
         last = max(last, part, key=lambda item: item.end_ns)
     return warnings
@@ -119,30 +122,36 @@ def _duration(nanoseconds: int) -> str:
     return f"{hours} h {minutes:02d} min" if hours < 48 else f"{hours // 24} days"
 
 
-def _jumps(found: Sequence[tuple[PartSummary, Container]], topic: str, tf_frames: tuple[str, str] | None) -> list[str]:
+def _jumps(
+    found: Sequence[tuple[PartSummary, Container]], topic: str, tf_frames: tuple[str, str] | None
+) -> list[RunWarning]:
     ends = [(part, *_edges(container, topic, tf_frames)) for part, container in found]
     told = [(part, first, last) for part, first, last in ends if first is not None and last is not None]
     return [
-        doubt
+        warning
         for (before, _, end), (after, begin, _) in pairwise(sorted(told, key=lambda entry: entry[1].log_time_ns))
-        for doubt in _jump(before, end, after, begin)
+        for warning in _jump(before, end, after, begin)
     ]
 
 
-def _jump(a: PartSummary, end: _Edge, b: PartSummary, begin: _Edge) -> list[str]:
+def _jump(a: PartSummary, end: _Edge, b: PartSummary, begin: _Edge) -> list[RunWarning]:
     """What the odometry says to one part following the other."""
     # Where the edges overlap, too, the robot was at either end of so much time.
     seconds = abs(begin.log_time_ns - end.log_time_ns) / NANOSECONDS
     way = hypot(begin.pose.x - end.pose.x, begin.pose.y - end.pose.y)
     if hypot(begin.pose.x, begin.pose.y) < _RESET and hypot(end.pose.x, end.pose.y) > _AWAY:
-        return [f"the odometry begins anew with {b.path}: if that is another drive, run each by itself"]
+        return [
+            RunWarning(
+                WarningCode.PARTS_ODOMETRY_RESET, f"the odometry starts again from zero with {b.path}", _ANOTHER_RUN
+            )
+        ]
     what = f"the odometry is {way:.1f} m away when {b.path} goes on, {seconds:.1f} s from the end of {a.path}"
     if way > POSSIBLE_JUMP + POSSIBLE_SPEED * seconds:
         raise LogError(
             f"{what}, so they are not parts of one run; run each by itself, or all with `hsloc sweep {a.path} {b.path}`"
         )
     if way > LIKELY_JUMP + LIKELY_SPEED * seconds:
-        return [f"{what}: if that is another drive, run each by itself"]
+        return [RunWarning(WarningCode.PARTS_ODOMETRY_JUMP, what, _ANOTHER_RUN)]
     return []
 
 

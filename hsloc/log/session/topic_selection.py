@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from hsloc.errors import TopicError
 from hsloc.log.messages import definitions, foxglove
 from hsloc.log.messages.decoders import canonical_type, is_decodable
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,12 +28,12 @@ _LISTED = 12
 
 @dataclass(slots=True)
 class TopicSelection:
-    """Topics to read; `TF` stands for transforms in place of a topic. `problems` are what stood in the way."""
+    """Topics to read; `TF` stands for transforms in place of a topic. `warnings` are what stood in the way."""
 
     scans: tuple[str, ...] = ()
     odom: str | None = None
     truth: str | None = None
-    problems: list[str] = field(default_factory=list)
+    warnings: list[RunWarning] = field(default_factory=list)
 
 
 def has_name(channel: Channel, name: str) -> bool:
@@ -63,7 +64,7 @@ def choose_topics(
     """
     choice = TopicSelection()
     choice.truth = _truth(where, channels, options)
-    choice.scans = _scans(where, channels, options, choice.problems)
+    choice.scans = _scans(where, channels, options, choice.warnings)
     if options.odom_topic in TF_NAMES:
         choice.odom = TF
     else:
@@ -81,7 +82,7 @@ def choose_topics(
                 candidates,
                 options.odom_topic,
                 options.require_odometry,
-                choice.problems,
+                choice.warnings,
             )
     if choice.truth is not None and choice.truth == choice.odom != TF:
         if options.truth_topic is not None:
@@ -95,14 +96,16 @@ def is_truth_name(topic: str) -> bool:
     return _TRUTH_NAME.search(topic) is not None
 
 
-def _scans(where: str, channels: Sequence[Channel], options: ReadOptions, problems: list[str]) -> tuple[str, ...]:
+def _scans(
+    where: str, channels: Sequence[Channel], options: ReadOptions, warnings: list[RunWarning]
+) -> tuple[str, ...]:
     """The scan topics: the only one, or those that are named, separated by commas."""
     candidates = of_type(channels, definitions.LASER_SCAN)
     names: list[str | None] = [None]
     if options.scan_topic is not None:
         names = [*dict.fromkeys(name.strip() for name in options.scan_topic.split(","))]
     chosen = [
-        _pick(where, channels, "scan", definitions.LASER_SCAN, candidates, name, options.require_scan, problems)
+        _pick(where, channels, "scan", definitions.LASER_SCAN, candidates, name, options.require_scan, warnings)
         for name in names
     ]
     return tuple(dict.fromkeys(topic for topic in chosen if topic is not None))
@@ -125,7 +128,7 @@ def _pick(
     candidates: list[str],
     named: str | None,
     required: bool,
-    problems: list[str],
+    warnings: list[RunWarning],
 ) -> str | None:
     flag = f"--{kind}-topic"
     if named is not None:
@@ -138,14 +141,17 @@ def _pick(
     what = {"scan": "scan", "odom": "odometry"}[kind]
     if candidates:
         listing = ", ".join(candidates[:_LISTED])
-        problem = f"{where}: {len(candidates)} {what} topics ({listing}); choose with {flag} {candidates[0]}"
-        problem += f", or take all with {flag} {','.join(candidates[:_LISTED])}" if kind == "scan" else ""
+        remedy = f"choose with {flag} {candidates[0]}"
+        remedy += f", or take all with {flag} {','.join(candidates[:_LISTED])}" if kind == "scan" else ""
+        text = f"{where}: {len(candidates)} {what} topics ({listing})"
+        warning = RunWarning(WarningCode.TOPIC_AMBIGUOUS, text, remedy)
     else:
-        problem = f"{where}: no {what} topic ({typename}); the log holds {listed(channels)}"
-        problem += "; without odometry a map can be drawn (--no-odom)" if kind == "odom" and required else ""
+        remedy = "without odometry a map can be built (--no-odom)" if kind == "odom" and required else ""
+        text = f"{where}: no {what} topic ({typename}); the log holds {listed(channels)}"
+        warning = RunWarning(WarningCode.TOPIC_MISSING, text, remedy)
     if required:
-        raise TopicError(problem)
-    problems.append(problem)
+        raise TopicError(str(warning))
+    warnings.append(warning)
     return None
 
 

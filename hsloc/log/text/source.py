@@ -15,6 +15,7 @@ from hsloc.log.text.carmen import Carmen
 from hsloc.log.text.max_range_inference import RANGE_MIN, RangeRule
 from hsloc.log.text.wean import Wean
 from hsloc.model import IDENTITY, Odometry, Scan
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -167,15 +168,19 @@ class TextSource:
         scan: Scan | None,
         scan_keyword: str,
     ) -> LogSummary:
-        extrinsics, warnings = "identity", []
+        extrinsics, warnings = "identity", list[RunWarning]()
         if self._options.laser_pose is not None:
             extrinsics = "option"
         elif scan_keyword in self._format.states_mounting:
             extrinsics = "file format"
         elif scan is not None:
             warnings.append(
-                f"{scan_keyword} lines do not say where the laser stands: it is taken to stand in the base's "
-                "place; give --laser-pose x,y,yaw"
+                RunWarning(
+                    WarningCode.EXTRINSICS_ASSUMED,
+                    f"{scan_keyword} lines do not state where the laser is mounted: it is assumed to be at the origin "
+                    "of the base",
+                    "give --laser-pose x,y,yaw",
+                )
             )
         mounting = self._options.laser_pose or (scan.T_base_laser if scan else IDENTITY)
         odometry = kinds["odometry"]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc_service.results.store import BLOCK
 from hsloc_service.storage import safe_name
-from hsloc_service.stored_request import MAP_STATE, logs_of
+from hsloc_service.stored_request import MAP_STATE, UPLOADS, logs_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -55,8 +55,7 @@ def prepare(folder: Path, claim: Claim, storage: Storage, settings: Settings) ->
         # Any name but those that the YAML may ask for; the worker links the one it does ask for.
         (folder / "map" / ".image").symlink_to(storage.upload_path(request["map"]["image"]).absolute())
         job["map_image"] = ".image"
-    if request.get("relations") is not None:
-        job["relations"] = link("relations", request["relations"], "relations")
+    job |= {name: link(name, request[name], name) for name in UPLOADS if request.get(name) is not None}
     if claim.source is not None:
         job["resume"] = MAP_STATE
     (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")

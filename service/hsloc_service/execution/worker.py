@@ -18,6 +18,7 @@ import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hsloc.options import BY_NAME
 from hsloc_service.execution import limits
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
     from hsloc.replay.run import Progress
     from hsloc.request import RunRequest
+    from hsloc.run_metrics import RunMetrics, RunTimings
 
 EVERY_S = 0.25
 """Progress is told this often at most."""
@@ -59,74 +61,76 @@ def main(argv: list[str] | None = None) -> int:
 def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, float, int], None]) -> dict[str, Any]:
     """Replay and write the results into `folder/output`; returns the summary for the job's row."""
     from hsloc.evaluation import read_relations
-    from hsloc.export.results_folder import timings, write_results
+    from hsloc.export.results_folder import write_results
     from hsloc.replay.run import run
     from hsloc_service.results.preview import write_viewer
 
     report("open", 0.0, 1.0, 0)
     spec = make_spec(job, folder)
-    relations = None if job.get("relations") is None else folder / "relations" / job["relations"]
-    if relations is not None:
-        read_relations(relations)  # what cannot be read is told now, not after an hour of replay
+    if spec.relations is not None:
+        read_relations(spec.relations)  # what cannot be read is told now, not after an hour of replay
 
     def replayed(progress: Progress) -> None:
         report(progress.phase, progress.done_s, progress.total_s, progress.scans)
 
     result = run(spec, replayed)
     # Warnings are a part of the results, which are to be the same in every folder.
-    result = dataclasses.replace(result, warnings=tuple(plain_names(each) for each in result.warnings))
+    plain = tuple(dataclasses.replace(each, text=plain_names(each.text)) for each in result.warnings)
+    result = dataclasses.replace(result, warnings=plain)
     scans = len(result.diagnostics)
-    metrics = write_results(
+    written = write_results(
         result,
         folder / "output",
-        alignment=job["request"].get("alignment"),
-        relations=relations,
         progress=lambda share: report("write", share, 1.0, scans),
     )
-    write_viewer(result, folder / "output", metrics)
+    write_viewer(result, written.analysis, folder / "output")
+    return summarise(written.metrics, written.timings)
+
+
+_SUMMARISED = ("verdict", "run", "log", "scans", "localised", "ape", "relations", "losses")
+"""Keys of metrics.json that the job's row holds, too."""
+_MOST_LINES = 50
+
+
+def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
+    """The summary of a job: the figures as the reports show them, the verdict, and all warnings of the run."""
+    from hsloc.dataclass_json import to_json
+    from hsloc.report.table import table_rows
+
+    values = metrics.to_json()
     return {
-        "metrics": {
-            key: metrics[key] for key in ("run", "log", "scans", "ape", "relations", "losses") if key in metrics
-        },
-        "data_lost": result.losses.data_lost,
-        "warnings": [str(warning)[:500] for warning in result.warnings][:50],
-        "notes": [line[:500] for line in result.losses.lines()][:50],
-        "timings": timings(result),
+        "metrics": {key: values[key] for key in _SUMMARISED if key in values},
+        "figures": [{"name": row.label, "values": list(row.values)} for row in table_rows(metrics)],
+        "verdict_reasons": [_shortened(each) for each in values["verdict_reasons"]][:_MOST_LINES],
+        "data_lost": metrics.losses.data_lost,
+        "warnings": [_shortened(to_json(each)) for each in metrics.warnings][:_MOST_LINES],
+        "notes": [line[:500] for line in metrics.losses.notes][:_MOST_LINES],
+        "timings": timings.to_json(),
+    }
+
+
+def _shortened(values: dict[str, Any]) -> dict[str, Any]:
+    """Texts of at most 500 letters, lists of at most 50 entries: the row of a job stays small."""
+    return {
+        key: value[:500] if isinstance(value, str) else value[:_MOST_LINES] if isinstance(value, list) else value
+        for key, value in values.items()
     }
 
 
 def make_spec(job: Mapping[str, Any], folder: Path) -> RunRequest:
     """The run that the job asks for. Raises ConfigError or MapError for what does not fit."""
-    from dataclasses import replace
-
-    from hsloc.config import Config, from_dict, preset
-    from hsloc.log import ReadOptions
-    from hsloc.model.pose2 import Pose2, wrap_angle
     from hsloc.request import RunRequest
 
     request = job["request"]
-    config = from_dict(Config, request.get("config") or {}, preset(request["preset"]))
-    chosen = {name: request[name] for name in ("matcher", "mapper") if request.get(name) is not None}
-    config = replace(config, **chosen)
-    pose = request.get("initial_pose")
-    read = request.get("read") or {}
-    laser = read.get("laser_pose")
-    options = {key: value for key, value in read.items() if key != "laser_pose"}
-    return RunRequest(
-        logs=tuple(folder / place for place in job["logs"]),
-        resume=None if job.get("resume") is None else folder / job["resume"],
-        map_path=None if job.get("map") is None else linked_map(folder, job["map"], job["map_image"]),
-        config=config,
-        read=ReadOptions(
-            **options, laser_pose=None if laser is None else Pose2(laser[0], laser[1], wrap_angle(laser[2]))
-        ),
-        initial_pose=None if pose is None else Pose2(pose[0], pose[1], wrap_angle(pose[2])),
-        unknown_start=request["unknown_start"],
-        seed=request["seed"],
-        preset=request["preset"],
-        mode=request.get("mode", "auto"),
-        no_odometry=request.get("no_odometry", False),
+    values = {name: request.get(name) for name in BY_NAME if name not in ("map", "resume")} | (
+        request.get("read") or {}
     )
+    values |= {name: folder / name / job[name] for name in BY_NAME if BY_NAME[name].is_upload and job.get(name)}
+    if job.get("map") is not None:
+        values["map"] = linked_map(folder, job["map"], job["map_image"])
+    if job.get("resume") is not None:
+        values["resume"] = folder / job["resume"]
+    return RunRequest.from_values([folder / place for place in job["logs"]], {**values, "bare_names": True})
 
 
 def linked_map(folder: Path, name: str, image: str) -> Path:
@@ -176,7 +180,7 @@ def explain(error: Exception) -> dict[str, Any]:
 
 def plain_names(text: str) -> str:
     """A message with the files' own names: the folder is the server's business, and differs from run to run."""
-    return re.sub(rf"{re.escape(str(Path.cwd()))}/(?:(?:input(?:-\d+)?|map|relations|output)/)?", "", text)
+    return re.sub(rf"{re.escape(str(Path.cwd()))}/(?:(?:input(?:-\d+)?|map|relations|reference|output)/)?", "", text)
 
 
 def _throttled(tell: Callable[[dict[str, Any]], None]) -> Callable[[str, float, float, int], None]:

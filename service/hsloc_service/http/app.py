@@ -24,7 +24,7 @@ from hsloc_service import config_schema as options
 from hsloc_service.auth import Tokens
 from hsloc_service.call_timeout import BoundedExecutor
 from hsloc_service.db.database import Database
-from hsloc_service.errors import ServiceError, StoreError
+from hsloc_service.errors import ServiceError, StoreError, is_disk_full
 from hsloc_service.execution.dispatcher import LocalDispatcher
 from hsloc_service.housekeeping import Housekeeping
 from hsloc_service.http import (
@@ -34,6 +34,7 @@ from hsloc_service.http import (
     metrics,
     results_routes,
     run_routes,
+    schema_routes,
     system_routes,
     tus,
 )
@@ -56,7 +57,7 @@ if TYPE_CHECKING:
 
     from hsloc_service.settings import Settings
 
-ROUTES = (files_routes, tus, jobs_routes, events_routes, results_routes, run_routes, system_routes)
+ROUTES = (files_routes, tus, jobs_routes, events_routes, results_routes, run_routes, schema_routes, system_routes)
 WEB = Path(__file__).parent.parent / "web"
 _CODES = {404: "not_found", 405: "method", 413: "too_large", 400: "bad_request", 416: "range"}
 
@@ -189,7 +190,7 @@ def _add_errors(app: FastAPI, storage: Storage) -> None:
     @app.exception_handler(OperationalError)
     async def database(_request: Request, error: OperationalError) -> Response:
         log("database.error", error=str(error.orig))
-        if "full" in str(error.orig):
+        if is_disk_full(error):
             storage.drop_ballast()
             return _answer(507, "no_space", "the server's disk is full; try again", {"Retry-After": "1"})
         return _answer(503, "database", "the database is busy", {"Retry-After": "1"})

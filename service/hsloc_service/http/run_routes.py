@@ -10,12 +10,13 @@ from fastapi import APIRouter, Request, Response
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.concurrency import run_in_threadpool
 
+from hsloc.options import BY_NAME
 from hsloc_service import config_schema as options
 from hsloc_service.errors import ServiceError
 from hsloc_service.http.context import Context, Ctx, Writer, problems
 from hsloc_service.http.schemas import MAX_LOGS, JobRequest, JobView, RunRequest, checked
 from hsloc_service.http.views import job_view
-from hsloc_service.stored_request import plain
+from hsloc_service.stored_request import UPLOADS, plain
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from hsloc_service.db.tables import FileRow
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
-FILES = ("log", "map", "map_image", "relations")
+FILES = ("log", "map", "map_image", *UPLOADS)
 FIELD_BYTES = 64 << 10
 HEADER_BYTES = 8 << 10
 _FILE = {"type": "string", "contentMediaType": "application/octet-stream"}
@@ -40,7 +41,7 @@ _BODY = {
                         "log": {**_FILE, "description": "the log; given several times, the parts of one run"},
                         "map": {**_FILE, "description": "the map's YAML"},
                         "map_image": {**_FILE, "description": "the map's image"},
-                        "relations": {**_FILE, "description": "relations to score by"},
+                        **{name: {**_FILE, "description": BY_NAME[name].http} for name in UPLOADS},
                         "request": {"$ref": "#/components/schemas/RunRequest"},
                     },
                     "additionalProperties": False,
@@ -101,8 +102,7 @@ def _request(text: bytes, files: dict[str, list[str]]) -> JobRequest:
     values |= {"log": logs[0]} if len(logs) == 1 else {"logs": logs}
     if "map" in files:
         values["map"] = {"yaml": files["map"][0], "image": files["map_image"][0]}
-    if "relations" in files:
-        values["relations"] = files["relations"][0]
+    values |= {name: files[name][0] for name in UPLOADS if name in files}
     return checked(JobRequest, values)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     AwareDatetime,
@@ -13,12 +13,19 @@ from pydantic import (
     Field,
     FiniteFloat,
     ValidationError,
+    create_model,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
 
+from hsloc.options import offered
 from hsloc_service.config_schema import whole
 from hsloc_service.errors import ServiceError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from hsloc.options import Option
 
 UUID_PATTERN = r"^[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}$"
 Ident = Annotated[str, Field(pattern=UUID_PATTERN, examples=["3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f"])]
@@ -26,7 +33,6 @@ PoseList = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3, exampl
 MAX_LOGS = 64
 UNIQUE: dict[str, Any] = {"uniqueItems": True}
 Label = Annotated[str, Field(max_length=255)]
-Seed = Annotated[int, Field(ge=0, le=2**53 - 1), BeforeValidator(whole)]
 Config = dict[str, Any]
 """Parameters; `hsloc_service.config_schema` knows their schema, which the application puts into the OpenAPI."""
 
@@ -72,46 +78,64 @@ class MapFiles(Strict):
     image: Ident
 
 
-class ReadRequest(Strict):
-    """How to read the log; what is left out is found out."""
+def _type(option: Option) -> Any:
+    """The type of an option on the wire."""
+    match option.kind:
+        case "choice":
+            return Literal[option.choices]
+        case "number":
+            return Annotated[FiniteFloat, Field(ge=option.least, le=option.most)]
+        case "whole":
+            return Annotated[int, Field(ge=0, le=option.most or 2**53 - 1), BeforeValidator(whole)]
+        case "pose":
+            return PoseList
+        case "switch":
+            return bool
+        case _ if option.name == "config":
+            return Config
+        case _:
+            return Ident if option.kind == "path" or option.is_upload else Label
 
-    scan_topic: Label | None = None
-    odom_topic: Label | None = None
-    truth_topic: Label | None = None
-    base_frame: Label | None = None
-    laser_pose: PoseList | None = None
-    start_s: FiniteFloat | None = None
-    end_s: FiniteFloat | None = None
-    deskew: bool = False
+
+def _fields(options: Iterable[Option], *, optional: bool = False) -> dict[str, Any]:
+    """Fields of a model. What is optional, or has no default, may be null."""
+    found: dict[str, Any] = {}
+    for option in options:
+        nullable = optional or option.default is None
+        kind = _type(option) | None if nullable else _type(option)
+        default = None if nullable else option.default
+        found[option.name] = (kind, Field(default=default, description=option.http or option.help))
+    return found
 
 
-class RunRequest(Strict):
-    """How to run: the same as the options of `hsloc replay`."""
+_HTTP = tuple(offered("http"))
+Model: Any = create_model  # Its overloads do not take fields that are made.
+ReadRequest = Model(
+    "ReadRequest",
+    __base__=Strict,
+    __doc__="How to read the log; what is left out is found out.",
+    **_fields(option for option in _HTTP if option.place == "read"),
+)
+_Run = Model(
+    "RunOptions",
+    __base__=Strict,
+    **_fields(option for option in _HTTP if option.place != "read" and not option.is_upload),
+)
 
-    mode: Literal["auto", "localise", "slam"] = Field(
-        default="auto", description="auto: localise if there is a map, else draw one"
-    )
-    matcher: Literal["hide", "harmony_search", "icp"] | None = None
-    mapper: Literal["graph", "point"] | None = None
-    preset: Literal["default", "paper", "paper-literal"] = "default"
-    seed: Seed = Field(default=0, description="at most what a browser counts exactly")
-    initial_pose: PoseList | None = Field(default=None, description="start: x, y (m), yaw (rad)")
-    unknown_start: bool = Field(default=False, description="search the whole map, whatever the log says")
-    no_odometry: bool = Field(default=False, description="do not look at the log's odometry (slam alone)")
-    alignment: Literal["none", "origin", "se2"] | None = Field(
-        default=None, description="of the trajectory with the truth; default: none on a given map, se2 on a drawn one"
-    )
-    read: ReadRequest | None = None
-    config: Config | None = Field(default=None, description="parameters, on top of the preset; see /v1/options")
-    resume: Ident | None = Field(
-        default=None, description="id of a job of yours that drew a map, which is extended: the new one is in its frame"
-    )
+
+class RunRequest(_Run):  # type: ignore[misc, valid-type]
+    """How to run: the options of `hsloc replay`."""
+
+    read: ReadRequest | None = None  # type: ignore[valid-type]
     webhook: Annotated[str, Field(max_length=2000, pattern=r"^https?://[^\s]+$")] | None = Field(
-        default=None, description="URL that is told when the job has ended"
+        default=None, description="URL that is called when the job has ended"
     )
 
 
-class JobRequest(RunRequest):
+_Job = Model("JobOptions", __base__=RunRequest, **_fields(option for option in _HTTP if option.is_upload))
+
+
+class JobRequest(_Job):  # type: ignore[misc, valid-type]
     """What to run, and how. Either `log` or `logs`."""
 
     model_config = ConfigDict(
@@ -144,9 +168,6 @@ class JobRequest(RunRequest):
     logs: Annotated[list[Ident], Field(min_length=1, max_length=MAX_LOGS, json_schema_extra=UNIQUE)] | None = Field(
         default=None, description="ids of several uploaded logs that are parts of one run, as `hsloc replay a b`"
     )
-    relations: Ident | None = Field(
-        default=None, description="id of an uploaded file of relations to score by: `t1 t2 x y z roll pitch yaw`"
-    )
     map: MapFiles | None = Field(default=None, description="map; default: the one in the log")
 
     @model_validator(mode="after")
@@ -165,19 +186,17 @@ class JobRequest(RunRequest):
         return self
 
 
-class RerunRequest(Strict):
-    """What to change in a job that is run again; the rest, and the seed, stay."""
+_CHANGES = ("resume", "reference")
+"""What a job that is run again keeps."""
+_Rerun = Model(
+    "RerunOptions",
+    __base__=Strict,
+    **_fields((each for each in _HTTP if each.place != "read" and each.name not in _CHANGES), optional=True),
+)
 
-    mode: Literal["auto", "localise", "slam"] | None = None
-    matcher: Literal["hide", "harmony_search", "icp"] | None = None
-    mapper: Literal["graph", "point"] | None = None
-    preset: Literal["default", "paper", "paper-literal"] | None = None
-    seed: Seed | None = None
-    initial_pose: PoseList | None = None
-    unknown_start: bool | None = None
-    alignment: Literal["none", "origin", "se2"] | None = None
-    relations: Ident | None = None
-    config: Config | None = None
+
+class RerunRequest(_Rerun):  # type: ignore[misc, valid-type]
+    """What to change in a job that is run again; the rest, and the seed, stay."""
 
 
 State = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
@@ -281,8 +300,11 @@ class Info(BaseModel):
 
 
 class Options(BaseModel):
-    """The parameters that a job may set in `config`."""
+    """The options of a job, and the parameters that it may set in `config`."""
 
+    run: list[dict[str, Any]] = Field(
+        description="the options of a run: name, kind, group, help, choices, default, for a form"
+    )
     config_schema: dict[str, Any] = Field(description="JSON Schema of `config`")
     presets: dict[str, Any] = Field(description="the effective configuration of each preset")
 
@@ -299,7 +321,8 @@ Request = TypeVar("Request", bound=RunRequest)
 def checked(kind: type[Request], values: Any) -> Request:
     """A request that did not come as the body. Raises ServiceError 422 with the place of what is wrong."""
     try:
-        return kind.model_validate(values)
+        found: Request = kind.model_validate(values)
+        return found
     except ValidationError as error:
         first = error.errors()[0]
         where = "".join(f".{part}" for part in first["loc"])

@@ -9,6 +9,7 @@ from fastapi.responses import Response
 from prometheus_client import generate_latest
 from sqlalchemy import func, select, text
 
+from hsloc.options import describe
 from hsloc.version import __version__
 from hsloc_service import config_schema as job_options
 from hsloc_service.db.tables import DeliveryRow, JobRow
@@ -70,9 +71,9 @@ def info(ctx: Ctx, who: Reader) -> Info:
 
 @router.get("/v1/options", responses=problems())
 def options(who: Reader) -> Options:
-    """JSON Schema of a job's `config`, and the presets."""
+    """The options of a job, JSON Schema of its `config`, and the presets."""
     del who
-    return Options(**job_options.options())
+    return Options(run=describe(), **job_options.options())
 
 
 @router.get("/v1/webhook-secret", responses=problems())

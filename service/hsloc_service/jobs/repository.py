@@ -16,7 +16,7 @@ from hsloc_service.errors import ServiceError, busy, conflict, not_found
 from hsloc_service.jobs.events import record
 from hsloc_service.results.deletion_queue import removal_of
 from hsloc_service.storage import safe_name
-from hsloc_service.stored_request import MAP_STATE, logs_of
+from hsloc_service.stored_request import MAP_STATE, UPLOADS, logs_of
 from hsloc_service.uploads.repository import need_quota
 
 if TYPE_CHECKING:
@@ -150,8 +150,9 @@ class Jobs:
         if request.get("map") is not None:
             _complete_file(session, who, request["map"]["yaml"], "map.yaml")
             _complete_file(session, who, request["map"]["image"], "map.image")
-        if request.get("relations") is not None:
-            _complete_file(session, who, request["relations"], "relations")
+        for name in UPLOADS:
+            if request.get(name) is not None:
+                _complete_file(session, who, request[name], name)
         if request.get("resume") is not None:
             _need_map(session, _job(session, who, request["resume"]))
         job = JobRow(

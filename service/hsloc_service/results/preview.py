@@ -1,4 +1,4 @@
-"""What the web page draws: the map as a picture, and paths and errors short enough for a telephone."""
+"""What the web page draws: the map as a picture, and paths and errors of limited length."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hsloc.model.pose2 import Pose2, compose_poses, wrap_angles
+from hsloc.model.pose2 import compose_poses
 from hsloc.model.trajectory import Trajectory
+from hsloc.report.data import peak_rows
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
 
+    from hsloc.analysis import Analysis
+    from hsloc.evaluation import Comparison
     from hsloc.replay.run import Result
 
     Floats = NDArray[np.float64]
@@ -26,41 +28,27 @@ SIDE = 4096
 """A map with a longer side is drawn from every n-th cell."""
 
 
-def write_viewer(result: Result, folder: Path, metrics: Mapping[str, Any]) -> None:
+def write_viewer(result: Result, analysis: Analysis, folder: Path) -> None:
     """Write `viewer.json` and `viewer-map.png`; times in seconds since the first pose.
 
-    Everything is in the frame of the map that was used or drawn: the odometry begins where the trajectory does, and the
-    reference is moved by the alignment of the metrics.
+    Everything is in the frame of the map that was used or built: the odometry begins at the trajectory's first
+    localised pose, and the reference is moved by the alignment of the comparison, whose errors the curve shows.
     """
     start = int(result.trajectory.stamps_ns[0])
+    odometry, reference, comparison = analysis.odometry, result.reference, analysis.comparison
+    if reference is not None and comparison is not None:
+        T_map_reference = comparison.T_reference_estimate.inverse()
+        reference = Trajectory(reference.stamps_ns, compose_poses(T_map_reference.to_array(), reference.poses))
     values: dict[str, Any] = {
         "map": _draw_map(result, folder / "viewer-map.png"),
-        "trajectory": _path(result.trajectory.stamps_ns, result.trajectory.poses, start),
-        "odometry": None,
-        "reference": None,
-        "errors": None,
+        "trajectory": _path(result.trajectory, start),
+        "odometry": None if odometry is None else _path(odometry, start),
+        "reference": None if reference is None or len(reference) < 2 else _path(reference, start),
+        "errors": None if comparison is None else _errors(comparison, start),
         "fitness": _columns((result.diagnostics.stamps_ns - start) / 1e9, fitness=result.diagnostics.fitness),
     }
-    if len(result.odometry) > 0:
-        first = Pose2(*result.trajectory.poses[0]) @ Pose2(*result.odometry.poses[0]).inverse()
-        values["odometry"] = _path(
-            result.odometry.stamps_ns, compose_poses(first.to_array(), result.odometry.poses), start
-        )
-    if result.reference is not None and len(result.reference) > 1:
-        reference = _moved(result.reference, metrics)
-        values["reference"] = _path(reference.stamps_ns, reference.poses, start)
-        values["errors"] = _errors(result.trajectory, reference, start)
     text = json.dumps(values, separators=(",", ":"), allow_nan=False)
     (folder / "viewer.json").write_text(text, encoding="utf-8")
-
-
-def _moved(reference: Trajectory, metrics: Mapping[str, Any]) -> Trajectory:
-    """The reference in the frame of the estimate."""
-    found = metrics.get("alignment_transform")
-    if not isinstance(found, dict):
-        return reference
-    T_estimate_reference = Pose2(found["x"], found["y"], found["theta"]).inverse()
-    return Trajectory(reference.stamps_ns, compose_poses(T_estimate_reference.to_array(), reference.poses))
 
 
 def _draw_map(result: Result, path: Path) -> dict[str, Any]:
@@ -82,25 +70,19 @@ def _draw_map(result: Result, path: Path) -> dict[str, Any]:
     }
 
 
-def _errors(trajectory: Trajectory, reference: Trajectory, start: int) -> dict[str, list[float | None]]:
-    """Distance and heading difference to the reference, interpolated at the stamps that it encloses."""
-    stamps, known = trajectory.stamps_ns, reference.stamps_ns
-    order = np.argsort(known, kind="stable")
-    base = int(known[order[0]])
-    t_known = (known[order] - base) / 1e9
-    inside = (stamps >= base) & (stamps <= int(known[order[-1]]))
-    t = (stamps[inside] - base) / 1e9
-    x = np.interp(t, t_known, reference.poses[order, 0])
-    y = np.interp(t, t_known, reference.poses[order, 1])
-    theta = np.interp(t, t_known, np.unwrap(reference.poses[order, 2]))
-    poses = trajectory.poses[inside]
-    position = np.hypot(poses[:, 0] - x, poses[:, 1] - y)
-    heading = np.degrees(np.abs(wrap_angles(poses[:, 2] - theta)))
-    return _columns((stamps[inside] - start) / 1e9, position=position, heading=heading)
+def _errors(comparison: Comparison, start: int) -> dict[str, list[float | None]]:
+    """Distance (m) and heading difference (deg) of the pairs that metrics.json counts; no peak is left out."""
+    order = np.argsort(comparison.pairs.stamps_ns, kind="stable")
+    seconds = (comparison.pairs.stamps_ns[order] - start) / 1e9
+    position, heading = comparison.errors.trans_part[order], comparison.errors.angle_deg[order]
+    each = POSES // 2 - 4  # room for the ends of both
+    rows = np.union1d(peak_rows(position, each), peak_rows(heading, each))
+    return _columns(seconds[rows], position=position[rows], heading=heading[rows])
 
 
-def _path(stamps: NDArray[np.int64], poses: Floats, start: int) -> dict[str, list[float | None]]:
-    return _columns((stamps - start) / 1e9, x=poses[:, 0], y=poses[:, 1], theta=poses[:, 2])
+def _path(trajectory: Trajectory, start: int) -> dict[str, list[float | None]]:
+    poses = trajectory.poses
+    return _columns((trajectory.stamps_ns - start) / 1e9, x=poses[:, 0], y=poses[:, 1], theta=poses[:, 2])
 
 
 def _columns(t: Floats, **columns: Floats) -> dict[str, list[float | None]]:

@@ -303,34 +303,30 @@ function legend(data) {
 }
 
 function metrics(job) {
-  const found = job.summary?.metrics ?? {}, rows = [], ape = found.ape;
+  const found = job.summary?.metrics ?? {}, rows = [];
   const row = (name, value) => {
     const line = element("tr"), head = element("th", name);
     head.scope = "row";
     line.append(head, element("td", value));
     rows.push(line);
   };
-  if (ape?.trans_part) {
-    row("APE, position", `rmse ${(100 * ape.trans_part.rmse).toFixed(1)} cm, median ${(100 * ape.trans_part.median).toFixed(1)} cm, max ${(100 * ape.trans_part.max).toFixed(1)} cm`);
-    row("APE, heading", `rmse ${ape.angle_deg.rmse.toFixed(3)}°, max ${ape.angle_deg.max.toFixed(3)}°`);
-  }
-  const relations = found.relations;
-  if (relations) {
-    const cm = (value) => value === null ? "–" : (100 * value).toFixed(1), part = relations.trans_part, angle = relations.angle_deg;
-    row("Relations", `${relations.matched} of ${relations.matched + relations.unmatched} are in the path`);
-    row("Relations, position", `mean ${cm(part.mean)} cm, std ${cm(part.std)} cm, max ${cm(part.max)} cm`);
-    row("Relations, heading", `mean ${angle.mean.toFixed(3)}°, std ${angle.std === null ? "–" : angle.std.toFixed(3)}°, max ${angle.max.toFixed(3)}°`);
-  }
+  if (found.verdict) row("Verdict", found.verdict);
+  // The figures as the reports show them: made once, in hsloc.report.table.
+  for (const figure of job.summary?.figures ?? []) row(figure.name, figure.values.join(", "));
   if (found.log) row("Log", `${found.log.duration_s.toFixed(1)} s, ${found.log.path_length_m.toFixed(1)} m, ${found.log.odometry_messages} odometry messages`);
-  if (found.scans) row("Scans", Object.entries(found.scans.by_status).map(([k, v]) => `${v} ${k}`).join(", "));
   const seconds = job.summary?.timings;
   if (seconds?.times_real_time) row("Speed", `${seconds.times_real_time.toFixed(0)} times real time`);
   if (found.run) row("Run", `hsloc ${found.run.hsloc}, ${found.run.matcher}, preset ${found.run.preset}, seed ${found.run.seed}`);
   if (found.run) row("SHA-256 of the log", found.run.input_sha256);
   $("metrics").tBodies[0].replaceChildren(...rows);
-  const notes = [...(job.summary?.warnings ?? []), ...(job.summary?.notes ?? [])];
-  $("notes").replaceChildren(...notes.map((text) => element("p", text, "quiet")));
+  const reasons = (job.summary?.verdict_reasons ?? []).map(warningText);
+  const warnings = (job.summary?.warnings ?? []).map(warningText).filter((text) => !reasons.includes(text));
+  const lines = [...reasons, ...warnings, ...(job.summary?.notes ?? [])];
+  $("notes").replaceChildren(...lines.map((text) => element("p", text, "quiet")));
 }
+
+// Jobs of earlier versions hold warnings as text.
+const warningText = (warning) => typeof warning === "string" ? warning : [warning.text, warning.remedy].filter(Boolean).join("; ");
 
 // --- time ------------------------------------------------------------------------------------------------------------
 function scrub(value) {

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hsloc.analysis.quality_warnings import doubts
+from hsloc.analysis.quality import quality_warnings, verdict_reasons
 from hsloc.log import LogWriter, ReadOptions, open_log
 from hsloc.model import Odometry, Pose2, Scan, Truth
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
+from hsloc.warnings import WarningCode
 
 OFFICE = Path(__file__).resolve().parents[2] / "recordings" / "office.mcap"
 
@@ -30,24 +31,33 @@ def rewritten(path, change, end=20.0):
     return path
 
 
-def test_a_sound_run_leaves_no_doubt():
-    assert doubts(run(RunRequest(logs=(OFFICE,), read=ReadOptions(end_s=20.0), unknown_start=True))) == []
+def test_a_sound_run_is_good():
+    found = run(RunRequest(logs=(OFFICE,), read=ReadOptions(end_s=20.0), unknown_start=True))
+    assert quality_warnings(found) == []
+    assert verdict_reasons(found, found.warnings) == ()
 
 
-def test_a_laser_that_hangs_head_down_and_is_not_said_to_leaves_a_doubt(tmp_path):
+def test_a_laser_that_is_mounted_upside_down_unstated_is_warned_of(tmp_path):
     def mirrored(event):
         return replace(event, ranges=event.ranges[::-1].copy()) if isinstance(event, Scan) else event
 
     found = run(RunRequest(logs=(rewritten(tmp_path / "run.mcap", mirrored),), unknown_start=True))
-    (line,) = doubts(found)
-    assert "scans found no place on the map" in line
-    assert "--laser-pose" in line
+    (warning,) = quality_warnings(found)
+    assert warning.code == WarningCode.SCANS_WITHOUT_PLACE
+    assert "--laser-pose" in warning.remedy
+    reason = verdict_reasons(found, [warning])[0]
+    assert (reason.code, reason.text) == (warning.code, warning.text)
+    assert reason.verdict == ("failed" if not found.localised.any() else "check")
+    assert 0.0 <= reason.times[0][0] <= reason.times[-1][1] <= 20.0
 
 
 def test_a_log_too_short_to_be_sure_is_all_guesses():
     found = run(RunRequest(logs=(OFFICE,), read=ReadOptions(end_s=0.5), unknown_start=True))
     assert not found.localised.any()
-    assert "every pose is a guess" in doubts(found)[0]
+    (warning,) = quality_warnings(found)
+    assert "every pose is a guess" in warning.text
+    (reason,) = verdict_reasons(found, [warning])
+    assert reason.verdict == "failed"
 
 
 def test_odometry_that_is_told_in_millimetres_is_not_mended(tmp_path):
@@ -59,8 +69,9 @@ def test_odometry_that_is_told_in_millimetres_is_not_mended(tmp_path):
 
     log = rewritten(tmp_path / "run.mcap", in_millimetres, end=6.0)
     found = run(RunRequest(logs=(log,), initial_pose=Pose2(2.6, 8.1, 1.5708)))
-    (line,) = (text for text in found.warnings if "jumps" in text)
-    assert "too often to be mended" in line
+    (warning,) = (each for each in found.warnings if each.code.startswith("odometry"))
+    assert warning.code == WarningCode.ODOMETRY_JUMPS
+    assert "check" in [reason.verdict for reason in verdict_reasons(found, found.warnings)]
     assert found.odometry.length() > 1000.0  # as it is, but for the first few jumps
 
 
@@ -76,10 +87,10 @@ def test_odometry_that_begins_anew_goes_on_where_it_was_and_is_told(tmp_path, mo
     spec = RunRequest(logs=(rewritten(tmp_path / "run.mcap", begun_anew, end=14.0),), mode=mode, initial_pose=start)
     found = run(spec)
     whole = run(replace(spec, logs=(rewritten(tmp_path / "whole.mcap", lambda event: event, end=14.0),)))
-    (line,) = (text for text in found.warnings if "jumps" in text)
-    assert line.startswith("odometry (/odom) jumps (1 times, first by ")
-    assert " at 10.000 s); it goes on there" in line
-    assert not any("jumps" in text for text in whole.warnings)
+    (warning,) = (each for each in found.warnings if each.code == WarningCode.ODOMETRY_RESET)
+    assert warning.text.startswith("odometry (/odom) jumps (1 times, first by ")
+    assert " at 10.000 s); it is continued" in warning.text
+    assert not any(each.code.startswith("odometry") for each in whole.warnings)
     # But for the one step in which it jumped, 2 cm at 1 m/s.
     for name in ("odometry", "trajectory"):
         a, b = getattr(found, name), getattr(whole, name)

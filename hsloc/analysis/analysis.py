@@ -1,0 +1,159 @@
+"""`analyse`: from the result of a run to its metrics, its comparison with the reference, and its warnings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.analysis.metrics import (
+    evaluation_counts,
+    fitness_metrics,
+    localised_metrics,
+    log_metrics,
+    loss_metrics,
+    map_metrics,
+    run_identity,
+    scan_counts,
+)
+from hsloc.analysis.quality import quality_warnings, verdict_reasons
+from hsloc.analysis.scan_statistics import ConvergenceSample, ExtrinsicsCheck, Residuals
+from hsloc.analysis.second_pass import posed_events
+from hsloc.errors import EvaluationError
+from hsloc.evaluation import evaluate_relations, read_relations
+from hsloc.evaluation.association import interpolate_poses
+from hsloc.evaluation.error_metrics import ErrorMetrics
+from hsloc.evaluation.metrics import compare_run
+from hsloc.model.events import PairedScan
+from hsloc.model.pose2 import Pose2, compose_poses
+from hsloc.model.trajectory import Trajectory
+from hsloc.model.verdict import verdict_of
+from hsloc.run_metrics import RunMetrics
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from hsloc.analysis.second_pass import PosedEvent
+    from hsloc.evaluation import Comparison, RelationsResult
+    from hsloc.replay.run import Result
+
+    Convergence = dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Analysis:
+    """What the result of a run shows.
+
+    `comparison` pairs the trajectory with the reference, and `odometry_alone` the odometry: None where there is no
+    reference, or where they do not meet in time. `odometry` is the odometry in the frame of the map, moved as a whole
+    to the trajectory's first localised pose. `convergence` holds, by heading, the median best fitness over the
+    evaluations of the search. Whatever shows errors over time uses these pairs: association happens here alone.
+    """
+
+    metrics: RunMetrics
+    comparison: Comparison | None
+    odometry_alone: Comparison | None
+    odometry: Trajectory | None
+    convergence: Convergence
+
+
+def analyse(
+    result: Result,
+    *,
+    observer: Callable[[PosedEvent], None] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Analysis:
+    """Read the scans of the log a second time, and measure how well they, the map and the reference agree.
+
+    Alignment with the reference and relations are those of the request; the alignment is by default none on a given
+    map, and se2 on a built one, whose frame is its own. `observer` sees each event of the second pass, for a
+    recording of it. Raises EvaluationError for relations that cannot be used, and LogError where the log has changed.
+    """
+    residuals = Residuals(result.grid)
+    spec, scans = result.spec, len(result.diagnostics)
+    matcher, sigma = spec.matcher, spec.config.likelihood_field.sigma
+    check = ExtrinsicsCheck(result.grid, result.likelihood, matcher, sigma, scans, len(result.summary.lasers))
+    sample = ConvergenceSample(result.grid, result.likelihood, matcher, sigma, scans)
+    for posed in posed_events(result, progress):
+        if observer is not None:
+            observer(posed)
+        if posed.localised and isinstance(posed.event, PairedScan):
+            for statistics in (residuals, check, sample):
+                statistics.add(posed.event.scan, posed.T_map_base)
+    errors = _Errors(result, spec.alignment or ("se2" if result.mode == "slam" else "none"))
+    warnings = (*result.warnings, *quality_warnings(result), *residuals.warnings(), *check.warnings())
+    reasons = verdict_reasons(result, warnings)
+    metrics = RunMetrics(
+        verdict=verdict_of(reasons),
+        verdict_reasons=reasons,
+        run=run_identity(result),
+        log=log_metrics(result),
+        scans=scan_counts(result),
+        evaluations=evaluation_counts(result),
+        fitness=fitness_metrics(result),
+        map=map_metrics(result, residuals.metrics(), errors.whole),
+        localised=localised_metrics(result),
+        losses=loss_metrics(result),
+        warnings=warnings,
+        errors=_metrics_of(errors.whole),
+        evaluation_error=errors.reason,
+        localised_only=_metrics_of(errors.localised),
+        localised_only_error=errors.localised_reason,
+        odometry_alone=_metrics_of(errors.odometry_alone),
+        relations=_relations(result),
+    )
+    return Analysis(
+        metrics, errors.whole, errors.odometry_alone, errors.odometry, sample.curves(spec.matcher_name.upper())
+    )
+
+
+def _relations(result: Result) -> RelationsResult | None:
+    path = result.spec.relations
+    return None if path is None else evaluate_relations(result.trajectory, read_relations(path))
+
+
+class _Errors:
+    """Comparisons with the reference: of the whole trajectory, of its localised poses, and of the odometry alone."""
+
+    def __init__(self, result: Result, alignment: str) -> None:
+        self._alignment = alignment
+        self._reference = result.reference
+        self.odometry = start_together(result.odometry, result.trajectory, result.localised)
+        self.whole, self.reason = self._compare(result.trajectory)
+        self.localised, self.localised_reason = None, None
+        if self._reference is not None and result.localised.any() and not result.localised.all():
+            known = Trajectory(result.trajectory.stamps_ns[result.localised], result.trajectory.poses[result.localised])
+            self.localised, self.localised_reason = self._compare(known)
+        self.odometry_alone = None
+        if self.whole is not None and self.odometry is not None:
+            self.odometry_alone = self._compare(self.odometry)[0]
+
+    def _compare(self, trajectory: Trajectory) -> tuple[Comparison | None, str | None]:
+        """The comparison, or why there is none; a reference of one pose is no trajectory to compare with."""
+        if self._reference is None or len(self._reference) < 2:
+            return None, None
+        try:
+            return compare_run(trajectory, self._reference, alignment=self._alignment), None
+        except EvaluationError as error:
+            return None, str(error)
+
+
+def _metrics_of(comparison: Comparison | None) -> ErrorMetrics | None:
+    return None if comparison is None else ErrorMetrics.of(comparison.evaluation())
+
+
+def start_together(odometry: Trajectory, trajectory: Trajectory, localised: NDArray[np.bool_]) -> Trajectory | None:
+    """Odometry moved as a whole, so that it agrees with the trajectory's first localised pose in time.
+
+    With the first pose of all where none is localised; None without odometry.
+    """
+    if not len(odometry) or not len(trajectory):
+        return None
+    rows = np.flatnonzero(localised) if localised.any() else np.arange(len(trajectory))
+    row = int(rows[np.argmin(trajectory.stamps_ns[rows])])
+    there = interpolate_poses(odometry, trajectory.stamps_ns[row : row + 1])[0]
+    T_map_odom = Pose2.from_array(trajectory.poses[row]) @ Pose2.from_array(there).inverse()
+    return Trajectory(odometry.stamps_ns, compose_poses(T_map_odom.to_array(), odometry.poses))

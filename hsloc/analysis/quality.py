@@ -1,0 +1,102 @@
+"""Quality of a run's result: warnings, and the verdict with its reasons."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.model.verdict import Verdict, VerdictReason
+from hsloc.trajectory_io.tum import NS_PER_S
+from hsloc.warnings import RunWarning, WarningCode
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from hsloc.replay.run import Result
+
+_MAX_WITHOUT_PLACE = 0.5
+"""Fraction of scans without a place from which on the poses of the others are not to be trusted."""
+_VERDICTS = {
+    WarningCode.LASER_MISFIT: Verdict.CHECK,
+    WarningCode.EXTRINSICS_DISAGREE: Verdict.CHECK,
+    WarningCode.ODOMETRY_JUMPS: Verdict.CHECK,
+}
+"""Warnings that concern the whole result, with the verdict that each alone gives."""
+
+
+def quality_warnings(result: Result) -> list[RunWarning]:
+    """Localisation: most scans were rejected or left the pose open. A pose found once may then be a chance fit."""
+    if result.mode != "localise":
+        return []
+    status = Counter(result.diagnostics.status)
+    without, scans = status["searching"] + status["rejected"], len(result.diagnostics)
+    if without <= _MAX_WITHOUT_PLACE * scans:
+        return []
+    share = _share(result)
+    meaning = "every pose is a guess" if share == 0.0 else f"the {100 * share:.0f} % localised poses may be wrong"
+    return [
+        RunWarning(
+            WarningCode.SCANS_WITHOUT_PLACE,
+            f"{without} of {scans} scans found no place on the map, so {meaning}",
+            "check map, mounting (--laser-pose) and odometry (hsloc check), or give the start (--initial-pose)",
+        )
+    ]
+
+
+def verdict_reasons(result: Result, warnings: Sequence[RunWarning]) -> tuple[VerdictReason, ...]:
+    """The evidence against the result, from its warnings and from its poses. Never from the truth."""
+    reasons = []
+    for warning in warnings:
+        if warning.code == WarningCode.SCANS_WITHOUT_PLACE:
+            verdict = Verdict.FAILED if _share(result) == 0.0 else Verdict.CHECK
+            reasons.append(VerdictReason(verdict, warning.code, warning.text, warning.remedy, times=_unplaced(result)))
+        elif warning.code in _VERDICTS:
+            verdict = _VERDICTS[WarningCode(warning.code)]
+            reasons.append(VerdictReason(verdict, warning.code, warning.text, warning.remedy))
+    if 0.0 < _share(result) < 1.0:
+        reasons.append(_not_localised(result))
+    return tuple(reasons)
+
+
+def _share(result: Result) -> float:
+    return float(result.localised.mean()) if len(result.localised) else 0.0
+
+
+def _not_localised(result: Result) -> VerdictReason:
+    """The poses that are guesses, with the places where the pose was lost and found."""
+    trajectory = result.trajectory
+    spans = _runs(~result.localised)
+    last = len(trajectory) - 1
+    ends = [row for first, end in spans for row in (first - 1, end + 1) if 0 <= row <= last]
+    return VerdictReason(
+        Verdict.CHECK,
+        "poses_not_localised",
+        f"{100.0 * (1.0 - _share(result)):.1f} % of the poses are not localised: they are guesses",
+        "use the poses that are localised, or give the start (--initial-pose)",
+        places=tuple((float(x), float(y)) for x, y in trajectory.poses[ends, :2]),
+        times=_times(trajectory.stamps_ns, spans, result),
+    )
+
+
+def _unplaced(result: Result) -> tuple[tuple[float, float], ...]:
+    """Spans in which no scan found a place."""
+    without = np.isin(result.diagnostics.status, ("searching", "rejected"))
+    return _times(result.diagnostics.stamps_ns, _runs(without), result)
+
+
+def _runs(rows: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last row of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], rows, [False]))))
+    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]
+
+
+def _times(
+    stamps_ns: NDArray[np.int64], spans: list[tuple[int, int]], result: Result
+) -> tuple[tuple[float, float], ...]:
+    start = int(result.trajectory.stamps_ns.min())
+    seconds = ((stamps_ns - start) / NS_PER_S).tolist()
+    return tuple((seconds[first], seconds[end]) for first, end in spans)

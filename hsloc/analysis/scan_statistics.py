@@ -1,0 +1,241 @@
+"""Statistics over the scans of a finished run: fit to the map, mounting of each laser, convergence of the search.
+
+Each class takes the scans whose pose is known, one by one with their poses, in bounded memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import degrees, hypot, radians
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.matching.harmony_search import HarmonySearch
+from hsloc.matching.likelihood_field import LikelihoodField
+from hsloc.matching.window import Window
+from hsloc.model.pose2 import Pose2
+from hsloc.run_metrics import LaserResiduals, ResidualMetrics
+from hsloc.warnings import RunWarning, WarningCode
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hsloc.matching.match import Matcher
+    from hsloc.model.events import Scan
+    from hsloc.model.occupancy_grid import OccupancyGrid
+
+_BIN_M = 0.005
+_MAX_DISTANCE_M = 5.0
+_BINS = int(_MAX_DISTANCE_M / _BIN_M) + 1
+NEAR_WALL_M = 0.15
+"""A point within this distance of an occupied cell is explained by the map."""
+_MISFIT_RATIO = 0.8
+"""A laser with less than this part of the best laser's explained points has another mounting, or is broken."""
+
+MIN_POINTS = 30
+"""A scan with fewer points is not matched here: its pose is not determined."""
+CHECKED_SCANS = 60
+"""Scans of each laser that are matched alone to check its mounting."""
+_MIN_CHECKED_SCANS = 10
+_CHECK_HALF_M, _CHECK_HALF_RAD = 0.6, radians(20.0)
+_CHECK_MIN_FITNESS = 0.5
+MOUNTING_ERROR_M, MOUNTING_ERROR_RAD = 0.1, radians(2.0)
+"""Smaller errors of a mounting are not reported."""
+_MIN_SIGMAS = 4.0
+"""Errors of a mounting are reported from this multiple of their standard error on."""
+
+CONVERGENCE_SCANS = 25
+CONVERGENCE_HALF_M, CONVERGENCE_HALF_RAD = 0.5, radians(20.0)
+"""Half-widths of the window: that of a search after a rejected match."""
+
+
+class Residuals:
+    """Distances to the nearest occupied cell, counted in bins of 5 mm, so that memory does not grow."""
+
+    def __init__(self, grid: OccupancyGrid) -> None:
+        from scipy.ndimage import distance_transform_edt
+
+        self._grid = grid
+        self._distance = (distance_transform_edt(~grid.occupied()) * grid.resolution).astype(np.float32)
+        self._T_grid_map = grid.origin.inverse()
+        self._by_laser: dict[str, NDArray[np.int64]] = {}
+
+    def add(self, scan: Scan, T_map_base: Pose2) -> None:
+        """Count the points of a scan; those outside the map count as far from any wall."""
+        local = (self._T_grid_map @ T_map_base) @ scan.points_base()
+        cells = np.floor(local / self._grid.resolution).astype(np.int64)
+        height, width = self._distance.shape
+        inside = (cells[:, 0] >= 0) & (cells[:, 0] < width) & (cells[:, 1] >= 0) & (cells[:, 1] < height)
+        distance = np.full(len(cells), _MAX_DISTANCE_M, dtype=np.float32)
+        distance[inside] = self._distance[cells[inside, 1], cells[inside, 0]]
+        bins = np.minimum(distance / _BIN_M, _BINS - 1).astype(np.int64)
+        counts = self._by_laser.setdefault(scan.frame_id, np.zeros(_BINS, dtype=np.int64))
+        counts += np.bincount(bins, minlength=_BINS)
+
+    def metrics(self) -> ResidualMetrics:
+        """The figures over all lasers; where there are several, also those of each."""
+        whole = _figures(sum(self._by_laser.values(), np.zeros(_BINS, dtype=np.int64)))
+        by_laser = None
+        if len(self._by_laser) > 1:
+            by_laser = {frame: _figures(counts) for frame, counts in sorted(self._by_laser.items())}
+        return ResidualMetrics(
+            points=whole.points,
+            median=whole.median,
+            p95=whole.p95,
+            within_15_cm=whole.within_15_cm,
+            by_laser=by_laser,
+        )
+
+    def warnings(self) -> list[RunWarning]:
+        """A warning for each laser whose scans fit the map far worse than those of the best one."""
+        near = {frame: _figures(counts).within_15_cm for frame, counts in sorted(self._by_laser.items())}
+        known = {frame: part for frame, part in near.items() if part is not None}
+        if len(known) < 2:
+            return []
+        best = max(known, key=lambda frame: known[frame])
+        return [
+            RunWarning(
+                WarningCode.LASER_MISFIT,
+                f"{100.0 * part:.0f} % of the points of the laser {frame} lie at a wall of the map, but "
+                f"{100.0 * known[best]:.0f} % of those of {best}",
+                f"check the mounting of {frame} in /tf_static, or leave it out with --scan-topic",
+            )
+            for frame, part in known.items()
+            if part < _MISFIT_RATIO * known[best]
+        ]
+
+
+def _figures(counts: NDArray[np.int64]) -> LaserResiduals:
+    total = int(counts.sum())
+    if total == 0:
+        return LaserResiduals(points=0, median=None, p95=None, within_15_cm=None)
+    part = np.cumsum(counts) / total
+    return LaserResiduals(
+        points=total,
+        median=float(np.searchsorted(part, 0.5) * _BIN_M),
+        p95=float(np.searchsorted(part, 0.95) * _BIN_M),
+        within_15_cm=float(part[int(NEAR_WALL_M / _BIN_M)]),
+    )
+
+
+class ExtrinsicsCheck:
+    """Whether several lasers are mounted where the log states: each is matched alone on the map of the run.
+
+    A laser that is mounted elsewhere, by five degrees or ten centimetres, bends a map and biases a pose without any
+    other sign, since the pose is a compromise between the lasers. The median of what two lasers disagree in, in the
+    frame of the base, is the error of a mounting.
+    """
+
+    def __init__(
+        self, grid: OccupancyGrid, likelihood: LikelihoodField | None, matcher: Matcher, sigma: float, scans: int,
+        lasers: int,
+    ) -> None:  # fmt: skip
+        """`scans` is the number of scans to come, of `lasers` lasers; with one laser there is nothing to compare.
+
+        The map's field is made with `sigma` (m) where it is not given.
+        """
+        self._every = max(scans // (max(lasers, 1) * CHECKED_SCANS), 1)
+        usable = lasers > 1 and bool(grid.occupied().any())
+        self._field = (likelihood or LikelihoodField.from_grid(grid, sigma)) if usable else None
+        self._matcher = matcher
+        self._rng = np.random.default_rng(0)
+        self._seen: dict[str, int] = {}
+        self._mounted: dict[str, Pose2] = {}
+        self._offsets: dict[str, list[NDArray[np.float64]]] = {}
+
+    def add(self, scan: Scan, T_map_base: Pose2) -> None:
+        """A scan, and the pose of the base at its stamp."""
+        frame = scan.frame_id
+        number = self._seen[frame] = self._seen.get(frame, -1) + 1
+        self._mounted.setdefault(frame, scan.T_base_laser)
+        if self._field is None or number % self._every:
+            return
+        points = scan.points_base()
+        if len(points) < MIN_POINTS:
+            return
+        window = Window(T_map_base, _CHECK_HALF_M, _CHECK_HALF_M, _CHECK_HALF_RAD)
+        match = self._matcher.match(points, self._field, window, self._rng)
+        if match.fitness >= _CHECK_MIN_FITNESS:
+            self._offsets.setdefault(frame, []).append(T_map_base.between(match.pose).to_array())
+
+    def warnings(self) -> list[RunWarning]:
+        """A warning for each laser that disagrees with the first in the order of names."""
+        offsets_of = {
+            frame: np.array(rows) for frame, rows in sorted(self._offsets.items()) if len(rows) >= _MIN_CHECKED_SCANS
+        }
+        warnings = []
+        for other, offsets in list(offsets_of.items())[1:]:
+            first = next(iter(offsets_of))
+            a, sigma_a = _median(offsets_of[first])
+            b, sigma_b = _median(offsets)
+            off = a.between(b)
+            sigma = np.hypot(sigma_a, sigma_b)
+            far = hypot(off.x, off.y) > max(MOUNTING_ERROR_M, _MIN_SIGMAS * float(np.hypot(*sigma[:2])))
+            if far or abs(off.theta) > max(MOUNTING_ERROR_RAD, _MIN_SIGMAS * float(sigma[2])):
+                stated, found = self._mounted[other], off @ self._mounted[other]
+                warnings.append(
+                    RunWarning(
+                        WarningCode.EXTRINSICS_DISAGREE,
+                        f"the laser {other} does not fit {first}: /tf_static states {_text(stated)}, by the map it is "
+                        f"at about {_text(found)}",
+                        f"measure how {other} and {first} are mounted and correct /tf_static",
+                    )
+                )
+        return warnings
+
+
+def _median(offsets: NDArray[np.float64]) -> tuple[Pose2, NDArray[np.float64]]:
+    """The median, and its standard error from the spread about it."""
+    middle = np.median(offsets, axis=0)
+    spread = 1.4826 * np.median(np.abs(offsets - middle), axis=0)
+    return Pose2.from_array(middle), 1.25 * spread / np.sqrt(len(offsets))
+
+
+def _text(pose: Pose2) -> str:
+    return f"{pose.x:.2f}, {pose.y:.2f} m, {degrees(pose.theta):.1f} deg"
+
+
+class ConvergenceSample:
+    """Searches about `CONVERGENCE_SCANS` scans of a run again and keeps the best fitness after each evaluation."""
+
+    def __init__(
+        self, grid: OccupancyGrid, likelihood: LikelihoodField | None, matcher: Matcher, sigma: float, scans: int
+    ) -> None:
+        """The map's likelihood field is built where it is not given: for a large map it takes seconds.
+
+        Nothing is sampled for a matcher that does not search (ICP), or on a map without walls.
+        """
+        usable = isinstance(matcher, HarmonySearch) and grid.occupied().any()
+        self._matcher = replace(matcher, restarts=1) if usable and isinstance(matcher, HarmonySearch) else None
+        self._field = (likelihood or LikelihoodField.from_grid(grid, sigma)) if usable else None
+        self._every = max(scans // CONVERGENCE_SCANS, 1)
+        self._seen = -1
+        self._rng = np.random.default_rng(0)
+        self._curves: list[NDArray[np.float64]] = []
+
+    def add(self, scan: Scan, T_map_base: Pose2) -> None:
+        """A scan, and the pose of the base at its stamp."""
+        self._seen += 1
+        full = len(self._curves) >= CONVERGENCE_SCANS
+        if self._matcher is None or self._field is None or self._seen % self._every or full:
+            return
+        points = scan.points_base()
+        if len(points) < MIN_POINTS:
+            return
+        # The window is not centred on the answer.
+        half = (CONVERGENCE_HALF_M, CONVERGENCE_HALF_M, CONVERGENCE_HALF_RAD)
+        off = Pose2(*(self._rng.uniform(-0.5, 0.5, 3) * half).tolist())
+        window = Window(T_map_base @ off, *half)
+        history = self._matcher.match(points, self._field, window, self._rng, keep_history=True).history
+        if history is not None and len(history):
+            self._curves.append(history)
+
+    def curves(self, name: str) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        """(evaluations, best fitness), the median over the scans, under a heading; empty where nothing was sampled."""
+        if not self._curves:
+            return {}
+        length = min(len(curve) for curve in self._curves)
+        middle = np.median([curve[:length] for curve in self._curves], axis=0)
+        window = f"±{CONVERGENCE_HALF_M:g} m, ±{degrees(CONVERGENCE_HALF_RAD):.0f}°"
+        return {f"{name}, {len(self._curves)} scans, {window}": (np.arange(1.0, length + 1.0), middle)}

@@ -1,0 +1,90 @@
+"""Where compiled kernels are kept, and what is reported while they are compiled.
+
+numba keeps them beside the sources, else in the user's cache folder, and raises where it may write to neither: a user
+without a home, or a read-only container. Then a private folder among the temporary files is used, and without that
+they are compiled again in each process.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import tempfile
+import warnings
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numba
+from numba.core import config, event
+from numba.core.dispatcher import Dispatcher
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+_PARENTS = ("/dev/shm",)
+"""Tried after the folder of temporary files."""
+
+
+def choose_cache() -> None:
+    """Give numba a folder that can be written, or leave its cache out with a warning."""
+    if _can_cache():
+        return
+    folder = _private_folder()
+    if folder is not None:
+        setattr(config, "CACHE_DIR", str(folder))  # noqa: B010
+        if _can_cache():
+            return
+    warnings.warn(
+        "no folder for compiled kernels can be written, so they are compiled in every process (about 20 s); "
+        "set NUMBA_CACHE_DIR to a folder that can be written",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    # The decorators ask for a cache, and numba raises where it finds no place for one.
+    setattr(Dispatcher, "enable_caching", lambda _: None)  # noqa: B010
+
+
+def _can_cache() -> bool:
+    def probe() -> None: ...
+
+    try:
+        numba.njit(cache=True)(probe)
+    except RuntimeError:
+        return False
+    return True
+
+
+def _private_folder() -> Path | None:
+    """A folder among the temporary files that belongs to this user alone: what is loaded from it is executed."""
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    for parent in (tempfile.gettempdir(), *_PARENTS):
+        folder = Path(parent) / f"hsloc-kernels-{user}"
+        try:
+            folder.mkdir(mode=0o700, exist_ok=True)
+            found = folder.lstat()
+        except OSError:
+            continue
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == user and not found.st_mode & 0o022:
+            return folder
+    return None
+
+
+class _Count(event.Listener):
+    def __init__(self, report: Callable[[int], None]) -> None:
+        self._report = report
+        self._count = 0
+
+    def on_start(self, event: Any) -> None:
+        self._report(self._count)
+
+    def on_end(self, event: Any) -> None:
+        self._count += 1
+        self._report(self._count)
+
+
+@contextmanager
+def compilation_reported(report: Callable[[int], None]) -> Iterator[None]:
+    """`report` gets the number of kernels compiled so far, whenever one is compiled because no cache holds it."""
+    with event.install_listener("numba:compile", _Count(report)):
+        yield

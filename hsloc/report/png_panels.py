@@ -1,0 +1,294 @@
+"""The panels of report.png: the map with the trajectory, curves over time, and the table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import floor, log10
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, StrMethodFormatter
+from matplotlib.transforms import Affine2D
+
+from hsloc.model import Status
+from hsloc.report import style
+from hsloc.report.data import LOG_ABOVE, Curve
+from hsloc.report.map_image import line_width, picture_of
+from hsloc.report.polyline import joined, pieces_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from numpy.typing import NDArray
+
+    from hsloc.model import OccupancyGrid
+    from hsloc.report.data import ReportData
+    from hsloc.report.map_image import Extent
+
+    Floats = NDArray[np.float64]
+    from hsloc.report.table import Row
+
+HALO = [withStroke(linewidth=3.0, foreground="white")]
+
+
+def draw_map(
+    axes: Axes, data: ReportData, grid: OccupancyGrid | None, points: Floats | None, extent: Extent, pixels: float
+) -> None:
+    """Fill the panel, which is about `pixels` wide or high, whichever is more."""
+    axes.set_facecolor(style.UNKNOWN if grid is not None else style.PAPER)
+    if grid is not None:
+        _draw_grid(axes, grid, pixels)
+    if points is not None and len(points):
+        axes.plot(points[:, 0], points[:, 1], ".", color=style.WALL, markersize=2.2, label="map points", zorder=2)
+    _draw_paths(axes, data, line_width(data, extent), max(extent.width, extent.height) / pixels)
+    _draw_marks(axes, data)
+    _draw_ends(axes, data, extent)
+    _draw_scale_bar(axes, extent)
+    axes.set_xlim(extent.x0, extent.x1)
+    axes.set_ylim(extent.y0, extent.y1)
+    axes.set_aspect("equal", adjustable="box")
+    axes.tick_params(length=3, labelsize=style.SMALL, color=style.RULE, labelcolor=style.MUTED)
+    unit, metres = ("km", 1000.0) if max(extent.width, extent.height) > 5000.0 else ("m", 1.0)
+    for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y")):
+        axis.set_label_text(f"{name} [{unit}]", fontsize=style.SMALL, color=style.MUTED)
+        axis.labelpad = 2
+        axis.set_major_locator(MaxNLocator(9, steps=[1, 2, 5, 10]))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / metres:.10g}".replace("-", "−")))
+    if grid is None:
+        axes.grid(color=style.RULE, linewidth=0.7)
+        axes.set_axisbelow(True)
+    for spine in axes.spines.values():
+        spine.set_color(style.RULE)
+
+
+def _draw_grid(axes: Axes, grid: OccupancyGrid, pixels: float) -> None:
+    picture = picture_of(grid, pixels)
+    if picture is None:
+        return
+    image = axes.imshow(
+        picture.levels, origin="lower", zorder=1, interpolation="antialiased",
+        extent=(0.0, picture.width, 0.0, picture.height), aspect="equal",
+    )  # fmt: skip
+    pose = picture.T_map_corner
+    image.set_transform(Affine2D().rotate(pose.theta).translate(pose.x, pose.y) + axes.transData)
+
+
+def _draw_paths(axes: Axes, data: ReportData, width: float, pixel: float) -> None:
+    """In the order of the legend; zorder gives what covers what. Nothing finer than half a pixel is drawn."""
+
+    def seen(xy: Floats) -> Floats:
+        return joined(pieces_of(xy, 0.5 * pixel))
+
+    if len(data.path):
+        known = seen(np.where(data.localised[:, None], data.path, np.nan))
+        axes.plot(*known.T, color=style.BLUE, linewidth=width, label="trajectory", zorder=5, solid_capstyle="round")
+    if data.reference is not None and len(data.reference):
+        axes.plot(
+            *seen(data.reference).T, color="black", linewidth=1.0, linestyle=(0, (5, 3)), label="reference", zorder=6
+        )
+    if data.odometry is not None and len(data.odometry):
+        axes.plot(
+            *seen(data.odometry).T, color=style.VERMILLION, alpha=0.7, linewidth=1.3, linestyle=(0, (1, 1.2)),
+            label="odometry alone", zorder=3,
+        )  # fmt: skip
+    if not data.localised.all():
+        guessed = seen(np.where(data.localised[:, None], np.nan, data.path))
+        axes.plot(
+            *guessed.T, color=style.PURPLE, linewidth=2.0, linestyle=(0, (0.8, 1.2)), label="pose unknown", zorder=4
+        )
+
+
+def _draw_marks(axes: Axes, data: ReportData) -> None:
+    if data.scans is None:
+        return
+    for statuses, label, marker, colour, size, zorder in (
+        ((Status.NO_RETURNS,), "scan without returns", "v", style.ORANGE, 5.0, 7),
+        ((Status.REJECTED,), "scan rejected", "x", style.VERMILLION, 5.0, 8),
+        ((Status.RELOCALISED,), "pose found", "*", style.ORANGE, 13.0, 9),
+    ):
+        xy = data.scans.xy[data.scans.where(*statuses)]
+        if len(xy):
+            axes.plot(
+                *xy.T, linestyle="none", marker=marker, color=colour, markersize=size, label=label, zorder=zorder,
+                markeredgewidth=1.4 if marker == "x" else 0.7,
+                markeredgecolor=colour if marker == "x" else style.INK,
+            )  # fmt: skip
+
+
+def _draw_ends(axes: Axes, data: ReportData, extent: Extent) -> None:
+    if not len(data.path):
+        axes.text(
+            0.5, 0.5, "no pose", transform=axes.transAxes, ha="center", va="center", color=style.MUTED, fontsize=14
+        )
+        return
+    order = np.argsort(data.seconds, kind="stable")
+    start, end = data.path[order[0]], data.path[order[-1]]
+    together = np.hypot(*(end - start)) < 0.04 * max(extent.width, extent.height)
+    for xy, marker, colour, label in (
+        (end, "s", style.VERMILLION, "" if together else "end"),
+        (start, "o", style.GREEN, "start, end" if together else "start"),
+    ):
+        axes.plot(
+            *xy, marker=marker, color=colour, markersize=9, markeredgecolor="white", markeredgewidth=1.5, zorder=10
+        )
+        near_the_edge = xy[0] > extent.x1 - 0.1 * extent.width
+        axes.annotate(
+            label, xy, xytext=(-8 if near_the_edge else 8, 8), textcoords="offset points", fontsize=style.TEXT,
+            fontweight="bold", color=style.INK, path_effects=HALO, zorder=11, ha="right" if near_the_edge else "left",
+        )  # fmt: skip
+
+
+def _draw_scale_bar(axes: Axes, extent: Extent) -> None:
+    """A bar of a round length, up to a fifth of the width, in the lower left corner."""
+    length = round_length(extent.width / 5.0)
+    x, y = extent.x0 + 0.025 * extent.width, extent.y0 + 0.035 * extent.height
+    axes.plot(
+        (x, x + length), (y, y), color=style.INK, linewidth=3.0, solid_capstyle="butt", zorder=12,
+        path_effects=[withStroke(linewidth=6.0, foreground="white")],
+    )  # fmt: skip
+    axes.annotate(
+        format_round_length(length), (x + length / 2.0, y), xytext=(0, 5),
+        textcoords="offset points", ha="center", fontsize=style.TEXT, color=style.INK, path_effects=HALO, zorder=12,
+    )  # fmt: skip
+
+
+def round_length(metres: float) -> float:
+    """The nearest smaller 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** floor(log10(metres))
+    return float(next(step * power for step in (5.0, 2.0, 1.0) if step * power <= metres * (1.0 + 1e-12)))
+
+
+def format_round_length(metres: float) -> str:
+    """5 mm, 20 cm, 5 m, 2 km."""
+    for limit, factor, unit in ((0.0095, 1e3, "mm"), (0.95, 1e2, "cm"), (950.0, 1.0, "m")):
+        if metres < limit:
+            return f"{metres * factor:g} {unit}"
+    return f"{metres / 1000.0:g} km"
+
+
+MOST_POINTS = 3000
+_GAP_PIXELS = 10.0
+"""Between a label of the table and its value."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panel:
+    """One quantity over time: its heading, curve, and the colour of its line."""
+
+    title: str
+    curve: Curve
+    colour: str = style.BLUE
+    is_fitness: bool = False
+
+
+def time_panels(data: ReportData) -> list[Panel]:
+    """With truth: both errors and fitness. Without: fitness and what the estimator itself believes (sigma)."""
+    panels = []
+    if data.errors is not None:
+        metres, degrees = data.errors.translation_m, data.errors.rotation_deg
+        panels.append(Panel("translation error [cm]", Curve(metres.seconds, metres.values * 100.0)))
+        panels.append(Panel("rotation error [deg]", degrees))
+    scans = data.scans
+    if scans is not None:
+        if data.errors is None:
+            panels.append(Panel("position, standard deviation [cm]", Curve(scans.seconds, scans.sigma_m * 100.0)))
+            panels.append(Panel("heading, standard deviation [deg]", Curve(scans.seconds, scans.sigma_deg)))
+        accepted = np.where(scans.where(Status.REJECTED), np.nan, scans.fitness)
+        panels.append(Panel("fitness of the match", Curve(scans.seconds, accepted), style.GREEN, True))
+    return [panel for panel in panels if np.isfinite(panel.curve.values).any()]
+
+
+def draw_panel(axes: Axes, panel: Panel, data: ReportData, *, with_time: bool) -> None:
+    """One panel; `with_time` writes the time under it."""
+    unit, factor = ("min", 60.0) if data.duration_s > 300.0 else ("s", 1.0)
+    lost = () if data.scans is None else data.scans.lost
+    curve = _known(panel.curve, lost).thinned(MOST_POINTS)
+    curve = Curve(curve.seconds / factor, curve.values)
+    end = max(data.duration_s, float(panel.curve.seconds.max(initial=0.0))) / factor
+    if panel.is_fitness:
+        _draw_fitness(axes, curve, data, factor)
+    else:
+        _draw_line(axes, curve, panel.colour)
+    for begin, until in lost:
+        axes.axvspan(
+            begin / factor, min(until / factor, end), facecolor=style.PURPLE, alpha=0.22, linewidth=0, zorder=0
+        )
+    axes.set_title(panel.title, loc="left", fontsize=style.TEXT, color=style.INK, pad=4)
+    axes.set_xlim(0.0, end if end > 0.0 else 1.0)
+    axes.grid(axis="y", color=style.RULE, linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(length=3, labelsize=style.SMALL, color=style.RULE, labelcolor=style.MUTED)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(style.RULE)
+    if with_time:
+        axes.set_xlabel(f"time [{unit}]", fontsize=style.SMALL, color=style.MUTED, labelpad=2)
+    else:
+        axes.tick_params(labelbottom=False)
+
+
+def _known(curve: Curve, lost: tuple[tuple[float, float], ...]) -> Curve:
+    """The curve without its NaN, but with one where the pose was lost and nothing known: the line breaks there."""
+    known = np.isfinite(curve.values)
+    seconds, values = curve.seconds[known], curve.values[known]
+    for begin, until in lost:
+        if not ((seconds >= begin) & (seconds < until)).any():
+            row = int(np.searchsorted(seconds, begin))
+            seconds, values = np.insert(seconds, row, begin), np.insert(values, row, np.nan)
+    return Curve(seconds, values)
+
+
+def _draw_line(axes: Axes, curve: Curve, colour: str) -> None:
+    middle, top = float(np.nanmedian(curve.values)), float(np.nanmax(curve.values))
+    if middle > 0.0 and top > LOG_ABOVE * middle:
+        axes.set_yscale("log")
+        floor = max(float(np.nanpercentile(curve.values, 1.0)), middle / 30.0)
+        axes.set_ylim(floor, top * 1.4)
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.tick_params(which="minor", length=0)
+        axes.plot(curve.seconds, np.maximum(curve.values, floor), color=colour, linewidth=1.1)
+        return
+    axes.fill_between(curve.seconds, 0.0, curve.values, color=colour, alpha=0.13, linewidth=0)
+    axes.plot(curve.seconds, curve.values, color=colour, linewidth=1.1)
+    axes.set_ylim(0.0, top * 1.08 if top > 0.0 else 1.0)
+    axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
+
+
+def _draw_fitness(axes: Axes, curve: Curve, data: ReportData, factor: float) -> None:
+    axes.plot(curve.seconds, curve.values, color=style.GREEN, linewidth=1.0)
+    low = float(np.nanmin(curve.values))
+    if data.scans is not None:
+        refused = data.scans.where(Status.REJECTED) & np.isfinite(data.scans.fitness)
+        low = min(low, float(data.scans.fitness[refused].min(initial=1.0)))
+        axes.plot(
+            data.scans.seconds[refused] / factor, data.scans.fitness[refused], "x", color=style.VERMILLION,
+            markersize=5.0, markeredgewidth=1.4,
+        )  # fmt: skip
+    axes.set_ylim(max(0.0, low - 0.08), 1.0)
+    axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
+
+
+def draw_table(axes: Axes, rows: list[Row], *, line_height: float) -> None:
+    """The table, from the top down; `line_height` is a line's part of the panel. What does not fit is left out."""
+    axes.set_axis_off()
+    axes.set_xlim(0.0, 1.0)
+    axes.set_ylim(0.0, 1.0)
+    y = 1.0
+    if any(len(row.values) == 2 for row in rows):
+        for x, heading in ((0.74, "translation"), (1.0, "rotation")):
+            axes.text(x, y, heading, ha="right", va="top", fontsize=style.SMALL, color=style.MUTED)
+        y -= line_height
+    for row in rows:
+        if y < 0.6 * line_height:
+            break
+        axes.plot((0.0, 1.0), (y + 0.18 * line_height,) * 2, color=style.RULE, linewidth=0.7, clip_on=False)
+        label = axes.text(0.0, y, row.label, ha="left", va="top", fontsize=style.TEXT, color=style.INK)
+        for x, value in zip((0.74, 1.0) if len(row.values) == 2 else (1.0,), row.values, strict=True):
+            text = axes.text(x, y, value, ha="right", va="top", fontsize=style.TEXT, color=style.INK, fontweight="bold")
+            if len(row.values) == 1 and text.get_window_extent().x0 < label.get_window_extent().x1 + _GAP_PIXELS:
+                y -= line_height  # a long value has a line of its own
+                text.set_y(y)
+                text.set_fontsize(style.TEXT * min(0.95 * axes.bbox.width / text.get_window_extent().width, 1.0))
+        y -= line_height

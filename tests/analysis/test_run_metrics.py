@@ -1,0 +1,184 @@
+"""RunMetrics: one value for all readers; the same figure has the same name and value wherever it is shown."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import jsonschema_rs
+import numpy as np
+import pytest
+from sample_metrics import sample_metrics
+
+from hsloc.cli.main import main
+from hsloc.errors import HslocError
+from hsloc.evaluation.metrics import compare
+from hsloc.model import Trajectory
+from hsloc.model.verdict import Verdict, VerdictReason, verdict_of
+from hsloc.report.table import error_statistics, table_rows
+from hsloc.run_metrics import RunMetrics, RunTimings, schema
+from hsloc.warnings import RunWarning, WarningCode
+from hsloc_service.execution.worker import summarise
+
+ROOT = Path(__file__).resolve().parents[2]
+KIDNAPPED = ROOT / "recordings" / "kidnapped.mcap"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """(folder, what the terminal shows) of a robot that is kidnapped after 30 s."""
+    import contextlib
+    import io
+
+    folder, terminal = tmp_path_factory.mktemp("run") / "out", io.StringIO()
+    with contextlib.redirect_stdout(terminal):
+        assert main(["replay", str(KIDNAPPED), "--start", "20", "--end", "36", "--out", str(folder)]) == 0
+    return folder, terminal.getvalue()
+
+
+@pytest.fixture(scope="module")
+def metrics(run):
+    return RunMetrics.read(run[0] / "metrics.json")
+
+
+def words(text: str) -> str:
+    """Without tags, and with single spaces."""
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", text)).split())
+
+
+def test_the_published_schema_is_that_of_the_classes():
+    path = ROOT / "docs" / "schemas" / "run-metrics.json"
+    made = json.dumps(schema(), indent=2, ensure_ascii=False) + "\n"
+    assert path.read_text(encoding="utf-8") == made, "run: python -m hsloc.run_metrics docs/schemas"
+    assert jsonschema_rs.meta.is_valid(schema())
+
+
+def test_every_number_of_the_schema_has_a_unit_or_is_a_count():
+    def numbers(part, name):
+        for key, value in part.get("properties", {}).items():
+            if "number" in value.get("type", ()):
+                yield f"{name}.{key}", value["description"]
+
+    found = schema()
+    unitless = [
+        key
+        for name, part in (("RunMetrics", found), *found["$defs"].items())
+        for key, text in numbers(part, name)
+        if not re.search(r"\[.+\]|from 0 to 1|null without a match", text)
+    ]
+    statistics = ("rmse", "mean", "median", "std", "min", "max", "sse")  # in the unit of what they are of
+    assert set(unitless) == {*(f"Statistics.{name}" for name in statistics), "RelativeError.delta"}
+
+
+def test_a_run_fits_the_schema_and_reads_back(run, metrics):
+    written = json.loads((run[0] / "metrics.json").read_text())
+    jsonschema_rs.validate(schema(), written)
+    assert metrics.to_json() == written
+    assert metrics.verdict == "check"
+    assert (metrics.errors, metrics.localised_only, metrics.odometry_alone) != (None, None, None)
+    times = json.loads((run[0] / "timings.json").read_text())
+    assert RunTimings.from_json(times).to_json() == times
+    assert {"open", "replay", "analyse", "run_mcap", "reports"} <= times["seconds"].keys()
+    assert min(times["seconds"].values()) > 0.0
+
+
+def test_what_cannot_be_measured_is_null_and_reads_back_as_nan():
+    path = Trajectory(np.arange(3, dtype=np.int64), np.zeros((3, 3)))
+    values = json.loads(json.dumps(sample_metrics(compare(path, path)).to_json(), allow_nan=False))
+    jsonschema_rs.validate(schema(), values)
+    assert values["rpe_1m"]["trans_part"]["rmse"] is None
+    assert np.isnan(RunMetrics.from_json(values).errors.rpe_1m.statistics.trans_part.rmse)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"schema_version": "2.0"}, "schema version is '2.0', not 1.0; run the replay again"),
+        ({"schema_version": None}, "an earlier one"),
+        ({"scans": {"total": 3}}, r"RunMetrics\.scans\.used is missing"),
+        ({"fitness": {"median": "high", "p05": None}}, r"RunMetrics\.fitness\.median is 'high'"),
+        ({"verdict": "splendid"}, r"RunMetrics\.verdict is 'splendid'"),
+        ({"log": 3}, r"RunMetrics\.log is 3; it must be an object"),
+    ],
+)
+def test_other_content_is_refused_by_name(tmp_path, change, message):
+    path = tmp_path / "metrics.json"
+    path.write_text(json.dumps(sample_metrics().to_json() | change))
+    with pytest.raises(HslocError, match=message) as caught:
+        RunMetrics.read(path)
+    assert str(path) in str(caught.value)
+
+
+def test_keys_of_a_later_version_are_ignored():
+    later = sample_metrics().to_json() | {"schema_version": "1.9", "brand_new": {"x": 1}}
+    assert RunMetrics.from_json(later) == replace(sample_metrics(), schema_version="1.9")
+
+
+def test_every_code_is_documented():
+    text = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8")
+    assert [code for code in WarningCode if f"| `{code}` |" not in text] == []
+
+
+def test_the_worst_reason_is_the_verdict():
+    reasons = [VerdictReason(Verdict(each), "x", "x") for each in ("check", "failed", "check")]
+    assert verdict_of(reasons) == Verdict.FAILED
+    assert verdict_of(reasons[:1]) == Verdict.CHECK
+    assert verdict_of([]) == Verdict.GOOD
+
+
+def test_every_figure_is_the_same_on_the_terminal_in_the_report_and_on_the_page(run, metrics):
+    folder, terminal = run
+    report = words((folder / "report.html").read_text())
+    summary = summarise(metrics, RunTimings(seconds={"replay": 1.0}, times_real_time=None, evaluations_per_second=None))
+    on_page = {each["name"]: each["values"] for each in summary["figures"]}
+    rows = table_rows(metrics)
+    assert {"APE rmse", "APE rmse where localised", "APE rmse of odometry", "localised"} <= {row.label for row in rows}
+    for row in rows:
+        line = " ".join([row.label, *row.values])
+        assert line in words(terminal)
+        assert line in report
+        assert on_page[row.label] == list(row.values)
+    assert f"verdict: {metrics.verdict}" in terminal
+    assert f"Verdict: {metrics.verdict}" in report
+    assert summary["metrics"]["verdict"] == metrics.verdict
+    for label, unit, values in error_statistics(metrics):
+        assert f"{label} [{unit}] {values.rmse:.4f} {values.mean:.4f}" in report
+
+
+def test_the_error_of_a_kidnapped_robot_is_shown_where_it_is_localised_too(run, metrics):
+    """Not 1.5 m alone, when all that is wrong is a second that the robot itself calls a guess."""
+    whole, known = metrics.errors.ape.trans_part.rmse, metrics.localised_only.ape.trans_part.rmse
+    assert known < 0.05 < 1.0 < whole
+    assert f"APE rmse where localised {100 * known:.2f} cm" in words(run[1])
+
+
+def test_counts_of_scans_add_up(run, metrics):
+    scans = metrics.scans
+    assert sum(scans.by_status.values()) == sum(scans.by_reason.values()) == scans.total
+    matched, others = (row.values[0] for row in table_rows(metrics) if row.label.startswith("scans"))
+    assert matched == f"{scans.used} of {scans.total}"
+    assert "held by the motion gate" in others
+    assert scans.used + sum(int(n) for n in re.findall(r"(\d+) [a-z]", others)) == scans.total
+
+
+def test_the_reasons_name_places_and_times(metrics):
+    (reason,) = metrics.verdict_reasons
+    assert reason.code == "poses_not_localised"
+    ((begin, end),) = reason.times
+    assert 9.0 < begin < end < 13.0
+    assert len(reason.places) == 2
+
+
+def test_a_job_keeps_all_warnings_of_the_run():
+    """Those of the analysis too, which concern the result more than those of the log."""
+    warnings = (
+        RunWarning(WarningCode.CLOCKS_APART, "stamps differ"),
+        RunWarning(WarningCode.SCANS_WITHOUT_PLACE, "x" * 600, "check the map"),
+    )
+    metrics = sample_metrics(warnings=warnings)
+    summary = summarise(metrics, RunTimings(seconds={}, times_real_time=None, evaluations_per_second=None))
+    assert [each["code"] for each in summary["warnings"]] == ["clocks_apart", "scans_without_place"]
+    assert summary["warnings"][1] == {"code": "scans_without_place", "text": "x" * 500, "remedy": "check the map"}

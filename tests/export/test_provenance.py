@@ -1,0 +1,109 @@
+"""The line "run it again with": pasted into a shell it gives the same files."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.cli.main import main
+from hsloc.evaluation import write_tum
+from hsloc.export.provenance import command
+from hsloc.log import ReadOptions, open_log
+from hsloc.model import Trajectory, Truth
+from hsloc.request import RunRequest
+
+if TYPE_CHECKING:
+    import pytest
+
+RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
+
+
+def paste(folder: Path, out: str) -> None:
+    """Run the line of a results folder again, into another one."""
+    line = (folder / "config.yaml").read_text().splitlines()[0].partition("run it again with: ")[2]
+    program = Path(folder.parent / "hsloc")
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m hsloc.cli.main "$@"\n')
+    program.chmod(0o755)
+    path = f"{folder.parent}{os.pathsep}{os.environ['PATH']}"
+    subprocess.run(["bash", "-c", f"{line} -q --out {out}"], check=True, env=os.environ | {"PATH": path})
+
+
+def same(first: Path, second: Path) -> None:
+    names = {path.name for path in first.iterdir()}
+    assert names == {path.name for path in second.iterdir()}
+    for name in sorted(names - {"timings.json"}):
+        assert (first / name).read_bytes() == (second / name).read_bytes(), name
+
+
+def reference(path: Path, log: Path) -> None:
+    truth = [event for event in open_log(log, ReadOptions()).events() if isinstance(event, Truth)]
+    write_tum(path, Trajectory.from_pairs((event.stamp_ns, event.T_map_base) for event in truth))
+
+
+def test_the_line_gives_the_same_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Alignment, relations, reference, folders, a configuration file, --set, names with blanks (B5)."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my logs").mkdir()
+    log = Path("my logs") / "an office's log.mcap"
+    shutil.copy(RECORDINGS / "office.mcap", log)
+    reference(Path("my logs/truth.tum"), log)
+    Path("mine.yaml").write_text("hide: {budget: 150, restarts: 3}\nmatcher: hs\nlocaliser: {window_min: 0.2}\n")
+    stamps = np.loadtxt("my logs/truth.tum", usecols=0)
+    Path("my logs/two.relations").write_text(f"{stamps[150]:.6f} {stamps[200]:.6f} 0.1 0 0 0 0 0\n")
+    start = ",".join(repr(value) for value in start_of(log))
+    argv = ["replay", str(log), "-q", "--out", "first", "--duration", "6", "--start", "1", "--seed", "7",
+            "--alignment", "se2", "--reference", "my logs/truth.tum", "--relations", "my logs/two.relations",
+            "--config", "mine.yaml", "--set", "matcher.budget=90", "--initial-pose", start,
+            "--set", "localiser.window_sigmas=2.5"]  # fmt: skip
+    assert main(argv) == 0
+    Path("mine.yaml").unlink()
+    paste(tmp_path / "first", "second")
+    same(tmp_path / "first", tmp_path / "second")
+    text = Path("first/config.yaml").read_text()
+    assert "--relations=" in text.splitlines()[0]
+    assert "--alignment=se2" in text.splitlines()[0]
+
+
+def start_of(log: Path) -> tuple[float, float, float]:
+    """The start that the log states."""
+    stated = open_log(log, ReadOptions()).initial_pose()
+    assert stated is not None
+    pose = stated[1]
+    return pose.x, pose.y, pose.theta
+
+
+def test_the_line_of_a_mapping_run_and_of_another_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    slip = str(RECORDINGS / "slip.mcap")
+    for number, words in enumerate(
+        (["--mode", "slam", "--no-odom", "--end", "4"], ["--preset", "paper", "--matcher", "hs", "--end", "4"])
+    ):
+        assert main(["replay", slip, "-q", "--out", f"first{number}", *words]) == 0
+        paste(tmp_path / f"first{number}", f"second{number}")
+        same(tmp_path / f"first{number}", tmp_path / f"second{number}")
+
+
+def test_names_that_are_no_text_are_quoted_for_bash() -> None:
+    line = command(RunRequest(logs=(Path(os.fsdecode(b"logs/B\xfc'ro\n.mcap")),)))
+    assert "\n" not in line
+    printed = subprocess.run(["bash", "-c", f"printf %s {line.split(' ', 2)[2]}"], capture_output=True, check=True)
+    assert printed.stdout == b"logs/B\xfc'ro\n.mcap"
+
+
+def test_limits_are_no_part_of_the_files(tmp_path: Path) -> None:
+    log = (RECORDINGS / "slip.mcap",)
+    assert command(RunRequest(logs=log, max_ape=0.1)) == command(RunRequest(logs=log))
+
+
+def test_a_server_writes_no_folder(tmp_path: Path) -> None:
+    request = RunRequest.from_values(
+        ["/srv/job/input/run.mcap"],
+        {"map": "/srv/job/map/floor.yaml", "relations": "/srv/job/relations/r.txt", "bare_names": True},
+    )
+    assert command(request) == "hsloc replay run.mcap --map=floor.yaml --relations=r.txt"

@@ -1,0 +1,73 @@
+"""Where compiled kernels are kept: a writable place is found, or one warning says that there is none."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import warnings
+from typing import TYPE_CHECKING
+
+import numba
+import pytest
+from numba.core import config
+from numba.core.dispatcher import Dispatcher
+
+from hsloc.kernels import cache
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.fixture
+def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """numba finds no place of its own; what is changed for good is restored."""
+
+    def refuse(_: object) -> None:
+        if not config.CACHE_DIR:
+            raise RuntimeError("cannot cache function: no locator available")
+
+    monkeypatch.setattr(config, "CACHE_DIR", "")
+    monkeypatch.setattr(Dispatcher, "enable_caching", refuse)
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_the_cache_falls_back_to_a_private_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache.tempfile, "gettempdir", lambda: str(tmp_path))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cache.choose_cache()
+    (folder,) = tmp_path.iterdir()
+    assert str(folder) == config.CACHE_DIR
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_a_folder_that_others_may_write_to_is_not_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is loaded from the cache is executed."""
+    monkeypatch.setattr(cache, "_PARENTS", (str(tmp_path),))
+    monkeypatch.setattr(cache.tempfile, "gettempdir", lambda: str(tmp_path))
+    folder = tmp_path / f"hsloc-kernels-{os.getuid()}"
+    folder.mkdir()
+    folder.chmod(0o777)
+    with pytest.warns(RuntimeWarning, match="compiled in every process"):
+        cache.choose_cache()
+    assert not config.CACHE_DIR
+    numba.njit(cache=True)(lambda: 0)  # no longer raises
+
+
+def test_compilation_is_reported_and_cached_kernels_are_not() -> None:
+    counts: list[int] = []
+    kernel = numba.njit(lambda x: x + 1)
+    with cache.compilation_reported(counts.append):
+        kernel(1)
+        kernel(2)
+    assert counts == [0, 1]
+
+
+def test_a_user_without_a_home_gets_no_traceback(tmp_path: Path) -> None:
+    code = "import hsloc.kernels.fitness"
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    environment |= {"HOME": "/nonexistent", "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")

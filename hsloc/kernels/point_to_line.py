@@ -255,7 +255,7 @@ def pair_terms(
             for k in range(max(middle - 1, 0), min(middle + 2, n_beams)):
                 end = np.float64(ranges[first + k])
                 if end == np.inf:
-                    end = _CLEARED
+                    end = np.float64(_CLEARED)
                 if end == end:
                     known += 1
                     nearest = min(nearest, end)

@@ -1,13 +1,13 @@
 """One scan onto several others that stand still: point to line, with a prior on the pose.
 
-Gauss-Newton on the terms of `hsloc.kernels.point_to_line.pair_terms`, taken in both directions. A direction that no wall
-fixes has no gradient, so that there the pose stays where the prior has it; a field of scores does not have this property,
-it prefers the pose at which the scans overlap most.
+Gauss-Newton on the terms of `hsloc.kernels.point_to_line.pair_terms`, taken in both directions. A direction that no
+wall fixes has no gradient, so that there the pose stays where the prior has it. A field of scores does not have this
+property: it prefers the pose at which the scans overlap most.
 """
 
 from __future__ import annotations
 
-from math import pi
+from math import pi, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -143,8 +143,8 @@ def register(
 ) -> float:
     """Move `pose` (3,), in place, to where the moving scans fit the fixed ones and the prior best.
 
-    `prior` (3, 3) is the information of `prior_pose` in the map. Writes the `information` (3, 3) of the pairs alone and their
-    `counts` (5,), at the pose before the last step. Returns the chi of the pose against the prior.
+    `prior` (3, 3) is the information of `prior_pose` in the map. Writes the `information` (3, 3) of the pairs alone and
+    their `counts` (5,), at the pose before the last step. Returns the chi of that pose against the prior.
     """
     gradient = np.empty(3)
     step = np.empty(3)
@@ -177,4 +177,4 @@ def register(
         still = abs(step[0]) < _STILL_M and abs(step[1]) < _STILL_M and abs(step[2]) < _STILL_RAD
         if still and k >= 2:
             break
-    return np.sqrt(chi2)
+    return sqrt(chi2)

@@ -128,8 +128,8 @@ _CONVINCING = 0.8
 _CONVINCING_PAIRED = 0.3
 """And this part of the points that both sides could see must be paired."""
 _OBSERVED = 0.1
-"""Information along the offset from the prediction, as a part of that across the best wall. Of poses that HIDE found away
-from the odometry on five logs the right ones have 0.3 and more (95 of 100), slides along corridors 0.03 and less."""
+"""Information along the offset from the prediction, as a part of that across the best wall. Of poses that HIDE found
+away from the odometry on five logs 95 of 100 right ones have 0.3 and more, slides along corridors 0.03 and less."""
 _BETTER = 0.03
 """A pose that HIDE found replaces the registered prediction if this much more of the points agree, or fit."""
 _SLIP = 0.3

@@ -133,5 +133,5 @@ class KeyScans:
 
 
 def starts_of(lengths: list[int]) -> I64:
-    """Where each of several parts begins once they stand one after the other, and the end of the last, shape (n + 1,)."""
+    """Where each of n parts begins if they are stored one after the other, and the end of the last, shape (n + 1,)."""
     return np.concatenate(([0], np.cumsum(lengths))).astype(np.int64)

@@ -1,9 +1,9 @@
 """Closing loops: is this place one that was seen before, long ago on the way?
 
 Places are visited in their order. Those seen before that could be near, by a drift that is assumed too large rather
-than too small, are compared (`hsloc.slam.loop_matcher`). A loop that is believed becomes an edge of the pose graph with a
-covariance and a robust weight, and the graph is solved before the next place is looked at. What was refused is searched
-again once more is known; a loop that the solved graph contradicts is refused in the end.
+than too small, are compared (`hsloc.slam.loop_matcher`). A loop that is believed becomes an edge of the pose graph
+with a covariance and a robust weight, and the graph is solved before the next place is looked at. What was refused is
+searched again once more is known; a loop that the solved graph contradicts is refused in the end.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ class LoopCloser:
 
 
 def loop_edges(accepted: list[Loop], nodes: NDArray[np.int64], robust: float) -> Edges:
-    """Accepted loops as edges of a graph in which place k is node `nodes[k]`, with Cauchy's weight of scale `robust`."""
+    """Accepted loops as edges of a graph in which place k is node `nodes[k]`; `robust` is the Cauchy scale on chi."""
     if not accepted:
         return Edges.none()
     return Edges(

@@ -43,7 +43,7 @@ _CONSISTENT = 0.75
 """Consistency without which a pose is refused: of 22,000 steps of five real logs and their degradations 95 of 100 right
 ones have 0.9 and more, 95 of 100 wrong ones that do not slide along a corridor 0.7 and less."""
 _SURELY_CONSISTENT = 0.85
-""" Below it a pose is doubtful."""
+"""Below it a pose is doubtful."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,7 +133,7 @@ class RecentScans:
     def register(
         self, scans: tuple[MovingScan, ...], start: Pose2, predicted: Pose2, covariance: F64
     ) -> ScanRegistration:
-        """Register a scan with its companions from `start` on; odometry has it at `predicted` +- `covariance` (3, 3)."""
+        """Register a scan with its companions from `start` on; odometry has it at `predicted`, `covariance` (3, 3)."""
         fixed = [self._kept[-back] for back in _BACK if back <= len(self._kept)]
         still = [(_composed(pose, scan.pose), scan) for pose, kept in fixed for scan in kept]
         poses = np.array([pose for pose, _ in still] + [scan.pose for scan in scans])
@@ -142,7 +142,7 @@ class RecentScans:
             _GATES, _SCALE_OF_GATE, 1.0 / (_POINT_SIGMA**2 * _CORRELATED), _PRIOR_SCALE, _ROUNDS
         )
         pose, information, counts = start.to_array(), np.zeros((3, 3)), np.zeros(5)
-        prior: F64 = np.linalg.inv(covariance)
+        prior: F64 = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         chi = register(pose, len(still), poses, arrays, predicted.to_array(), prior, parameters, information, counts)
         seen = max(float(counts[2]), 1.0)
         return ScanRegistration(

@@ -3,7 +3,7 @@ import pytest
 from test_point_to_line import room_scan, terms
 
 from hsloc.kernels.registration import RegistrationParameters, ScanArrays, add_pairs, register
-from hsloc.model import Pose2
+from hsloc.model import Pose2, Scan
 from hsloc.slam.keyscans import KeyScan, KeyScans
 
 PARAMETERS = RegistrationParameters((0.3, 0.2, 0.15), 0.33, 100.0, np.inf, 10)
@@ -55,7 +55,7 @@ def room():
 
 def test_equations_are_those_of_the_pairs(room):
     scans, poses, base = room
-    pose = base.to_array() + (0.04, -0.03, 0.01)
+    pose = base.to_array() + np.array((0.04, -0.03, 0.01))
     information, gradient, counts = np.zeros((3, 3)), np.zeros(3), np.zeros(5)
     add_pairs(pose, 2, poses, arrays(scans), 0.3, PARAMETERS, information, gradient, counts)
     wanted = naive_pairs(pose, 2, poses, scans, 0.3)
@@ -66,7 +66,7 @@ def test_equations_are_those_of_the_pairs(room):
 
 def test_a_scan_finds_its_pose(room):
     scans, poses, base = room
-    pose = base.to_array() + (0.12, -0.1, 0.05)
+    pose = base.to_array() + np.array((0.12, -0.1, 0.05))
     prior = np.eye(3) * 1e-3
     counts = np.zeros(5)
     register(pose, 2, poses, arrays(scans), pose.copy(), prior, PARAMETERS, np.zeros((3, 3)), counts)
@@ -75,21 +75,17 @@ def test_a_scan_finds_its_pose(room):
     assert counts[1] == 0
 
 
-def corridor_scan(x, *, reach=4.0):
+def corridor_scan(reach=4.0):
     """A laser in a corridor 2 m wide without an end, that sees `reach` metres."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, 181)
     with np.errstate(divide="ignore"):
         ranges = np.abs(1.0 / np.sin(angles))
-    from hsloc.model import Scan
-
-    return Scan(
-        0, np.where(ranges < reach, ranges, np.inf).astype(np.float32), -np.pi / 2, np.pi / 180.0, 0.05, reach
-    )
+    return Scan(0, np.where(ranges < reach, ranges, np.inf).astype(np.float32), -np.pi / 2, np.pi / 180.0, 0.05, reach)
 
 
 def test_along_a_corridor_the_prior_decides():
     """A field of scores pulls such a scan back to where both overlap; here nothing pulls along the walls."""
-    scans = KeyScans.from_scans([KeyScan.of(corridor_scan(0.0)), KeyScan.of(corridor_scan(1.0))])
+    scans = KeyScans.from_scans([KeyScan.of(corridor_scan()), KeyScan.of(corridor_scan())])
     poses, prior = np.zeros((2, 3)), np.diag((100.0, 100.0, 100.0))
     predicted, information = np.array((1.0, 0.0, 0.0)), np.zeros((3, 3))
     for start in (predicted, predicted - (0.4, 0.0, 0.0)):
@@ -101,7 +97,7 @@ def test_along_a_corridor_the_prior_decides():
 
 def test_a_refuted_prior_loses_its_weight(room):
     scans, poses, base = room
-    predicted = base.to_array() + (0.0, 0.0, 0.6)
+    predicted = base.to_array() + np.array((0.0, 0.0, 0.6))
     prior = np.diag((1e6, 1e6, 1e5))
     trusted, doubted = base.to_array(), base.to_array()
     register(trusted, 2, poses, arrays(scans), predicted, prior, PARAMETERS, np.zeros((3, 3)), np.zeros(5))

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import ape_rmse, drive
@@ -6,6 +8,7 @@ from test_mapper import mapped
 from hsloc.localisation.motion import OdometryNoise
 from hsloc.model import Pose2
 from hsloc.simulation.odometer import Slip
+from hsloc.simulation.presets import preset
 from hsloc.slam.front_end import odometry_chi, odometry_scale
 
 
@@ -40,10 +43,6 @@ def test_a_step_that_odometry_has_wrong_is_found_by_the_scans(slip):
 
 def test_a_lidar_that_sees_four_metres_does_not_shorten_corridors():
     """The mean score pulled every step back to where the scans overlapped most."""
-    from dataclasses import replace
-
-    from hsloc.simulation.presets import preset
-
     sensor = replace(preset("corridor-loop").sensor, range_max=4.0)
     events, truth = drive("corridor-loop", duration_s=30.0, seed=2, sensor=sensor)
     result, _ = mapped(events)

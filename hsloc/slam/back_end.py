@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
+_UNSETTLED_M = 0.01
+"""The log is gone over again if 1 of 100 keyscans still moved farther than this [m] in the last round: a fifth of a cell."""
 _RESIDUAL_SCANS = 400
 """Scans whose residuals are measured."""
 
@@ -154,11 +156,11 @@ def _refine(
 ) -> tuple[Registration, int]:
     """Passes over the whole log, each with partners chosen anew, until nothing moves."""
     most, p = parameters.passes, parameters.joint_registration
-    # Later passes begin near their end: no wide gates, and fewer rounds.
-    later = replace(p, gates=p.gates[-1:], rounds=max(p.rounds // 2, 1))
+    # Later passes begin near their end: no wide gates.
+    later = replace(p, gates=p.gates[-1:])
     refined = refine(poses, scans, edges, p, lambda part: progress(part / most))
     passes = 1
-    while passes < most:
+    while passes < most and refined.moved >= _UNSETTLED_M:
         begin = refined.poses
         done = passes
         refined = refine(begin, scans, edges, later, lambda part: progress((done + part) / most))  # noqa: B023

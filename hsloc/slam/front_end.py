@@ -119,8 +119,8 @@ FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
 """No motion is known better than this (m^2, rad^2)."""
 _FORGET = 0.05
 """Weight of a new match in the usual fitness."""
-_LONGEST_PREDICTION = 2.0
-"""A velocity is trusted for so many periods of the scans."""
+_LONGEST_PREDICTION = 4.0
+"""Periods of the scans for which a velocity is trusted."""
 _KNOWN = 0.85
 """A point is spared whose nearest node scores as much: the local map has one within a part of a cell."""
 _CONVINCING = 0.8
@@ -200,10 +200,11 @@ class FrontEnd:
             motion = self._T_odom_key.between(paired.T_odom_base)
             return motion, self._odometry_scale**2 * p.odometry_noise.covariance(motion) + FLOOR
         stamp, pose = self._last if self._last is not None else (paired.scan.stamp_ns, self._T_map_key)
-        seconds = min(max((paired.scan.stamp_ns - stamp) * 1e-9, 0.0), 1.0, _LONGEST_PREDICTION * self._period)
-        # A clock that jumps makes wild velocities: no step is predicted longer than the window is wide.
+        seconds = max((paired.scan.stamp_ns - stamp) * 1e-9, 0.0)
+        periods = min(seconds / self._period, _LONGEST_PREDICTION)
+        # A clock that jumps makes wild velocities: no step of a period is predicted longer than the window is wide.
         most = np.array((p.no_odometry_window, p.no_odometry_window, p.no_odometry_window_angle))
-        step = np.clip(self._velocity * seconds, -most, most)
+        step = np.clip(self._velocity, -most, most) * periods
         motion = self._T_map_key.between(pose @ Pose2(float(step[0]), float(step[1]), float(step[2])))
         return motion, np.diag((most / p.window_sigmas) ** 2)
 
@@ -309,8 +310,8 @@ class FrontEnd:
             step = self._last[1].between(found.pose).to_array()
             seconds = (stamp - self._last[0]) * 1e-9
             self._period = seconds if self._period == np.inf else self._period + _FORGET * (seconds - self._period)
-            # Two stamps that nearly coincide are a clock's fault: their scans are not.
-            self._velocity = step / max(seconds, 0.5 * self._period)
+            # In metres and radians per period. Two stamps that nearly coincide are a clock's fault: their scans do not.
+            self._velocity = step / max(seconds / self._period, 0.5)
         elif found.status is not Status.MATCHED:
             self._velocity = np.zeros(3)
         self._last = (stamp, found.pose)

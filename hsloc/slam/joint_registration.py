@@ -52,7 +52,7 @@ class JointRegistrationParameters:
     """So many points count as one: neighbouring beams, and pairs of neighbouring scans, share their errors."""
     points_per_scan: int = 90
     """About so many hits of a scan are used."""
-    rounds: int = 6
+    rounds: int = 3
     """At most, in a pass."""
     convergence_tolerance: float = 0.002
     """Nothing moves when 99 of 100 poses move less than this (m; rad: a fifth)."""

@@ -37,6 +37,8 @@ _SWEEPS = 3
 """Times that all places are visited at most."""
 _WIDENED = (16.0, 8.0, 4.0, 2.0)
 """Factors of the robust scales in the first rounds of a solve."""
+_STILL = 1e-3
+"""A solve between two loops ends when no place moves farther (m; rad): the windows are metres wide."""
 _NARROWER = 0.7
 """A pair is searched again if its window is narrower than before by this factor."""
 _CONNECTED_WAY = 12.0
@@ -103,7 +105,7 @@ class LoopCloser:
         """Solve the graph of the places: the front end's steps, and the loops with robust weights."""
         places = self._places
         steps = Edges.chain(places.steps, places.covariances, places.doubted)
-        self.poses = solve_edges(self.poses, Edges.concatenate([steps, self.edges()]), widened=_WIDENED)
+        self.poses = solve_edges(self.poses, Edges.concatenate([steps, self.edges()]), still=_STILL, widened=_WIDENED)
 
     def _visit(self, place: int) -> int:
         """Search the candidates of a place that are not known yet; returns how many loops were accepted."""

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import ape_rmse, drive
+from drives import ape_rmse, drive
 from test_mapper import mapped
 
 from hsloc.localisation.motion import OdometryNoise

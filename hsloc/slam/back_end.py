@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
 
 _UNSETTLED_M = 0.01
-"""The log is gone over again if 1 of 100 keyscans still moved farther than this [m] in the last round: a fifth of a cell."""
+"""Another pass is made if 1 of 100 keyscans moved farther than this [m] in the last round: a fifth of a cell."""
 _RESIDUAL_SCANS = 400
 """Scans whose residuals are measured."""
 

@@ -129,7 +129,7 @@ _BLIND_M = 2.0
 """A step so many metres long, and five times the usual one, was driven without enough returns."""
 _BLIND_SHARE = 0.1
 _NO_RETURN_SHARE = 0.4
-"""On five real logs at most 0.03 of the beams meet nothing, cut to 4 m at most 0.27; where they erased walls 0.52 to 0.94."""
+"""On five real logs at most 0.03 of the beams meet nothing, cut to 4 m 0.27; where they erased walls 0.52 and more."""
 _MOST_NAMED = 20
 """Places named in a reason, at most."""
 

@@ -109,16 +109,27 @@ class LoopCloser:
 
     def _visit(self, place: int) -> int:
         """Search the candidates of a place that are not known yet; returns how many loops were accepted."""
-        found = []
-        for old, way in self._candidates(place):
-            before = self._found.get((old, place))
-            if before is None or self._window(way)[0] < _NARROWER * before.window[0]:
-                found.append(self._search(old, place, way))
-        self._found.update({(loop.first, loop.second): loop for loop in found})
-        accepted = sum(loop.accepted for loop in found)
+        searched = accepted = 0
+        left = self._unknown(place)
+        while left and searched < self._parameters.max_candidates:
+            old, way = left[0]
+            loop = self._search(old, place, way)
+            self._found[old, place] = loop
+            searched += 1
+            accepted += loop.accepted
+            # What the loop ties to this place need not be searched any more.
+            left = self._unknown(place) if loop.accepted else left[1:]
         if accepted:
             self.solve()
         return accepted
+
+    def _unknown(self, place: int) -> list[tuple[int, float]]:
+        """Candidates that were not searched, or in a much wider window, and the way to each."""
+        return [
+            (old, way)
+            for old, way in self._candidates(place)
+            if (before := self._found.get((old, place))) is None or self._window(way)[0] < _NARROWER * before.window[0]
+        ]
 
     def _tear(self) -> int:
         """Refuse the loop that the solved graph contradicts most, until it contradicts none; returns how many."""

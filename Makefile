@@ -2,22 +2,34 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Processes that run the tests; a file's tests stay in one of them, so that its fixtures are made once.
+JOBS ?= auto
+PYTEST := $(BIN)/pytest -q -n $(JOBS) --dist loadfile
 
-.PHONY: demo test lint test-slow clean
+.PHONY: demo test lint docs clean
 
 demo: $(VENV)/.demo  ## replay a fixture recording on its map and show the errors
 	$(BIN)/hsloc replay recordings/office.mcap --unknown-start --out results/demo --overwrite
 	@echo "Look at results/demo/report.png, or open results/demo/run.mcap in Lichtblick or Foxglove."
 
-test: $(VENV)/.dev  ## all tests
-	$(BIN)/pytest -q
-	NUMBA_DISABLE_JIT=1 $(BIN)/pytest -q -p no:cacheprovider tests/kernels
+# The kernels run twice: compiled, where coverage cannot see into them, and as plain Python, where it can.
+test: $(VENV)/.dev  ## all tests on all cores, and the coverage gate (pyproject: fail_under)
+	rm -f .coverage .coverage.*
+	$(PYTEST) --cov --cov-report=
+	mv .coverage .coverage.compiled
+	NUMBA_DISABLE_JIT=1 $(PYTEST) -p no:cacheprovider --cov --cov-report= tests/kernels
+	mv .coverage .coverage.plain
+	$(BIN)/coverage combine -q .coverage.compiled .coverage.plain
+	$(BIN)/coverage report
 
 lint: $(VENV)/.dev  ## style, types and the direction of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: $(VENV)/.docs  ## the documentation as a site in build/site; a warning is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build -q --strict
 
 $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit("hsloc needs Python 3.11 or newer; set PYTHON=python3.11") if sys.version_info < (3, 11) else None'
@@ -31,6 +43,10 @@ $(VENV)/.dev: $(VENV)/.demo
 	$(BIN)/python -m pip install -q --disable-pip-version-check -c requirements.lock -e '.[dev]'
 	touch $@
 
+$(VENV)/.docs: $(VENV)/.demo
+	$(BIN)/python -m pip install -q --disable-pip-version-check -c requirements.lock -e '.[docs]'
+	touch $@
+
 clean:  ## remove the virtual environment and what tools left behind
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage .coverage.*
 	find hsloc service tests -name __pycache__ -type d -exec rm -rf {} +

@@ -5,12 +5,10 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
-import types
 import typing
 from dataclasses import dataclass, field, replace
-from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from hsloc.errors import ConfigError
 from hsloc.localisation.localiser import LocaliserParameters
@@ -18,6 +16,7 @@ from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.hide import Hide
 from hsloc.matching.icp import Icp
 from hsloc.options import MAPPERS, MATCHER_ALIASES, MATCHERS, PRESETS
+from hsloc.parameters import LARGEST, NonNegative, OneOf, Parameters, Positive, check, hints, plain
 from hsloc.slam.parameters import GraphMapperParameters
 from hsloc.slam.point_mapper import PointMapperParameters
 
@@ -29,46 +28,36 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_SMALLEST, _LARGEST = 1e-9, 1e9
-"""No length, angle, part or count of use is smaller or larger; squares and quotients of these fit a float."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldParameters(Parameters):
+    """The likelihood field that scans are matched against."""
+
+    sigma: Positive = 0.2
+    """Decay length of a point's score with its distance from the nearest wall [m]; 1 m in [P]."""
+    margin: NonNegative = 1.0
+    """Margin of the field around the map [m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FieldParameters:
-    """The field that scans are matched against."""
-
-    sigma: float = 0.2
-    """Decay of a point's score with its distance to the nearest wall (m); [P]: 1 m."""
-    margin: float = 1.0
-    """The field reaches so far beyond the map (m)."""
-
-    def __post_init__(self) -> None:
-        if not (self.sigma > 0.0 and self.margin >= 0.0):
-            raise ConfigError(f"likelihood_field: sigma {self.sigma} must be positive, margin {self.margin} 0 or more")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Config:
+class Config(Parameters):
     """Everything that decides a run beside its input and its seed."""
 
-    matcher: str = "hide"
-    """Scan matcher: hide, harmony_search (or hs) or icp."""
+    matcher: Annotated[str, OneOf((*MATCHERS, *MATCHER_ALIASES))] = "hide"
+    """Scan matcher that localises; hs is short for harmony_search."""
     hide: Hide = field(default_factory=Hide)
     harmony_search: HarmonySearch = field(default_factory=HarmonySearch)
     icp: Icp = field(default_factory=Icp)
     likelihood_field: FieldParameters = field(default_factory=FieldParameters)
     localiser: LocaliserParameters = field(default_factory=LocaliserParameters)
-    mapper: str = "graph"
-    """Mapper: graph closes loops; point is the point map of the course report [P]."""
+    mapper: Annotated[str, OneOf(MAPPERS)] = "graph"
+    """Mapper that builds a map; graph closes loops, point is the point map of [P]."""
     graph_mapper: GraphMapperParameters = field(default_factory=GraphMapperParameters)
     point_mapper: PointMapperParameters = field(default_factory=PointMapperParameters)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "matcher", MATCHER_ALIASES.get(self.matcher, self.matcher))
-        if self.mapper not in MAPPERS:
-            raise ConfigError(f"mapper is {self.mapper!r}; it must be one of {', '.join(MAPPERS)}")
-        if self.matcher not in MATCHERS:
-            raise ConfigError(f"matcher is {self.matcher!r}; it must be one of {', '.join(MATCHERS)}")
+        Parameters.__post_init__(self)
 
     def make_matcher(self) -> Matcher:
         """The matcher that is chosen."""
@@ -199,13 +188,15 @@ def from_dict(kind: type[T], values: Any, base: T | None = None, where: str = "c
     """
     if not isinstance(values, dict):
         raise ConfigError(f"{where} is {values!r}; it must be a table of keys and values")
-    hints = typing.get_type_hints(kind)
-    names = [f.name for f in dataclasses.fields(typing.cast("Any", kind))]
+    types_of = hints(kind)
+    names = list(types_of)
     for key in values:
         if key not in names:
             raise ConfigError(f"{where} has the unknown key {key!r}; {_instead(str(key), names)}")
     start = kind() if base is None else base
-    changes = {key: _convert(hints[key], value, getattr(start, key), f"{where}.{key}") for key, value in values.items()}
+    changes = {
+        key: _convert(types_of[key], value, getattr(start, key), f"{where}.{key}") for key, value in values.items()
+    }
     return typing.cast("T", replace(typing.cast("Any", start), **changes))
 
 
@@ -215,6 +206,7 @@ _RENAMED = {
     "crowd": "max_scans_per_view",
     "drawing": "occupancy",
     "hit": "hit_probability",
+    "lead": "min_margin",
     "local_matching": "front_end",
     "lost_after": "max_consecutive_rejections",
     "min_lead": "min_margin",
@@ -243,23 +235,15 @@ def _instead(key: str, names: list[str]) -> str:
 def _convert(hint: Any, value: Any, base: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return from_dict(typing.cast("type[Any]", hint), value, base, where)
-    if isinstance(hint, types.UnionType):
-        if value is None and type(None) in hint.__args__:
-            return None
-        hint = next(kind for kind in hint.__args__ if kind is not type(None))
-    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
-        if not isfinite(value):
-            raise ConfigError(f"{where} is {value}; it must be finite")
-        if value != 0 and not _SMALLEST <= abs(value) <= _LARGEST:
-            raise ConfigError(f"{where} is {value:g}; it must be 0, or from {_SMALLEST:g} to {_LARGEST:g} in size")
-        return float(value)
     if typing.get_origin(hint) is tuple and isinstance(value, list | tuple):
-        return tuple(value)
-    if hint is int and type(value) is int and abs(value) > _LARGEST:
-        raise ConfigError(f"{where} is {value}; it must be at most {_LARGEST:g} in size")
-    if hint in (int, str, bool) and type(value) is hint:
-        return value
-    raise ConfigError(f"{where} is {value!r}; it must be of type {getattr(hint, '__name__', hint)}")
+        return tuple(_convert(typing.get_args(hint)[0], item, None, where) for item in value)
+    kind = plain(hint)
+    if kind is float and type(value) is int:
+        value = float(value) if abs(value) <= LARGEST else value
+    if kind is not type(value) and not (kind is float and type(value) is int):
+        raise ConfigError(f"{where} is {value!r}; it must be of type {getattr(kind, '__name__', kind)}")
+    check(value, hint, where)
+    return value
 
 
 def load(path: Path, base: Config | None = None, warnings: list[str] | None = None) -> Config:

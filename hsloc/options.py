@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 Kind = Literal["choice", "number", "whole", "pose", "switch", "text", "topics", "path", "settings"]
-"""Type of an option: one of its choices, a float, an integer of 0 or more, x,y,yaw, yes or no, a text, topics (several
+"""Type of an option: one of its choices, a float, an integer of 0 or more, x,y,yaw, yes or no, a text, texts (several
 or with commas), a file or folder, or KEY=VALUE (repeatable)."""
 Place = Literal["run", "read", "config", "check"]
 """What an option belongs to: the request itself, its `read`, its `config`, or the limits that a result must keep."""
@@ -33,6 +33,7 @@ MATCHER_ALIASES = {"hs": "harmony_search"}
 MAPPERS = ("graph", "point")
 PRESETS = ("default", "paper", "paper-literal")
 ALIGNMENTS = ("none", "origin", "se2")
+STAMPS = ("header", "log")
 VERDICTS = ("check", "failed")
 
 
@@ -93,7 +94,8 @@ OPTIONS: tuple[Option, ...] = (
     ),
     Option(
         name="no_odometry", flag="--no-odom", kind="switch", default=False,
-        help="Build a map without reading the log's odometry.",
+        help="Estimate motion from the scans alone, without reading the log's odometry; localise with --map or "
+        "--mode localise, else build a map.",
     ),
     Option(
         name="initial_pose", flag="--initial-pose", kind="pose", instead_of="start",
@@ -142,6 +144,23 @@ OPTIONS: tuple[Option, ...] = (
     Option(
         name="deskew", flag="--deskew", kind="switch", default=False, place="read", group=_READING,
         help="Move each beam to where the robot was when it was measured.",
+    ),
+    Option(
+        name="scan_fix", flag="--scan-fix", kind="topics", metavar="FIELD=VALUE", place="read", group=_READING,
+        help="Override a field of the scans: increment=RAD, increment=angles or negate, angles=degrees, "
+        "time_increment=S or interval, range_max=M; several, or with commas.",
+    ),
+    Option(
+        name="slice", flag="--slice", kind="text", metavar="LOW,HIGH", place="read", group=_READING,
+        help="Read point clouds as scans: the nearest point of each direction between two heights above the base [m].",
+    ),
+    Option(
+        name="time_offset", flag="--time-offset", kind="topics", metavar="TOPIC=S", place="read", group=_READING,
+        help="Add seconds to the stamps of a topic [s]; several, or with commas.",
+    ),
+    Option(
+        name="stamps", flag="--stamps", kind="choice", choices=STAMPS, default="header", place="read", group=_READING,
+        help="Take times from the messages' headers, or from when the log received them (default: header).",
     ),
     Option(
         name="start_s", flag="--start", kind="number", metavar="S", place="read", group=_READING,

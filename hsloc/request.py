@@ -30,7 +30,8 @@ class RunRequest:
 
     With `resume`, the results of an earlier mapping run, that run's map is extended: the new map and trajectory are in
     its frame. `mode` is "localise", "slam" or "auto": localise if there is a map, `map_path` or the log's own, else
-    build one. With `no_odometry` the log's odometry is not read (slam only). The start is `initial_pose`, else the one
+    build one. With `no_odometry` the log's odometry is not
+    read: motion is estimated from the scans. The start is `initial_pose`, else the one
     that the log states for the time of the first event, else unknown; with `unknown_start` it is unknown whatever the
     log states. `reference` names poses to compare with, see `hsloc.replay.references`; otherwise they are those in the
     log. `alignment` and `relations` are for the evaluation. `own_matcher` is used instead of the one that `config`
@@ -69,10 +70,6 @@ class RunRequest:
         for option in OPTIONS:
             if option.place in ("run", "check"):
                 _check_bounds(option, getattr(self, option.target))
-        if self.no_odometry and (self.mode == "localise" or self.map_path is not None):
-            raise ConfigError(
-                "a robot on a given map is followed with odometry; leave out --no-odom or use --mode slam"
-            )
         if self.resume is not None and (self.mode == "localise" or self.map_path is not None):
             raise ConfigError("a map is either localised in (--map) or extended (--resume); leave out one of them")
         if self.resume is not None and self.config.mapper != "graph":

@@ -4,33 +4,36 @@ from __future__ import annotations
 
 import os
 import warnings
-from pathlib import Path
 from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from paths import DATA, RECORDINGS
 
 from hsloc.trajectory_io.tum import write_tum
 
-ROOT = Path(__file__).resolve().parent.parent
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
 
 
 @pytest.fixture(scope="session")
 def recordings() -> Path:
-    return ROOT / "recordings"
+    return RECORDINGS
 
 
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Real logs; a test that needs them skips where they are missing."""
-    folder = Path(os.environ.get("HSLOC_DATA", ROOT.parent / "shared" / "data"))
+    folder = DATA
     if not folder.is_dir():
         pytest.skip(f"no real logs: {folder} is missing; set HSLOC_DATA")
     return folder
 
 
 @pytest.fixture(scope="session")
-def evo(tmp_path_factory):
+def evo(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """evo's Python API. It is GPL and a judge in tests only: hsloc itself never imports it.
 
     On import evo writes its settings under $HOME, and its dependencies warn; neither is to reach us.
@@ -68,10 +71,10 @@ def evo(tmp_path_factory):
 
 
 @pytest.fixture
-def as_evo(evo, tmp_path):
+def as_evo(evo: SimpleNamespace, tmp_path: Path) -> Callable[..., Any]:
     """A trajectory as evo reads it from our file."""
 
-    def convert(trajectory, name="trajectory"):
+    def convert(trajectory: Any, name: str = "trajectory") -> Any:
         write_tum(tmp_path / f"{name}.tum", trajectory)
         return evo.read(str(tmp_path / f"{name}.tum"))
 
@@ -79,6 +82,6 @@ def as_evo(evo, tmp_path):
 
 
 @pytest.fixture
-def rng():
+def rng() -> np.random.Generator:
     """A generator with a fixed seed."""
     return np.random.default_rng(7)

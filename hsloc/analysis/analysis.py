@@ -25,6 +25,8 @@ from hsloc.evaluation import evaluate_relations, read_relations
 from hsloc.evaluation.association import interpolate_poses
 from hsloc.evaluation.error_metrics import ErrorMetrics
 from hsloc.evaluation.metrics import compare_run
+from hsloc.matching.harmony_search import HarmonySearch
+from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.model.events import PairedScan
 from hsloc.model.pose2 import Pose2, compose_poses
 from hsloc.model.trajectory import Trajectory
@@ -72,11 +74,11 @@ def analyse(
     map, and se2 on a built one, whose frame is its own. `observer` sees each event of the second pass, for a
     recording of it. Raises EvaluationError for relations that cannot be used, and LogError where the log has changed.
     """
+    scans, spec, lasers = len(result.diagnostics), result.spec, len(result.summary.lasers)
+    likelihood, matcher = _likelihood(result), spec.matcher
     residuals = Residuals(result.grid)
-    spec, scans = result.spec, len(result.diagnostics)
-    matcher, sigma = spec.matcher, spec.config.likelihood_field.sigma
-    check = ExtrinsicsCheck(result.grid, result.likelihood, matcher, sigma, scans, len(result.summary.lasers))
-    sample = ConvergenceSample(result.grid, result.likelihood, matcher, sigma, scans)
+    check = ExtrinsicsCheck(likelihood, matcher, scans, lasers)
+    sample = ConvergenceSample(likelihood, matcher, scans)
     for posed in posed_events(result, progress):
         if observer is not None:
             observer(posed)
@@ -108,6 +110,15 @@ def analyse(
     return Analysis(
         metrics, errors.whole, errors.odometry_alone, errors.odometry, sample.curves(spec.matcher_name.upper())
     )
+
+
+def _likelihood(result: Result) -> LikelihoodField | None:
+    """The field that was matched on, else one of the built map, which may take seconds; None where nothing needs it."""
+    needed = isinstance(result.spec.matcher, HarmonySearch) or len(result.summary.lasers) > 1
+    if not needed or not result.grid.occupied().any():
+        return None
+    parameters = result.spec.config.likelihood_field
+    return result.likelihood or LikelihoodField.from_grid(result.grid, parameters.sigma)
 
 
 def _relations(result: Result) -> RelationsResult | None:

@@ -69,7 +69,7 @@ def log_metrics(result: Result) -> LogMetrics:
         odometry_messages=len(result.odometry),
         path_length_m=result.trajectory.length(),
         first_stamp_ns=int(stamps.min()) if len(stamps) else None,
-        odometry=None if result.spec.no_odometry else summary.odom_topic,
+        odometry=None if result.lidar_only else summary.odom_topic,
         reference=None if result.reference is None else reference,
         lasers=tuple(LaserMetrics.of(laser) for laser in lasers),
     )

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.matching.harmony_search import HarmonySearch
-from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2
 from hsloc.run_metrics import LaserResiduals, ResidualMetrics
@@ -21,6 +20,7 @@ from hsloc.warnings import RunWarning, WarningCode
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
     from hsloc.model.events import Scan
     from hsloc.model.occupancy_grid import OccupancyGrid
@@ -127,17 +127,13 @@ class ExtrinsicsCheck:
     frame of the base, is the error of a mounting.
     """
 
-    def __init__(
-        self, grid: OccupancyGrid, likelihood: LikelihoodField | None, matcher: Matcher, sigma: float, scans: int,
-        lasers: int,
-    ) -> None:  # fmt: skip
-        """`scans` is the number of scans to come, of `lasers` lasers; with one laser there is nothing to compare.
+    def __init__(self, likelihood: LikelihoodField | None, matcher: Matcher, scans: int, lasers: int) -> None:
+        """`scans` is the number of scans to come, of `lasers` lasers.
 
-        The map's field is made with `sigma` (m) where it is not given.
+        With one laser, or without a likelihood field (a map without walls), there is nothing to compare.
         """
         self._every = max(scans // (max(lasers, 1) * CHECKED_SCANS), 1)
-        usable = lasers > 1 and bool(grid.occupied().any())
-        self._field = (likelihood or LikelihoodField.from_grid(grid, sigma)) if usable else None
+        self._field = likelihood if lasers > 1 else None
         self._matcher = matcher
         self._rng = np.random.default_rng(0)
         self._seen: dict[str, int] = {}
@@ -199,16 +195,13 @@ def _text(pose: Pose2) -> str:
 class ConvergenceSample:
     """Searches about `CONVERGENCE_SCANS` scans of a run again and keeps the best fitness after each evaluation."""
 
-    def __init__(
-        self, grid: OccupancyGrid, likelihood: LikelihoodField | None, matcher: Matcher, sigma: float, scans: int
-    ) -> None:
-        """The map's likelihood field is built where it is not given: for a large map it takes seconds.
+    def __init__(self, likelihood: LikelihoodField | None, matcher: Matcher, scans: int) -> None:
+        """`scans` is the number of scans to come.
 
-        Nothing is sampled for a matcher that does not search (ICP), or on a map without walls.
+        Nothing is sampled for a matcher that does not search (ICP), or without a likelihood field: no walls.
         """
-        usable = isinstance(matcher, HarmonySearch) and grid.occupied().any()
-        self._matcher = replace(matcher, restarts=1) if usable and isinstance(matcher, HarmonySearch) else None
-        self._field = (likelihood or LikelihoodField.from_grid(grid, sigma)) if usable else None
+        self._matcher = replace(matcher, restarts=1) if isinstance(matcher, HarmonySearch) else None
+        self._field = likelihood
         self._every = max(scans // CONVERGENCE_SCANS, 1)
         self._seen = -1
         self._rng = np.random.default_rng(0)

@@ -5,15 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from hsloc.log import open_log
-from hsloc.model.events import Odometry, PairedScan
+from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.preprocessing.odometry_resets import ContinuousOdometry
 from hsloc.replay.engine import pair
 from hsloc.replay.garbage import seldom_collected
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
+    from hsloc.model.events import Event
     from hsloc.replay.run import Result
 
 
@@ -44,7 +45,8 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
         return T_map_base @ Pose2(*odometry[row].tolist()).inverse(), T_map_base
 
     with seldom_collected():
-        for event in pair(ContinuousOdometry(log.events()), deskew=result.spec.read.deskew, first=first):
+        events = _with_recorded_odometry(log.events(), result) if result.lidar_only else log.events()
+        for event in pair(ContinuousOdometry(events), deskew=result.deskewed, first=first):
             if isinstance(event, PairedScan):
                 if result.follows_scans:
                     row += 1
@@ -57,3 +59,14 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
                 yield PosedEvent(event, *correction(row), bool(localised[row]))
             if progress is not None and row % 500 == 0:
                 progress(row / len(result.trajectory))
+
+
+def _with_recorded_odometry(events: Iterable[Event], result: Result) -> Iterator[Event]:
+    """Events without the log's odometry; before each scan comes the odometry that the run made of the scans, if any."""
+    recorded = iter(zip(result.odometry.stamps_ns.tolist(), result.odometry.poses.tolist(), strict=True))
+    for event in events:
+        if isinstance(event, Odometry):
+            continue
+        if isinstance(event, Scan) and (found := next(recorded, None)) is not None:
+            yield Odometry(found[0], Pose2(*found[1]))
+        yield event

@@ -1,1 +1,1 @@
-"""HOW FAST: the figures that the project promises, measured on this machine, and peers on the same work."""
+"""Benchmarks: the figures that the project promises, measured on this machine, and other programs on the same work."""

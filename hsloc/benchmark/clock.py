@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Seconds of wall time. `best` is what the code needs when nobody disturbs it, `median` what was usual."""
+    """Seconds of wall time. `best` is the time without disturbance, `median` the usual one."""
 
     best: float
     median: float

@@ -103,7 +103,7 @@ def _replayed(scenario: Scenario, path: Path) -> dict[str, float]:
     record(scenario, path)
     child = subprocess.run([sys.executable, "-c", _CHILD, str(path)], capture_output=True, text=True, check=False)
     if child.returncode != 0:
-        last = (child.stderr.strip().splitlines() or ["it said nothing"])[-1]
+        last = (child.stderr.strip().splitlines() or ["no output"])[-1]
         raise HslocError(f"{path}: the replay in a process of its own failed: {last}")
     values: dict[str, float] = json.loads(child.stdout)
     return values

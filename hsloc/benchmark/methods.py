@@ -159,7 +159,7 @@ class MealpyHarmonySearch:
         """See `Method`."""
         objective = _Objective(self._field, points, window)
         half = window.half_widths()
-        # The bounds lie about zero: the pitch of OriginalHS is drawn around their middle.
+        # The bounds lie about zero: OriginalHS samples the pitch around their middle.
         problem = {
             "obj_func": objective,
             "bounds": self._module.FloatVar(lb=tuple(-half), ub=tuple(half)),

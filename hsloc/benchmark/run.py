@@ -72,7 +72,7 @@ def run_bench(
     """
     sizes = QUICK if quick else Sizes()
     bench = Bench(machine=machine(), load_after=None, quick=quick)
-    # First of all: a wrong file is told before minutes of work.
+    # First of all: a wrong file is reported before minutes of work.
     given = None if cases is None or "cases" not in parts else read_cases(cases).first(sizes.cases)
     if "kernel" in parts or "match" in parts:
         progress("kernel", 0.0)
@@ -97,16 +97,16 @@ def run_bench(
         rows: list[CaseResult] = []
         for index, method in enumerate(methods):
 
-            def tell(share: float, index: int = index) -> None:
+            def report(share: float, index: int = index) -> None:
                 progress("cases", (index + share) / len(methods))
 
-            rows += run_method(method, given, tell)
+            rows += run_method(method, given, report)
         bench = replace(bench, cases_name=given.name, cases=tuple(rows), notes=tuple(notes))
     return replace(bench, load_after=load())
 
 
 def _log(folder: Path, sizes: Sizes) -> Path:
-    """The fixture where there is one, else the same recorded anew; or a short one."""
+    """The fixture where there is one, else the same, recorded again; or a short one."""
     found = fixture()
     if found is not None and sizes.replay_seconds is None:
         return found

@@ -20,7 +20,7 @@ CASES = {"track": (1.0, None), "small": (1.0, 1.0), "large": (0.99, 4.0)}
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A figure, its limit, and whether it is kept; `at_least` says on which side."""
+    """A figure, its limit, and whether it is kept; `at_least`: the limit is a minimum."""
 
     text: str
     measured: float

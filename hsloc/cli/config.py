@@ -1,4 +1,4 @@
-"""Print the parameters of a run as YAML: those of a preset, or of a file on top of it, checked."""
+"""Print the parameters of a run as YAML with comments: those of a preset, or of a file on top of it, checked."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the configuration."""
-    from hsloc.config import dump, to_dict
+    from hsloc.config import to_dict
+    from hsloc.parameter_reference import commented_yaml
 
     chosen = request(arguments).config
     if arguments.json:
@@ -32,5 +33,5 @@ def run(arguments: argparse.Namespace) -> int:
 
         print(json.dumps(to_dict(chosen), indent=2))
     else:
-        print(dump(chosen), end="")
+        print(commented_yaml(chosen), end="")
     return 0

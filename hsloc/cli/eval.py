@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hsloc.evaluation.rpe import Delta
     from hsloc.evaluation.statistics import Statistics
     from hsloc.model import Trajectory
+    from hsloc.warnings import RunWarning
 
 HELP = "compare trajectories with a reference"
 EXAMPLES = """
@@ -83,18 +84,21 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     delta = Delta(arguments.delta, arguments.delta_unit, arguments.all_pairs)
     relations = None if arguments.relations is None else read_relations(arguments.relations)
-    reference = None if alone or own else read_reference(files[0])
+    warnings: list[RunWarning] = []
+    reference = None if alone or own else read_reference(files[0], (), warnings)
     results = {
         path: _evaluate(
             path,
-            read_reference(_inside(path, "trajectory.tum")),
-            read_reference(_inside(path, "reference.tum")) if own else reference,
+            read_reference(_inside(path, "trajectory.tum"), (), warnings),
+            read_reference(_inside(path, "reference.tum"), (), warnings) if own else reference,
             relations,
             delta,
             arguments,
         )
         for path in files[0 if alone or own else 1 :]
     }
+    for warning in dict.fromkeys(warnings):
+        print(f"hsloc: warning: {warning}", file=sys.stderr)
     if arguments.save_results is not None:
         if alone:
             print("hsloc eval: error: --save-results needs a reference to take errors from", file=sys.stderr)

@@ -50,7 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser, door: Door = "replay") -> Non
 
 def run(arguments: argparse.Namespace) -> int:
     """Run, write the results, print the table; 4 where a limit is not kept, else 3 where part of the input was lost."""
-    from hsloc.cli.main import EXIT_DATA_LOST, EXIT_OK
+    from hsloc.analysis.limits import exceeded_limits
+    from hsloc.cli.main import EXIT_BELOW_LIMIT, EXIT_DATA_LOST, EXIT_OK
     from hsloc.cli.output import print_summary
     from hsloc.evaluation.metrics import format_json
     from hsloc.export.results_folder import write_results
@@ -88,6 +89,11 @@ def run(arguments: argparse.Namespace) -> int:
     elif not arguments.quiet:
         print_summary(written.metrics, written.timings, folder)
         print(f"whole command: {time.perf_counter() - BEGIN:.1f} s, reading and writing included")
+    exceeded = exceeded_limits(spec, written.metrics)
+    for limit in exceeded:
+        print(f"hsloc: limit not kept: {limit}", file=sys.stderr)
+    if exceeded:
+        return EXIT_BELOW_LIMIT
     return EXIT_DATA_LOST if result.losses.data_lost else EXIT_OK
 
 

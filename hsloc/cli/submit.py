@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Upload, submit, wait, fetch."""
-    from hsloc.cli.main import EXIT_DATA_LOST, EXIT_FAILED, EXIT_OK
+    from hsloc.cli.main import EXIT_BELOW_LIMIT, EXIT_DATA_LOST, EXIT_FAILED, EXIT_OK
     from hsloc.client import Client
 
     client = Client(arguments.url, os.environ.get("HSLOC_TOKEN"))
@@ -61,6 +62,13 @@ def run(arguments: argparse.Namespace) -> int:
         return EXIT_OK
     if job["state"] != "succeeded":
         return EXIT_FAILED
+    if not arguments.quiet:
+        for warning in job["summary"].get("warnings", ()):
+            print(f"hsloc: warning: {'; '.join(filter(None, (warning['text'], warning['remedy'])))}", file=sys.stderr)
+    for limit in job["summary"].get("limits", ()):
+        print(f"hsloc: limit not kept: {limit}", file=sys.stderr)
+    if job["summary"].get("limits"):
+        return EXIT_BELOW_LIMIT
     return EXIT_DATA_LOST if job["summary"]["data_lost"] else EXIT_OK
 
 
@@ -72,14 +80,16 @@ def request_of(given: Mapping[str, Any], upload: Callable[[Path], str]) -> dict[
     for name, value in merged(given).items():
         option = BY_NAME[name]
         if name == "map":
-            image = value.parent / str(read_values(value).get("image", ""))
+            from hsloc.maps.metadata import read_metadata
+
+            image = read_metadata(value).image
             request["map"] = {"yaml": upload(value), "image": upload(image)}
         elif name == "config":
             request["config"] = read_values(value)
         elif name == "resume":
             request["resume"] = str(value)
         elif name == "reference":
-            request |= _reference(value, upload)
+            merge(request, _reference(value, upload))
         elif option.kind == "path":
             request[name] = upload(value)
         elif name != "set":
@@ -116,7 +126,7 @@ def _show(line: ProgressLine, job: dict[str, Any]) -> None:
     if progress is None:
         line.show(job["state"], 1.0 if job["ended"] else 0.0, "")
     else:
-        line.show(progress["phase"], progress["fraction"], f"told {progress['age_s']:.0f} s ago")
+        line.show(progress["phase"], progress["fraction"], f"{progress['age_s']:.0f} s ago")
 
 
 def _tell(job: dict[str, Any], out: Path | None) -> str:

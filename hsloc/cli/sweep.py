@@ -50,8 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Sweep; 1 where a run failed, else 4 where one keeps a limit not, else 3 where part of an input was lost."""
-    from hsloc.cli.main import EXIT_DATA_LOST, EXIT_FAILED, EXIT_OK
+    """Sweep; 1 where a run failed, else 4 where one does not keep a limit, else 3 where part of an input was lost."""
+    from hsloc.cli.main import EXIT_BELOW_LIMIT, EXIT_DATA_LOST, EXIT_FAILED, EXIT_OK
     from hsloc.errors import OutputError
     from hsloc.sweep.process_pool import sweep_in_processes
     from hsloc.sweep.runs import FAILED, plan
@@ -82,6 +82,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"hsloc: {failed} of {len(outcomes)} runs failed", file=sys.stderr)
     if failed:
         return EXIT_FAILED
+    if any(outcome.limits for outcome in outcomes):
+        return EXIT_BELOW_LIMIT
     return EXIT_DATA_LOST if any(outcome.data_lost for outcome in outcomes) else EXIT_OK
 
 

@@ -4,7 +4,8 @@ from hsloc.evaluation.metrics import Comparison, Evaluation, RelativeError, comp
 from hsloc.evaluation.relations import RelationsResult, evaluate_relations, read_relations
 from hsloc.evaluation.rpe import Delta
 from hsloc.evaluation.statistics import PoseStatistics, Statistics
-from hsloc.trajectory_io.tum import read_tum, write_tum
+from hsloc.trajectory_io.reader import read_tum
+from hsloc.trajectory_io.tum import write_tum
 
 __all__ = [
     "Comparison",

@@ -1,15 +1,15 @@
-"""Is there another pose that fits as well? Branch and bound over a lattice of poses.
+"""Branch and bound over a lattice of poses, to find whether another pose fits as well.
 
 The scores of a field are pooled: level k holds at each node the maximum over the 2^k x 2^k nodes from it on. The sum of
 pooled scores under the points bounds the score of all 2^k x 2^k shifts at once, so that most of the window is
-ruled out unseen (Olson 2009; Hess et al. 2016). On the lattice the answer is exact.
+excluded at once (Olson 2009; Hess et al. 2016). On the lattice the answer is exact.
 Lengths are in cells of the field, as in hsloc/kernels/fitness.py.
 """
 
 from __future__ import annotations
 
 from math import cos, pi, sin
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,6 +20,23 @@ if TYPE_CHECKING:
     F32 = NDArray[np.float32]
     F64 = NDArray[np.float64]
     I32 = NDArray[np.int32]
+
+
+class Lattice(NamedTuple):
+    """The poses that are searched: the cells of a box, and headings `angle_step` (rad) apart."""
+
+    centre: F64
+    """(x, y, theta) of the middle of the box, cells and rad."""
+    half_widths: F64
+    """Half-widths of the box, cells, cells and rad."""
+    angle_step: float
+
+
+class Excluded(NamedTuple):
+    """Poses that do not count: those within `distance` (cells, cells, rad) of `pose`; distance[0] < 0: all count."""
+
+    pose: F64
+    distance: F64
 
 
 @njit(cache=True, nogil=True)
@@ -78,23 +95,18 @@ def _rotated(points: F32, theta: float, cells: I32) -> None:
 
 @njit(cache=True, nogil=True)
 def best_on_lattice(
-    pooled: F32,
-    points: F32,
-    centre: F64,
-    half_widths: F64,
-    angle_step: float,
-    excluded: F64,
-    exclusion: F64,
-    needed: float,
-    most_visits: int,
-    pose: F64,
+    pooled: F32, points: F32, lattice: Lattice, exclude: Excluded, needed: float, max_visits: int, pose: F64
 ) -> tuple[float, int]:
-    """The fittest pose of a lattice (one cell; `angle_step` rad) in the box `centre` +- `half_widths`.
+    """The fittest pose of a lattice that is fitter than `needed` and not excluded.
 
-    Poses within `exclusion` (cells; rad) of the pose `excluded` do not count; exclusion[0] < 0: all count. Only poses
-    fitter than `needed` are looked for. Writes `pose` (3,) and returns the fitness, or `needed` if no pose
-    is fitter, and the number of bounds computed; -1 for the fitness when `most_visits` did not suffice.
+    Writes `pose` (3,) and returns the fitness, or `needed` if no pose is fitter, and the number of bounds computed; -1
+    for the fitness when `max_visits` did not suffice.
     """
+    centre = lattice.centre
+    half_widths = lattice.half_widths
+    angle_step = lattice.angle_step
+    excluded = exclude.pose
+    exclusion = exclude.distance
     n = max(len(points), 1)
     levels = len(pooled) - 1
     top = 1 << levels
@@ -142,7 +154,7 @@ def best_on_lattice(
             if u > u_high or v > v_high:
                 continue
             visits += 1
-            if visits > most_visits:
+            if visits > max_visits:
                 return -1.0, visits
             last = (1 << level) - 1
             if (

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
 
 _BLOCK = 16
-"""Points summed between two looks at whether the pose can still win."""
+"""Points summed between two tests whether the pose can still win. Internal: time alone."""
 
 
 @njit(cache=True, nogil=True)

@@ -15,9 +15,8 @@ if TYPE_CHECKING:
     F32 = NDArray[np.float32]
     F64 = NDArray[np.float64]
 
-_STILL_CELLS = 1e-3
-_STILL_RADIANS = 1e-5
-"""A step smaller than both ends the refinement."""
+_STILL_CELLS, _STILL_RADIANS = 1e-3, 1e-5
+"""Steps (cells, rad) below which the iteration has converged. Internal: far below the accuracy of any scan."""
 
 
 @njit(cache=True, nogil=True)

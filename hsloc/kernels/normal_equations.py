@@ -7,20 +7,39 @@ moved onto the two poses in the map, and added to the 3x3 blocks of a sparse sym
 from __future__ import annotations
 
 from math import cos, pi, sin
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit
 
-from hsloc.kernels.point_to_line import pair_terms
+from hsloc.kernels.point_to_line import ScanArrays, Term, pair_terms
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    F32 = NDArray[np.float32]
     F64 = NDArray[np.float64]
-    I32 = NDArray[np.int32]
     I64 = NDArray[np.int64]
+
+
+class Blocks(NamedTuple):
+    """Blocks of a sparse symmetric system that a term between poses j and i adds to: (3, 3), right side (3,)."""
+
+    jj: F64
+    ji: F64
+    ii: F64
+    right_j: F64
+    right_i: F64
+
+
+class Equations(NamedTuple):
+    """A sparse symmetric system of n poses and m pairs of poses."""
+
+    diagonal: F64
+    """Shape (n, 3, 3)."""
+    off_diagonal: F64
+    """Shape (m, 3, 3), the blocks of rows pairs[:, 0] and columns pairs[:, 1]."""
+    right: F64
+    """Shape (n, 3)."""
 
 
 @njit(cache=True, nogil=True)
@@ -36,14 +55,19 @@ def relative(first: F64, second: F64, out: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def add_relative_term(
-    pose_j: F64, rel: F64, information: F64, gradient: F64, hjj: F64, hji: F64, hii: F64, gj: F64, gi: F64, ha: F64
-) -> None:
+def add_relative_term(pose_j: F64, rel: F64, term: Term, blocks: Blocks, ha: F64) -> None:
     """Move a term in the pose of i seen from j, `rel`, onto the two poses in the map, adding to the five blocks.
 
     With rel = R_j^T (t_i - t_j), theta_i - theta_j: A = d rel / d pose_i, B = d rel / d pose_j.
     `ha` (3, 3) is scratch; matrices this small are faster by hand than by BLAS.
     """
+    information = term.information
+    gradient = term.gradient
+    hjj = blocks.jj
+    hji = blocks.ji
+    hii = blocks.ii
+    gj = blocks.right_j
+    gi = blocks.right_i
     c = cos(pose_j[2])
     s = sin(pose_j[2])
     # H A: A turns (x, y) by -theta_j.
@@ -98,31 +122,23 @@ def assemble_pairs(
     poses: F64,
     pairs: I64,
     pair_weights: F64,
-    points: F32,
-    normals: F32,
-    centroids: F32,
-    start: I64,
-    hit_of_beam: I32,
-    ranges: F32,
-    table_start: I64,
-    geometry: F64,
-    chosen_hits: I32,
-    chosen_start: I64,
+    scans: ScanArrays,
     gate: float,
     scale: float,
-    diagonal: F64,
-    off_diagonal: F64,
-    right: F64,
+    equations: Equations,
     counts: F64,
 ) -> float:
     """The equations of all pairs (m, 2) of scans, either scan against the other, at `poses` (n, 3).
 
-    Adds to `diagonal` (n, 3, 3) and `right` (n, 3); overwrites `off_diagonal` (m, 3, 3), the block of rows
-    pairs[:, 0] and columns pairs[:, 1], and `counts` (m, 5), the sum over both directions (see `pair_terms`). Returns
-    the sum of weighted squares.
+    Adds to the diagonal and the right side of `equations`; overwrites its off-diagonal blocks, and `counts` (m, 5), the
+    sum over both directions (see `pair_terms`). Returns the sum of weighted squares.
     """
+    diagonal = equations.diagonal
+    off_diagonal = equations.off_diagonal
+    right = equations.right
     information = np.empty((3, 3))
     gradient = np.empty(3)
+    term = Term(information, gradient)
     rel = np.empty(3)
     tally = np.empty(5)
     total = 0.0
@@ -136,46 +152,33 @@ def assemble_pairs(
             j = pairs[m, direction]
             i = pairs[m, 1 - direction]
             relative(poses[j], poses[i], rel)
-            pair_terms(
-                i, j, rel[0], rel[1], rel[2], points, normals, centroids, start, hit_of_beam, ranges, table_start,
-                geometry, chosen_hits, chosen_start, gate, scale, information, gradient, tally,
-            )  # fmt: skip
+            pair_terms(i, j, rel, scans, gate, scale, term, tally)
             counts[m] += tally
             total += weight * tally[3]
             information *= weight
             gradient *= weight
             if direction == 0:
-                add_relative_term(
-                    poses[j],
-                    rel,
-                    information,
-                    gradient,
-                    diagonal[j],
-                    off_diagonal[m],
-                    diagonal[i],
-                    right[j],
-                    right[i],
-                    ha,
-                )
+                blocks = Blocks(diagonal[j], off_diagonal[m], diagonal[i], right[j], right[i])
+                add_relative_term(poses[j], rel, term, blocks, ha)
             else:
                 transposed[:] = 0.0
-                add_relative_term(
-                    poses[j], rel, information, gradient, diagonal[j], transposed, diagonal[i], right[j], right[i], ha
-                )
+                blocks = Blocks(diagonal[j], transposed, diagonal[i], right[j], right[i])
+                add_relative_term(poses[j], rel, term, blocks, ha)
                 off_diagonal[m] += transposed.T
     return total
 
 
 @njit(cache=True, nogil=True)
-def add_edges(
-    poses: F64, edges: I64, measured: F64, information: F64, scale: F64, diagonal: F64, off_diagonal: F64, right: F64
-) -> float:
+def add_edges(poses: F64, edges: I64, measured: F64, information: F64, scale: F64, equations: Equations) -> float:
     """The equations of edges (m, 2): pose `measured` (m, 3) of edges[:, 1] seen from edges[:, 0].
 
-    Adds to `diagonal` and `right`, overwrites `off_diagonal` (m, 3, 3) as in `assemble_pairs`. `scale` (m,)
+    Adds to the diagonal and the right side of `equations`; overwrites its off-diagonal blocks. `scale` (m,)
     weighs each edge down: w = scale^2 / (scale^2 + chi^2), Cauchy's weight; infinite: no robust weight. Returns the sum
     of weighted chi^2.
     """
+    diagonal = equations.diagonal
+    off_diagonal = equations.off_diagonal
+    right = equations.right
     rel = np.empty(3)
     error = np.empty(3)
     ha = np.empty((3, 3))
@@ -194,16 +197,6 @@ def add_edges(
         if scale[m] < np.inf:
             weight = scale[m] ** 2 / (scale[m] ** 2 + chi2)
         total += weight * chi2
-        add_relative_term(
-            poses[j],
-            rel,
-            weight * information[m],
-            weight * gradient,
-            diagonal[j],
-            off_diagonal[m],
-            diagonal[i],
-            right[j],
-            right[i],
-            ha,
-        )
+        blocks = Blocks(diagonal[j], off_diagonal[m], diagonal[i], right[j], right[i])
+        add_relative_term(poses[j], rel, Term(weight * information[m], weight * gradient), blocks, ha)
     return total

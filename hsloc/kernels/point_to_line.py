@@ -5,16 +5,13 @@ scan is looked up by its bearing in the scan it is compared with (projective ass
 so that no field and no tree is needed, and what one side of a wall has seen is never paired with
 its other side. The residual is the distance from point to line (Chen and Medioni 1992; Censi 2008 for planar scans).
 
-Scans are stored one after the other (`hsloc.slam.keyscans`): hits of scan k are rows start[k] to start[k + 1] of
-`points`, `normals`, `centroids` (P, 2; base frame, metres); its beams are entries table_start[k] to
-table_start[k + 1] of `hit_of_beam` (row of the hit within the scan, or -1) and `ranges` (m; +inf: no return, free;
-NaN: invalid). `geometry` (n, 5) is the laser's x, y, theta in the base, angle_min, angle_increment.
+Scans are stored one after the other (`ScanArrays`, made by `hsloc.slam.keyscans`).
 """
 
 from __future__ import annotations
 
 from math import atan2, cos, pi, sin, sqrt
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -28,18 +25,50 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
 
 _MOST_NEIGHBOURS = 16
-"""Hits taken on each side of a hit, at most."""
+"""Maximum number of hits on each side of a hit. Internal: bounds the time where beams are dense."""
 _MOST_BEAMS = 4
-"""Beams looked at on each side of the beam in which a point lies, at most."""
+"""Maximum number of beams on each side of a point's own beam. Internal: bounds the time where beams are dense."""
 _DIRECTIONS = 16
-"""Sorts of walls when hits are chosen."""
+"""Sectors of the normals among which hits are chosen. Internal: walls of one direction in each, 22.5 degrees."""
 _SAME_FACE = 0.7
-"""Cosine of the angle between the normals of one wall in two scans, at least."""
+"""Minimum cosine between the normals of one wall in two scans. Internal: 45 degrees, faces differ by 90 or 180."""
 _THROUGH = 0.25
-"""A beam that ends so far (m) behind a point has looked through it."""
+"""Distance (m) by which a beam that looked through a point ends behind it. Internal: above errors of range."""
 _CLEARED = 4.0
-"""A beam without a return has looked through what lies nearer than this [m], as where the map is built: beyond, it may
-have been out of the lidar's range, or have met glass."""
+"""Depth (m) up to which a beam without a return has looked through. Internal: as where the map is built; beyond, a wall
+may have been out of range, or of glass."""
+
+
+class ScanArrays(NamedTuple):
+    """Scans one after the other, and which of their hits are used.
+
+    In this module because a kernel's argument types decide whether it can be cached.
+    """
+
+    points: F32
+    """Hits of scan k in the base's frame (m): rows start[k] to start[k + 1], shape (P, 2)."""
+    normals: F32
+    """Normals of the hits, shape (P, 2); (0, 0) for a hit without a surfel."""
+    centroids: F32
+    """Centroids of the surfels of the hits (m), shape (P, 2)."""
+    start: I64
+    hit_of_beam: I32
+    """Row of a beam's hit within its scan, or -1; beams of scan k are entries table_start[k] to table_start[k + 1]."""
+    ranges: F32
+    """Range of each beam (m); infinite: no return; NaN: invalid."""
+    table_start: I64
+    geometry: F64
+    """The laser's x, y, theta in the base, angle_min and angle_increment of each scan, shape (n, 5)."""
+    chosen_hits: I32
+    """Rows of the hits that are used, within their scan: of k the entries chosen_start[k] to chosen_start[k + 1]."""
+    chosen_start: I64
+
+
+class Term(NamedTuple):
+    """Normal equations of one pose (x, y, theta): `information` (3, 3) and `gradient` (3,)."""
+
+    information: F64
+    gradient: F64
 
 
 @njit(cache=True, nogil=True)
@@ -136,8 +165,8 @@ def bearing(y: float, x: float) -> float:
 def choose_hits(normals: F32, most: int, chosen: I32) -> int:
     """Choose about `most` hits that have a surfel, evenly by the directions of their walls; returns how many.
 
-    In a corridor nearly all hits lie on its two sides, and only a handful, on door frames and at its end, tell
-    how far along it one is: of a crowded direction every so-many-th hit is taken, of a rare one all (normal-space
+    In a corridor nearly all hits lie on its two sides, and only a handful, on door frames and at its end, fix
+    the position along it: of a frequent direction every n-th hit is taken, of a rare one all (normal-space
     sampling, Rusinkiewicz and Levoy 2001). Writes the rows into `chosen`, in ascending order.
     """
     n = len(normals)
@@ -169,35 +198,27 @@ def choose_hits(normals: F32, most: int, chosen: I32) -> int:
 
 
 @njit(cache=True, nogil=True)
-def pair_terms(
-    i: int,
-    j: int,
-    rx: float,
-    ry: float,
-    rt: float,
-    points: F32,
-    normals: F32,
-    centroids: F32,
-    start: I64,
-    hit_of_beam: I32,
-    ranges: F32,
-    table_start: I64,
-    geometry: F64,
-    chosen_hits: I32,
-    chosen_start: I64,
-    gate: float,
-    scale: float,
-    information: F64,
-    gradient: F64,
-    counts: F64,
-) -> None:
-    """Equations of scan i against scan j, the pose of i in j being (rx, ry, rt).
+def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: float, term: Term, counts: F64) -> None:
+    """Equations of scan i against scan j, the pose of i in j being `rel` (x, y, theta).
 
-    Overwrites `information` (3, 3) = sum w J^T J and `gradient` (3,) = sum w J^T r with the residuals r (m) and
-    their derivatives by (rx, ry, rt), weights w = 1 / (1 + r^2 / scale^2)^2 (Geman-McClure), and `counts` =
+    Overwrites `term`, information = sum w J^T J and gradient = sum w J^T r with the residuals r (m) and their
+    derivatives by `rel`, weights w = 1 / (1 + r^2 / scale^2)^2 (Geman-McClure), and `counts` =
     (paired within `gate`, conflicts: points where j looked through, points in j's field of view, sum of w r^2, sum of
-    w). Of scan i the rows `chosen_hits[chosen_start[i] : chosen_start[i + 1]]` are used.
+    w). Of scan i the chosen hits are used.
     """
+    points = scans.points
+    normals = scans.normals
+    centroids = scans.centroids
+    start = scans.start
+    hit_of_beam = scans.hit_of_beam
+    ranges = scans.ranges
+    table_start = scans.table_start
+    geometry = scans.geometry
+    chosen_hits = scans.chosen_hits
+    chosen_start = scans.chosen_start
+    rx = rel[0]
+    ry = rel[1]
+    rt = rel[2]
     c = cos(rt)
     s = sin(rt)
     first = table_start[j]
@@ -292,15 +313,16 @@ def pair_terms(
         gx += wx * r
         gy += wy * r
         gt += wt * r
+    information = term.information
     information[0, 0] = xx
     information[0, 1] = information[1, 0] = xy
     information[0, 2] = information[2, 0] = xt
     information[1, 1] = yy
     information[1, 2] = information[2, 1] = yt
     information[2, 2] = tt
-    gradient[0] = gx
-    gradient[1] = gy
-    gradient[2] = gt
+    term.gradient[0] = gx
+    term.gradient[1] = gy
+    term.gradient[2] = gt
     counts[0] = paired
     counts[1] = conflicts
     counts[2] = seen

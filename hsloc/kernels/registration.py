@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 
 from hsloc.kernels.levenberg_marquardt import solve_damped
-from hsloc.kernels.normal_equations import add_relative_term, relative
-from hsloc.kernels.point_to_line import pair_terms
+from hsloc.kernels.normal_equations import Blocks, add_relative_term, relative
+from hsloc.kernels.point_to_line import ScanArrays, Term, pair_terms
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,21 +28,6 @@ if TYPE_CHECKING:
 _STILL_M = 1e-4
 _STILL_RAD = 1e-5
 """A step smaller than both ends the registration."""
-
-
-class ScanArrays(NamedTuple):
-    """Scans one after the other, as in `hsloc.slam.keyscans.KeyScans`, and the hits of each that are used."""
-
-    points: F32
-    normals: F32
-    centroids: F32
-    start: I64
-    hit_of_beam: I32
-    ranges: F32
-    table_start: I64
-    geometry: F64
-    chosen_hits: I32
-    chosen_start: I64
 
 
 class RegistrationParameters(NamedTuple):
@@ -60,27 +45,36 @@ class RegistrationParameters(NamedTuple):
     """Gauss-Newton steps at most."""
 
 
-@njit(cache=True, nogil=True)
-def add_pairs(
-    pose: F64,
-    first_moving: int,
-    scan_poses: F64,
-    scans: ScanArrays,
-    gate: float,
-    p: RegistrationParameters,
-    information: F64,
-    gradient: F64,
-    counts: F64,
-) -> None:
-    """Add the equations of the scans from `first_moving` on, which move with `pose`, against those before.
+class Scene(NamedTuple):
+    """n scans, of which those from `first_moving` on move together and the others stand still."""
 
-    `scan_poses` (n, 3): of the fixed scans in the map, of the moving ones as seen from `pose`. Adds to `information`
-    (3, 3) and `gradient` (3,) by (x, y, theta) in the map, and to `counts` (5,) as in `pair_terms`.
+    first_moving: int
+    scan_poses: F64
+    """Of the fixed scans in the map, of the moving ones as seen from the pose that is sought, shape (n, 3)."""
+    scans: ScanArrays
+
+
+class Prior(NamedTuple):
+    """What is known of the pose beforehand, in the map."""
+
+    pose: F64
+    information: F64
+    """Shape (3, 3)."""
+
+
+@njit(cache=True, nogil=True)
+def add_pairs(pose: F64, scene: Scene, gate: float, p: RegistrationParameters, term: Term, counts: F64) -> None:
+    """Add the equations of the scans that move with `pose` against those that stand still.
+
+    Adds to `term`, by (x, y, theta) of `pose` in the map, and to `counts` (5,) as in `pair_terms`.
     """
+    first_moving = scene.first_moving
+    scan_poses = scene.scan_poses
+    information = term.information
+    gradient = term.gradient
     moved = np.empty(3)
     rel = np.empty(3)
-    h = np.empty((3, 3))
-    g = np.empty(3)
+    one = Term(np.empty((3, 3)), np.empty(3))
     tally = np.empty(5)
     ha = np.empty((3, 3))
     away = np.zeros((3, 3))
@@ -88,6 +82,8 @@ def add_pairs(
     lost = np.zeros(3)
     block = np.zeros((3, 3))
     pull = np.zeros(3)
+    onto_first = Blocks(block, off, away, pull, lost)
+    onto_second = Blocks(away, off, block, lost, pull)
     c = np.cos(pose[2])
     s = np.sin(pose[2])
     for k in range(first_moving, len(scan_poses)):
@@ -106,18 +102,16 @@ def add_pairs(
                     relative(scan_poses[m], moved, rel)
                 else:
                     relative(moved, scan_poses[m], rel)
-                pair_terms(
-                    i, j, rel[0], rel[1], rel[2], scans.points, scans.normals, scans.centroids, scans.start,
-                    scans.hit_of_beam, scans.ranges, scans.table_start, scans.geometry, scans.chosen_hits,
-                    scans.chosen_start, gate, p.scale_of_gate * gate, h, g, tally,
-                )  # fmt: skip
+                pair_terms(i, j, rel, scene.scans, gate, p.scale_of_gate * gate, one, tally)
                 counts += tally
-                h *= p.weight
-                g *= p.weight
+                for a in range(3):
+                    one.gradient[a] *= p.weight
+                    for b in range(3):
+                        one.information[a, b] *= p.weight
                 if direction == 0:
-                    add_relative_term(scan_poses[m], rel, h, g, away, off, block, lost, pull, ha)
+                    add_relative_term(scan_poses[m], rel, one, onto_second, ha)
                 else:
-                    add_relative_term(moved, rel, h, g, block, off, away, pull, lost, ha)
+                    add_relative_term(moved, rel, one, onto_first, ha)
         # From the moved scan's pose to `pose`: x and y shift with it, theta also swings the scan around it.
         information += block
         for a in range(3):
@@ -130,47 +124,38 @@ def add_pairs(
 
 
 @njit(cache=True, nogil=True)
-def register(
-    pose: F64,
-    first_moving: int,
-    scan_poses: F64,
-    scans: ScanArrays,
-    prior_pose: F64,
-    prior: F64,
-    p: RegistrationParameters,
-    information: F64,
-    counts: F64,
-) -> float:
+def register(pose: F64, scene: Scene, prior: Prior, p: RegistrationParameters, information: F64, counts: F64) -> float:
     """Move `pose` (3,), in place, to where the moving scans fit the fixed ones and the prior best.
 
-    `prior` (3, 3) is the information of `prior_pose` in the map. Writes the `information` (3, 3) of the pairs alone and
-    their `counts` (5,), at the pose before the last step. Returns the chi of that pose against the prior.
+    Writes the `information` (3, 3) of the pairs alone and their `counts` (5,), at the pose before the last step.
+    Returns the chi of that pose against the prior.
     """
     gradient = np.empty(3)
     step = np.empty(3)
     error = np.empty(3)
     total = np.empty((3, 3))
+    term = Term(information, gradient)
     chi2 = 0.0
     for k in range(p.rounds):
         gate = p.gates[min(k, 2)]
         information[:] = 0.0
         gradient[:] = 0.0
         counts[:] = 0.0
-        add_pairs(pose, first_moving, scan_poses, scans, gate, p, information, gradient, counts)
+        add_pairs(pose, scene, gate, p, term, counts)
         for a in range(3):
-            error[a] = pose[a] - prior_pose[a]
+            error[a] = pose[a] - prior.pose[a]
         error[2] -= 2.0 * pi * np.round(error[2] / (2.0 * pi))
         chi2 = 0.0
         for a in range(3):
             for b in range(3):
-                chi2 += error[a] * prior[a, b] * error[b]
+                chi2 += error[a] * prior.information[a, b] * error[b]
         weight = 1.0
         if p.prior_scale < np.inf:
             weight = p.prior_scale**2 / (p.prior_scale**2 + chi2)
         for a in range(3):
             for b in range(3):
-                total[a, b] = information[a, b] + weight * prior[a, b]
-                gradient[a] += weight * prior[a, b] * error[b]
+                total[a, b] = information[a, b] + weight * prior.information[a, b]
+                gradient[a] += weight * prior.information[a, b] * error[b]
         solve_damped(total, gradient, 0.0, step)
         for a in range(3):
             pose[a] -= step[a]

@@ -1,7 +1,7 @@
 """Drawing points into a score field, one scan at a time: the field of a map that grows.
 
-The field holds exp(-d / sigma), d being the distance to the nearest point drawn so far; a further point can only
-raise it, so it is drawn by taking the maximum over its neighbourhood. Nothing is computed twice and no
+The field holds exp(-d / sigma), d being the distance to the nearest point added so far; a further point can only
+raise it, so it is added by taking the maximum over its neighbourhood. Nothing is computed twice and no
 distance transform is needed. All lengths are in cells, as in hsloc/kernels/fitness.py.
 """
 
@@ -37,15 +37,15 @@ def decay_table(sigma: float, radius: float) -> F32:
 
 @njit(cache=True, nogil=True)
 def splat(scores: F32, packed: F32, points: F32, table: F32, radius: float, known: float) -> int:
-    """Draw points (n, 2) into `scores` (h, w) and bring `packed` (h - 1, w - 1, 4) up to date around them.
+    """Add points (n, 2) to `scores` (h, w) and bring `packed` (h - 1, w - 1, 4) up to date around them.
 
     `table` is `decay_table(sigma, radius)`; a node farther than `radius` from a point is not touched. A point whose
     nearest node already scores more than `known` is passed over: the map has it. Points outside are
-    left out. Returns the number of points drawn.
+    left out. Returns the number of points added.
     """
     height, width = scores.shape
     reach = int(radius) + 1
-    drawn = 0
+    added = 0
     steps = np.float32(_STEPS)
     limit = np.float32(radius * radius)
     for i in range(len(points)):
@@ -57,7 +57,7 @@ def splat(scores: F32, packed: F32, points: F32, table: F32, radius: float, know
         iv = int(y + np.float32(0.5))
         if scores[iv, iu] > known:
             continue
-        drawn += 1
+        added += 1
         for v in range(iv - reach, iv + reach + 1):
             dy = np.float32(v) - y
             for u in range(iu - reach, iu + reach + 1):
@@ -67,4 +67,4 @@ def splat(scores: F32, packed: F32, points: F32, table: F32, radius: float, know
                     score = table[int(squared * steps)]
                     scores[v, u] = max(scores[v, u], score)
         pack(scores, packed, iv - reach - 1, iv + reach + 1, iu - reach - 1, iu + reach + 1)
-    return drawn
+    return added

@@ -2,7 +2,7 @@
 
 One kernel serves both: HIDE is Harmony Search with a pass of differential evolution over the memory after every
 `improvisations_per_pass` improvisations; Harmony Search makes no such pass. Letters and equation numbers are
-those of the report [P] and of Mirkhani et al. [M]; see hsloc/matching for what they mean.
+those of the course report [P] and of Mirkhani et al. [M]; see hsloc/matching for what they mean.
 
 Poses are (x, y, theta), x and y in cells of the packed field (hsloc/kernels/fitness.py).
 """
@@ -49,12 +49,40 @@ class SearchParameters(NamedTuple):
     budget: int
     """NI or NFE of one restart."""
     count_improvisations: bool
-    """Whether the budget counts improvisations (the report's program) or fitness evaluations ([M])."""
+    """Whether the budget counts improvisations (the course report's program) or fitness evaluations ([M])."""
     restarts: int
     agreement: int
     """End when this many restarts have found the same best pose."""
     polish_iterations: int
     """Gauss-Newton steps after each restart; 0: none."""
+
+
+class Box(NamedTuple):
+    """The window that is searched: `centre`, the prediction, and `half_widths`, each (3,) in cells, cells and radians.
+
+    For `search_boxes` the centres of many windows, shape (m, 3).
+    """
+
+    centre: F64
+    half_widths: F64
+
+
+class Memory(NamedTuple):
+    """The harmony memory: `poses` (HMS, 3) and the sums of scores of their points `sums` (HMS,)."""
+
+    poses: F64
+    sums: F64
+
+
+class Found(NamedTuple):
+    """What `search` writes: the best `pose` (3,), its `information` (3, 3), see `polish`, and a history.
+
+    `history` takes the best sum of the first restart after each evaluation as far as it is long; empty for none.
+    """
+
+    pose: F64
+    information: F64
+    history: F64
 
 
 @njit(cache=True, nogil=True)
@@ -65,7 +93,7 @@ def _improvise(memory: F64, low: F64, high: F64, par: float, bw: F64, hmcr: floa
             value = memory[int(rng.random() * len(memory)), j]
             if rng.random() < par:
                 value += (2.0 * rng.random() - 1.0) * bw[j]
-            # The papers say nothing of a pitch that leaves the box: it stays at its border.
+            # The papers do not treat a pitch that leaves the box: it stays at its border.
             new[j] = min(max(value, low[j]), high[j])
         else:
             new[j] = low[j] + rng.random() * (high[j] - low[j])
@@ -75,25 +103,26 @@ def _improvise(memory: F64, low: F64, high: F64, par: float, bw: F64, hmcr: floa
 def improve_memory(
     packed: F32,
     points: F32,
-    centre: F64,
-    half_widths: F64,
+    box: Box,
     parameters: SearchParameters,
     rng: Generator,
-    memory: F64,
-    sums: F64,
+    harmonies: Memory,
     history: F64,
     with_centre: bool,
 ) -> tuple[int, int]:
-    """One run of HS or HIDE: fills `memory` (HMS, 3) and the sums of scores `sums` (HMS,).
+    """One run of HS or HIDE: fills the memory `harmonies`.
 
-    Row 0 is the centre, the prediction, if `with_centre`; else it is drawn like the others.
+    Row 0 is the centre, the prediction, if `with_centre`; else it is uniform in the box like the others.
     Returns the index of the best row and the number of fitness evaluations, the initial ones included. `history`
     takes the best sum after each evaluation as far as it is long; pass an empty array for none.
     """
     p = parameters
     hms = p.memory_size
-    low = centre - half_widths
-    high = centre + half_widths
+    memory = harmonies.poses
+    sums = harmonies.sums
+    centre = box.centre
+    low = centre - box.half_widths
+    high = centre + box.half_widths
     # 1. Harmony memory: row 0 is the prediction, the others are uniform in the box.
     evaluations = 0
     best = 0
@@ -174,30 +203,29 @@ def search(
     packed: F32,
     points: F32,
     few_points: F32,
-    centre: F64,
-    half_widths: F64,
+    box: Box,
     parameters: SearchParameters,
     rng: Generator,
-    pose: F64,
-    information: F64,
-    history: F64,
+    found: Found,
 ) -> tuple[float, int, int, int]:
-    """Search the box with restarts; writes the best `pose` (3,) and its `information` (3, 3), see `polish`.
+    """Search the box with restarts; writes the best pose and its information into `found`.
 
     The restarts improvise on `few_points` (an even choice of the points, for speed), each ends with a polish on
     these; the pose that is fittest on all `points` wins and is polished on all of them. With `agreement` = k the
     search ends as soon as k restarts have arrived at the same best pose: an easy match stops early, a hard one goes
-    on. Only the first restart is told the prediction, or agreement would be no evidence.
+    on. Only the first restart starts with the prediction, or agreement would be no evidence.
     Returns the fitness on all points, the evaluations, the restarts made and why it stopped.
     """
     p = parameters
     n = max(len(points), 1)
     memory = np.empty((p.memory_size, 3), dtype=np.float64)
-    sums = np.empty(p.memory_size, dtype=np.float64)
+    harmonies = Memory(memory, np.empty(p.memory_size, dtype=np.float64))
+    pose = found.pose
+    information = found.information
     candidate = np.empty(3, dtype=np.float64)
     none = np.empty(0, dtype=np.float64)
-    low = centre - half_widths
-    high = centre + half_widths
+    low = box.centre - box.half_widths
+    high = box.centre + box.half_widths
     best_total = -1.0
     agreed = 0
     evaluations = 0
@@ -205,16 +233,7 @@ def search(
     stopped = STOPPED_BUDGET
     while restart < p.restarts:
         row, spent = improve_memory(
-            packed,
-            few_points,
-            centre,
-            half_widths,
-            p,
-            rng,
-            memory,
-            sums,
-            history if restart == 0 else none,
-            restart == 0,
+            packed, few_points, box, p, rng, harmonies, found.history if restart == 0 else none, restart == 0
         )
         restart += 1
         evaluations += spent
@@ -254,24 +273,22 @@ def search_boxes(
     packed: F32,
     points: F32,
     few_points: F32,
-    centres: F64,
-    half_widths: F64,
+    boxes: Box,
     parameters: SearchParameters,
     rng: Generator,
     poses: F64,
     fitness: F64,
 ) -> int:
-    """`search` in many boxes of one size, around each of `centres` (m, 3); fills `poses` (m, 3) and `fitness` (m,).
+    """`search` in many boxes of one size; fills `poses` (m, 3) and `fitness` (m,).
 
     Returns the evaluations. One call for all: a call from Python costs as much as a short search.
     """
     information = np.zeros((3, 3), dtype=np.float64)
     none = np.empty(0, dtype=np.float64)
     total = 0
-    for k in range(len(centres)):
-        found, evaluations, _, _ = search(
-            packed, points, few_points, centres[k], half_widths, parameters, rng, poses[k], information, none
-        )
-        fitness[k] = found
+    for k in range(len(boxes.centre)):
+        box = Box(boxes.centre[k], boxes.half_widths)
+        found = Found(poses[k], information, none)
+        fitness[k], evaluations, _, _ = search(packed, points, few_points, box, parameters, rng, found)
         total += evaluations
     return total

@@ -1,1 +1,1 @@
-"""WHERE AM I, on a known map."""
+"""Localisation on a known map."""

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.errors import ConfigError
 from hsloc.localisation.motion import OdometryNoise, fuse, predict_covariance
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters, Verdict
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive, Ratio
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -32,52 +32,43 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LocaliserParameters:
-    """When a scan is matched, in which window, and what is believed. Names as in AMCL where the meaning is the same."""
+class LocaliserParameters(Parameters):
+    """When a scan is matched, in which window, and which match is accepted; where AMCL has it, by AMCL's name."""
 
-    update_min_d: float = 0.2
-    """A scan is matched after so many metres (m)."""
-    update_min_a: float = 0.2
-    """Or after so much turning (rad)."""
-    min_points: int = 10
-    """A scan with fewer hits is not matched ([P]: more than 5)."""
-    window_sigmas: float = 3.0
-    """Half-width of the window in standard deviations of the prediction."""
-    window_min: float = 0.15
-    """But at least so many metres (m)."""
-    window_min_angle: float = radians(5.0)
-    """And so much of an angle (rad)."""
-    min_fitness: float = 0.3
-    """A match below is refused, whatever was usual before."""
-    min_fitness_ratio: float = 0.7
-    """A match below this part of the usual fitness (of the matches before) is refused."""
-    recovery_fitness_ratio: float = 0.9
-    """After a refusal a match in a wider window must reach this part of the usual fitness."""
-    max_consecutive_rejections: int = 5
-    """The pose is lost after so many refused matches in a row."""
+    update_min_d: NonNegative = 0.2
+    """Minimum translation between two matched scans [m]; a larger rotation alone is enough, too."""
+    update_min_a: NonNegative = 0.2
+    """Minimum rotation between two matched scans [rad]; a larger translation alone is enough, too."""
+    min_points: Count = 10
+    """Minimum number of hits of a scan that is matched; [P] asks for more than 5."""
+    window_sigmas: Positive = 3.0
+    """Half-width of the search window in standard deviations of the prediction."""
+    window_min: Positive = 0.15
+    """Minimum half-width of the search window in x and y [m]."""
+    window_min_angle: Angle = radians(5.0)
+    """Minimum half-width of the search window in heading [rad]."""
+    min_fitness: Ratio = 0.3
+    """Minimum fitness of an accepted match."""
+    min_fitness_ratio: Ratio = 0.7
+    """Minimum ratio of an accepted match's fitness to the usual fitness, the running mean of accepted matches."""
+    recovery_fitness_ratio: Ratio = 0.9
+    """Minimum ratio to the usual fitness of a match in the wide window that is searched after a refused match."""
+    wide_window: Positive = 0.5
+    """Half-width of the window that is searched after a refused match [m]; wheels may slip by as much."""
+    wide_window_angle: Angle = radians(20.0)
+    """Half-width in heading of the window that is searched after a refused match [rad]."""
+    max_consecutive_rejections: Count = 5
+    """Number of refused matches in a row after which the pose counts as lost and the whole map is searched."""
     fuse: bool = True
-    """Weigh match and prediction by their covariances (EKF); otherwise the match is the new pose ([P])."""
-    initial_sigma: float = 0.5
-    """Standard deviation of a given start in x and y (m)."""
-    initial_sigma_angle: float = radians(15.0)
-    """And in theta (rad)."""
+    """Whether match and prediction are weighted by their covariances (EKF); otherwise the match is taken, as in [P]."""
+    initial_sigma: Positive = 0.5
+    """Standard deviation of a given initial pose in x and y [m]."""
+    initial_sigma_angle: Positive = radians(15.0)
+    """Standard deviation of a given initial pose in heading [rad]."""
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
     relocaliser: RelocaliserParameters = field(default_factory=RelocaliserParameters)
 
-    def __post_init__(self) -> None:
-        for name in ("min_points", "max_consecutive_rejections"):
-            if not getattr(self, name) >= 1:
-                raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("update_min_d", "update_min_a", "min_fitness", "min_fitness_ratio", "recovery_fitness_ratio"):
-            if not getattr(self, name) >= 0.0:
-                raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be 0 or more")
-        for name in ("window_sigmas", "window_min", "window_min_angle", "initial_sigma", "initial_sigma_angle"):
-            if not getattr(self, name) > 0.0:
-                raise ConfigError(f"localiser: {name} is {getattr(self, name)}; it must be positive")
 
-
-_WIDER = (0.5, radians(20.0))
-"""Half-widths (m, rad) of the window tried after a refused match: what a wheel may slip."""
 _BETTER = 0.1
 """So much fitter must a match outside the window of the prediction be: ambiguous places look alike."""
 _FORGET = 0.05
@@ -178,9 +169,9 @@ class Localiser:
         if self._usual is not None and self._refusal(best):
             wide = Window(
                 predicted,
-                max(window.half_x, _WIDER[0]),
-                max(window.half_y, _WIDER[0]),
-                max(window.half_theta, _WIDER[1]),
+                max(window.half_x, p.wide_window),
+                max(window.half_y, p.wide_window),
+                max(window.half_theta, p.wide_window_angle),
             )
             match = self._matcher.match(points, self._field, wide, self._rng)
             evaluations += match.evaluations

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.errors import ConfigError
 from hsloc.model.pose2 import Pose2, wrap_angle
+from hsloc.parameters import NonNegative, Parameters
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OdometryNoise:
+class OdometryNoise(Parameters):
     """The odometry motion model of *Probabilistic Robotics* (Thrun, Burgard, Fox; 5.4), names as in AMCL.
 
     A motion is a turn, a straight line and a turn; their variances are `alpha1 rot^2 + alpha2 trans^2` (both turns)
@@ -26,19 +26,14 @@ class OdometryNoise:
     20 % of a turn. (With 20 % of the way the matches pull the pose from door to door in the corridors of Wean Hall.)
     """
 
-    alpha1: float = 0.04
-    """Noise of a turn from turning (rad^2 / rad^2)."""
-    alpha2: float = 0.02
-    """Noise of a turn from driving (rad^2 / m^2)."""
-    alpha3: float = 0.01
-    """Noise of driving from driving (m^2 / m^2)."""
-    alpha4: float = 0.01
-    """Noise of driving from turning (m^2 / rad^2)."""
-
-    def __post_init__(self) -> None:
-        for name in ("alpha1", "alpha2", "alpha3", "alpha4"):
-            if not getattr(self, name) >= 0.0:
-                raise ConfigError(f"odometry_noise: {name} is {getattr(self, name)}; it must be 0 or more")
+    alpha1: NonNegative = 0.04
+    """Variance of a rotation per squared rotation [rad^2 / rad^2]."""
+    alpha2: NonNegative = 0.02
+    """Variance of a rotation per squared translation [rad^2 / m^2]."""
+    alpha3: NonNegative = 0.01
+    """Variance of a translation per squared translation [m^2 / m^2]."""
+    alpha4: NonNegative = 0.01
+    """Variance of a translation per squared rotation [m^2 / rad^2]."""
 
     def covariance(self, motion: Pose2) -> F64:
         """Covariance (3, 3) of a motion, in the frame in which it began.

@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.errors import ConfigError
 from hsloc.localisation.motion import fuse, predict_covariance
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2, wrap_angle
+from hsloc.parameters import Count, NonNegative, Parameters, Positive, Ratio
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -39,49 +39,37 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RelocaliserParameters:
-    """How the whole map is searched, and when one answer is believed."""
+class RelocaliserParameters(Parameters):
+    """How the whole map is searched, and when a hypothesis is accepted."""
 
-    tile: float = 1.5
-    """Side of a tile of free space (m)."""
-    sectors: int = 4
-    """Headings are searched in so many parts."""
-    budget: int = 240
-    """Fitness evaluations in each tile and sector."""
-    search_points: int = 60
-    """Points of the scan used while searching tiles."""
-    hypotheses: int = 400
-    """At most so many are kept."""
-    step_min_d: float = 0.3
-    """A scan counts after so many metres (m)."""
-    step_min_a: float = 0.3
-    """Or after so much turning (rad)."""
-    seed_scans: int = 3
-    """The whole map is searched with so many scans: what one misses another finds."""
-    min_points: int = 20
-    """A scan with fewer hits says too little."""
-    min_scans: int = 4
-    """Scans before anything is believed."""
-    min_fitness: float = 0.35
-    """Mean fitness of the winner at least."""
-    lead: float = 1.0
-    """The winner's fitness, summed over the scans, must be ahead of every other's by this."""
-    drop: float = 2.5
-    """A hypothesis that is behind by this sum is dropped."""
-    restart_below: float = 0.3
-    """If the best falls below this mean fitness, the search begins anew."""
-
-    def __post_init__(self) -> None:
-        for name in ("sectors", "budget", "search_points", "hypotheses", "seed_scans", "min_points", "min_scans"):
-            _check(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        _check(self.tile > 0.0, "tile", self.tile, "positive")
-        for name in ("step_min_d", "step_min_a", "min_fitness", "lead", "drop", "restart_below"):
-            _check(getattr(self, name) >= 0.0, name, getattr(self, name), "0 or more")
-
-
-def _check(ok: bool, name: str, value: object, rule: str) -> None:
-    if not ok:
-        raise ConfigError(f"relocaliser: {name} is {value}; it must be {rule}")
+    tile: Positive = 1.5
+    """Side of a tile of free space that is searched at once [m]."""
+    sectors: Count = 4
+    """Number of parts in which the headings are searched."""
+    budget: Count = 240
+    """Number of fitness evaluations in each tile and sector."""
+    search_points: Count = 60
+    """Maximum number of points of a scan that are used while tiles are searched."""
+    hypotheses: Count = 400
+    """Maximum number of hypotheses."""
+    step_min_d: NonNegative = 0.3
+    """Minimum translation between two scans that update the hypotheses [m]; a larger rotation is enough, too."""
+    step_min_a: NonNegative = 0.3
+    """Minimum rotation between two scans that update the hypotheses [rad]; a larger translation is enough, too."""
+    seed_scans: Count = 3
+    """Number of scans with which the whole map is searched."""
+    min_points: Count = 20
+    """Minimum number of hits of a scan that updates the hypotheses."""
+    min_scans: Count = 4
+    """Minimum number of scans before a hypothesis is accepted."""
+    min_fitness: Ratio = 0.35
+    """Minimum mean fitness of an accepted hypothesis."""
+    min_margin: NonNegative = 1.0
+    """Minimum difference between the summed fitness of an accepted hypothesis and that of any other."""
+    drop: NonNegative = 2.5
+    """Difference to the best summed fitness at which a hypothesis is dropped."""
+    restart_below: Ratio = 0.3
+    """Mean fitness of the best hypothesis below which the search starts again."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,7 +223,7 @@ class Relocaliser:
         p = self._parameters
         best = self._hypotheses[0]
         lead = best.total - self._hypotheses[1].total if len(self._hypotheses) > 1 else p.drop
-        sure = fresh and best.scans >= p.min_scans and best.mean >= p.min_fitness and lead >= p.lead
+        sure = fresh and best.scans >= p.min_scans and best.mean >= p.min_fitness and lead >= p.min_margin
         reason = f"{len(self._hypotheses)} hypotheses, best {best.mean:.2f}, lead {lead:.2f}, {best.scans} scans"
         covariance = best.covariance if sure else None
         fitness = best.fitness if fresh else None

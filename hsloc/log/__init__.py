@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from hsloc.log.convert import Conversion, convert_log
     from hsloc.log.messages.decode import LinkMessage
     from hsloc.log.reader import Log, is_log, open_log
-    from hsloc.log.session.topic_selection import TF, TF_NAMES, TF_STATIC
+    from hsloc.log.session.topic_selection import TF, TF_NAMES
+    from hsloc.log.session.transform_topics import is_static_topic
     from hsloc.log.summary import LaserSummary, LogSummary, Losses, ReadOptions
     from hsloc.log.transforms import FrameTree, Transform3
     from hsloc.log.writer import LogWriter
@@ -28,7 +29,6 @@ __all__ = [
     "MAX_SPEED",
     "TF",
     "TF_NAMES",
-    "TF_STATIC",
     "CheckReport",
     "Conversion",
     "Finding",
@@ -44,6 +44,7 @@ __all__ = [
     "check_log",
     "convert_log",
     "is_log",
+    "is_static_topic",
     "open_log",
 ]
 
@@ -54,7 +55,8 @@ _MODULES = {
     "convert": ("Conversion", "convert_log"),
     "messages.decode": ("LinkMessage",),
     "reader": ("Log", "is_log", "open_log"),
-    "session.topic_selection": ("TF", "TF_NAMES", "TF_STATIC"),
+    "session.topic_selection": ("TF", "TF_NAMES"),
+    "session.transform_topics": ("is_static_topic",),
     "summary": ("LaserSummary", "LogSummary", "Losses", "ReadOptions"),
     "transforms": ("FrameTree", "Transform3"),
     "writer": ("LogWriter",),

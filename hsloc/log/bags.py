@@ -1,4 +1,4 @@
-"""ROS 1 bags, and ROS 2 bags in SQLite, by way of rosbags."""
+"""ROS 1 bags, by way of rosbags."""
 
 from __future__ import annotations
 
@@ -30,17 +30,18 @@ _RUN = 1024
 
 
 class BagContainer:
-    """A `.bag`, a `.db3`, or a folder with `metadata.yaml` and compressed SQLite files.
+    """A ROS 1 bag, whatever its name. `shown` is the name for messages to people, where the file is a copy of another.
 
     The decoders get the definitions that the bag carries, as with MCAP; rosbags is asked for raw messages alone.
     Raises LogFormatError, whatever rosbags, its databases and its decompressors raise.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.is_ros1 = path.suffix == ".bag"
-        self.format = "ROS 1 bag" if self.is_ros1 else "ROS 2 bag (SQLite)"
-        self.profile = "ros1" if self.is_ros1 else "ros2"
+    format = "ROS 1 bag"
+    profile = "ros1"
+
+    def __init__(self, path: Path, shown: Path | None = None) -> None:
+        self.path = shown or path
+        self._file = path
         self.channels: dict[int, Channel] = {}
         self.statistics: dict[int, TopicStatistics] = {}
         self.metadata: dict[str, dict[str, str]] = {}
@@ -76,13 +77,9 @@ class BagContainer:
         return losses
 
     def _reader(self) -> _Reader:
-        if self.is_ros1:
-            from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag1 import Reader
 
-            return cast("_Reader", Reader1(self.path))
-        from rosbags.rosbag2 import Reader as Reader2
-
-        return cast("_Reader", Reader2(self.path))
+        return cast("_Reader", Reader(self._file))
 
     @staticmethod
     def _key(connection: Any) -> tuple[int, int]:
@@ -93,11 +90,10 @@ class BagContainer:
         return {self._key(connection): number for number, connection in enumerate(reader.connections)}
 
     def _channel(self, number: int, connection: Any) -> Channel:
-        encoding = "ros1" if self.is_ros1 else "cdr"
         definition = connection.msgdef
-        form = {0: "", 1: "ros1msg" if self.is_ros1 else "ros2msg", 2: "ros2idl"}[definition.format.value]
+        form = {0: "", 1: "ros1msg", 2: "ros2idl"}[definition.format.value]
         topic, typename = str(connection.topic), long_name(str(connection.msgtype))
-        return Channel(number, topic, typename, encoding, form, definition.data.encode())
+        return Channel(number, topic, typename, "ros1", form, definition.data.encode())
 
     def _count(self, reader: _Reader) -> None:
         numbers = self._numbers(reader)
@@ -126,10 +122,9 @@ class BagContainer:
             raise
         except Exception as error:
             reason = (str(error).splitlines() or [""])[0][:160]
-            remedy = "rosbag reindex" if self.is_ros1 else f"sqlite3 {self.path.name} .recover"
             line = (
                 f"{self.path}: cannot be read as a {self.format} ({reason}); if its recorder was stopped hard, "
-                f"`{remedy}` saves what is whole"
+                "`rosbag reindex` saves what is whole"
             )
             if losses is None:
                 raise LogFormatError(line) from error

@@ -7,8 +7,11 @@ from itertools import islice
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping, Sequence
     from pathlib import Path
+
+    import numpy as np
+    from numpy.typing import NDArray
 
     from hsloc.log.summary import Losses, TopicStatistics
     from hsloc.warnings import RunWarning
@@ -37,6 +40,21 @@ def in_runs(messages: Iterator[RawMessage], size: int) -> Iterator[list[RawMessa
     """Messages in lists of `size`; the last may be shorter."""
     while run := list(islice(messages, size)):
         yield run
+
+
+_HOUR_NS = 3600 * 1_000_000_000
+
+
+def plausible_times(ordered: Sequence[int] | NDArray[np.uint64]) -> tuple[int, int]:
+    """Between which log times (ns) sorted log times of one part of a log are believed.
+
+    The inner nine tenths say how long the part is. A few times that are farther outside than twice that length and an
+    hour are wrong: a counter that overflowed, or a clock that was not set.
+    """
+    cut = len(ordered) // 20
+    low, high = int(ordered[cut]), int(ordered[-1 - cut])
+    margin = 2 * (high - low) + _HOUR_NS
+    return low - margin, min(high + margin, (1 << 63) - 1)
 
 
 class Container(Protocol):

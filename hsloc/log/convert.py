@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hsloc.model import Event
 
 PROGRESS_EVERY = 500
+"""Messages between two reports of progress."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +76,12 @@ class _Conversion:
         self._log_time: int | None = None
         self._frames: dict[str, str] = {}
         source = {"order": "log", "format": summary.format, "source": summary.paths[0].name, "sha256": log.sha256()}
+        # A mounting that had to be assumed is written, for viewers, but stays an assumption.
+        frames = [laser.frame or "laser" for laser in summary.lasers if laser.extrinsics == "identity"]
+        if not summary.lasers and summary.extrinsics == "identity":
+            frames = [summary.laser_frame or "laser"]
+        if frames:
+            source["assumed_mountings"] = ",".join(frames)
         writer.metadata(CONVERTED, source)
 
     def write(self, event: Event) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.errors import LogError, LogFormatError
-from hsloc.log.mcap.records import MAGIC
+from hsloc.log.files import NO_LOG, LogFile, Scratch
+from hsloc.log.files import expand as _expand
 from hsloc.log.summary import NANOSECONDS, LogSummary, Losses, ReadOptions
 
 if TYPE_CHECKING:
@@ -18,13 +18,6 @@ if TYPE_CHECKING:
     from hsloc.log.source import Observation, Source
     from hsloc.model import Event, OccupancyGrid, Pose2
 
-_BAG_MAGIC = b"#ROSBAG V"
-_SQLITE_MAGIC = b"SQLite format 3\0"
-_GZIP_MAGIC = b"\x1f\x8b"
-_COMPRESSED = re.compile(rb"^\s*compression_mode:\s*[\"']?(file|message)", re.IGNORECASE | re.MULTILINE)
-_METADATA_BYTES = 1 << 20
-_NO_LOG = "is not an MCAP, a ROS bag or a CARMEN log"
-
 
 class Log:
     """A recording, opened. Events are decoded while they are asked for; memory does not grow with the log.
@@ -33,8 +26,12 @@ class Log:
     under way and complete at its end.
     """
 
-    def __init__(self, source: Source, options: ReadOptions, files: Sequence[Path]) -> None:
+    def __init__(
+        self, source: Source, options: ReadOptions, files: Sequence[Path], scratch: Scratch | None = None
+    ) -> None:
+        """`scratch` holds what had to be unpacked; it goes with the log."""
         self._source = source
+        self._scratch = scratch
         self._options = options
         self._files = tuple(files)
         self.losses = source.losses_at_opening.copy()
@@ -109,97 +106,45 @@ def open_log(paths: Path | str | Sequence[Path | str], options: ReadOptions | No
     given = [Path(paths)] if isinstance(paths, (str, Path)) else [Path(path) for path in paths]
     if not given:
         raise LogError("no log was named")
-    files = [file for path in given for file in _expand(path)]
-    kinds = [_kind(path) for path in files]
+    scratch = Scratch()
+    files = [file for path in given for file in _expand(path, scratch)]
+    kinds = [file.kind for file in files]
+    originals = [*dict.fromkeys(file.shown for file in files)]
     if "text" in kinds:
         if len(files) > 1:
-            raise LogFormatError(f"{files[0]}: text logs are read one at a time; convert them first")
-        return Log(_text_source(files[0], options), options, files)
+            raise LogFormatError(f"{files[0].shown}: text logs are read one at a time; convert them first")
+        return Log(_text_source(files[0], options), options, originals, scratch)
     from hsloc.log.session.message_source import RosSource
 
-    containers = [_container(path, kind) for path, kind in zip(files, kinds, strict=True)]
-    return Log(RosSource(containers, options), options, [part for file in files for part in _parts(file)])
+    return Log(RosSource([_container(file) for file in files], options), options, originals, scratch)
 
 
 def is_log(path: Path) -> bool:
     """Whether a file or folder is a log of a known format, by what it holds; raises LogError as `open_log`."""
     from hsloc.log.text.source import find_format
 
-    (first, *_) = _expand(path)
-    return _kind(first) != "text" or find_format(first) is not None
+    (first, *_) = _expand(path, Scratch())
+    return first.kind != "text" or find_format(first.path) is not None
 
 
-def _text_source(path: Path, options: ReadOptions) -> Source:
+def _text_source(file: LogFile, options: ReadOptions) -> Source:
     from hsloc.log.text.source import TextSource, find_format
 
-    line_format = find_format(path)
+    line_format = find_format(file.path)
     if line_format is None:
-        raise LogFormatError(f"{path}: {_NO_LOG}")
-    return TextSource(path, line_format, options)
+        raise LogFormatError(f"{file.shown}: {NO_LOG}")
+    return TextSource(file.path, line_format, options, file.shown)
 
 
-def _container(path: Path, kind: str) -> Container:
-    if kind == "mcap":
+def _container(file: LogFile) -> Container:
+    if file.kind == "mcap":
         from hsloc.log.mcap.container import McapContainer
 
-        return McapContainer(path)
+        return McapContainer(file.path, file.shown)
+    if file.kind == "db3":
+        from hsloc.log.db3 import Db3Container
+
+        return Db3Container(file.path, file.shown)
     from hsloc.log.bags import BagContainer
 
-    return BagContainer(path)
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Order of names in which run_2 comes before run_10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
-
-
-def _expand(path: Path) -> list[Path]:
-    """The files of a recording: the path itself, or the parts in a folder.
-
-    Only a compressed SQLite bag stays a folder. Of all others metadata.yaml tells nothing that the files do not, and
-    where it is wrong (a type's hash, say) rosbags would give no messages and no error.
-    """
-    try:
-        if not path.exists():
-            raise LogError(f"{path}: no such file or folder")
-        if path.name == "metadata.yaml":  # What a bag's folder is known by.
-            path = path.parent
-        if not path.is_dir():
-            return [path]
-        inside = sorted(path.iterdir(), key=_natural)
-        metadata = path / "metadata.yaml"
-        if metadata.is_file() and _COMPRESSED.search(metadata.read_bytes()[:_METADATA_BYTES]):
-            return [path]
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
-    for suffix in (".mcap", ".db3", ".bag"):
-        found = [part for part in inside if part.suffix == suffix and not part.name.startswith(".")]
-        if found:
-            return found
-    raise LogFormatError(f"{path}: is a folder without .mcap, .db3 or .bag files; name a log file")
-
-
-def _parts(path: Path) -> list[Path]:
-    return sorted((part for part in path.iterdir() if part.is_file()), key=_natural) if path.is_dir() else [path]
-
-
-def _kind(path: Path) -> str:
-    """`mcap`, `bag` or `text`, by the first bytes and not by the name."""
-    if path.is_dir():
-        return "bag"
-    try:
-        if not path.is_file():
-            raise LogFormatError(f"{path}: is not a regular file")
-        with path.open("rb") as stream:
-            head = stream.read(4096)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
-    if not head:
-        raise LogFormatError(f"{path}: is empty")
-    if head.startswith(MAGIC):
-        return "mcap"
-    if head.startswith((_BAG_MAGIC, _SQLITE_MAGIC)):
-        return "bag"
-    if head.startswith(_GZIP_MAGIC) or b"\0" not in head:
-        return "text"
-    raise LogFormatError(f"{path}: {_NO_LOG}")
+    return BagContainer(file.path, file.shown)

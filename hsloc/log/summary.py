@@ -7,7 +7,9 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from hsloc.errors import ConfigError
 from hsloc.model import IDENTITY, Pose2
+from hsloc.options import STAMPS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
     from hsloc.warnings import RunWarning
 
 NANOSECONDS = 1_000_000_000
+LONGEST_OFFSET_S = 1e6
+"""Clocks that are farther apart (s) are of different epochs: the log's time is the way out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +32,11 @@ class ReadOptions:
     in seconds from the first event of the chosen topics. Without `require_scan` or
     `require_odometry` a missing or ambiguous topic is a warning, not an error. `deskew` asks for scans whose points
     are moved to where the robot was when each beam was measured.
+
+    `scan_fix` overrides fields of scans (see `hsloc.log.session.scan_geometry.ScanFixes`). `slice` are two heights
+    above the base [m], `LOW,HIGH`: point clouds are read as scans, the nearest point of each direction between them.
+    `time_offset` (`TOPIC=SECONDS`, several with commas) is added to the stamps of a topic. With `stamps` "log" the
+    log's times are used in place of the header stamps.
     """
 
     scan_topic: str | None = None
@@ -40,6 +49,45 @@ class ReadOptions:
     require_scan: bool = True
     require_odometry: bool = True
     deskew: bool = False
+    scan_fix: str | None = None
+    slice: str | None = None
+    time_offset: str | None = None
+    stamps: str = "header"
+
+    def __post_init__(self) -> None:
+        if self.stamps not in STAMPS:
+            raise ConfigError(f"stamps is {self.stamps!r}; it must be one of {', '.join(STAMPS)}")
+        self.heights()
+        self.offsets_s()
+
+    def heights(self) -> tuple[float, float] | None:
+        """The two heights of `slice` [m]. Raises ConfigError."""
+        if self.slice is None:
+            return None
+        try:
+            low, high = (float(part) for part in self.slice.split(","))
+        except ValueError:
+            low = high = 0.0
+        if not low < high:
+            raise ConfigError(f"--slice {self.slice}: must be LOW,HIGH, two heights above the base in metres")
+        return low, high
+
+    def offsets_s(self) -> dict[str, float]:
+        """Seconds to add by topic, its name without the leading slash. Raises ConfigError."""
+        found = {}
+        for item in (self.time_offset or "").split(",") if self.time_offset else ():
+            topic, _, seconds = item.rpartition("=")
+            try:
+                value = float(seconds)
+            except ValueError:
+                value = float("nan")
+            if not topic or not abs(value) <= LONGEST_OFFSET_S:
+                raise ConfigError(
+                    f"--time-offset {item}: must be TOPIC=SECONDS, with at most {LONGEST_OFFSET_S:g} seconds; "
+                    "--stamps log is the way out for clocks that are farther apart"
+                )
+            found[topic.strip().lstrip("/")] = value
+        return found
 
 
 @dataclass(slots=True)
@@ -122,7 +170,8 @@ class LogSummary:
     T_base_laser comes from: `/tf_static`, `/tf`, `option`, `file format` or `identity`. `order` is `stamp` (events
     in the order of their header stamps) or `log` (in the order of the log, where that is the true one). Where several
     lasers are merged, `scan_topic` names them all, `lasers` tells of each, and the other fields tell of the first.
-    `parts` are the files that hold scans or odometry that are read, in the order of time.
+    `parts` are the files that hold scans or odometry that are read, in the order of time. `segments` is how many
+    messages make a turn of the lidar, where these were joined.
     """
 
     paths: tuple[Path, ...]
@@ -145,6 +194,7 @@ class LogSummary:
     lasers: tuple[LaserSummary, ...] = ()
     parts: tuple[PartSummary, ...] = ()
     order: str = "stamp"
+    segments: int = 1
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     warnings: tuple[RunWarning, ...] = ()
 
@@ -174,7 +224,9 @@ class Losses:
     stamp_jumps: Counter[str] = field(default_factory=Counter)
     stamps_zero: Counter[str] = field(default_factory=Counter)
     stamps_zero_dropped: Counter[str] = field(default_factory=Counter)
+    orientations_unset: Counter[str] = field(default_factory=Counter)
     late_messages: int = 0
+    log_times_repaired: int = 0
     reasons: list[str] = field(default_factory=list)
 
     @property
@@ -199,12 +251,14 @@ class Losses:
         self.bytes_lost += other.bytes_lost
         self.truncated_files += other.truncated_files
         self.late_messages += other.late_messages
+        self.log_times_repaired += other.log_times_repaired
         self.unknown_compression.update(other.unknown_compression)
         self.undecodable_messages.update(other.undecodable_messages)
         self.invalid_messages.update(other.invalid_messages)
         self.stamps_backwards.update(other.stamps_backwards)
         self.stamp_jumps.update(other.stamp_jumps)
         self.stamps_zero.update(other.stamps_zero)
+        self.orientations_unset.update(other.orientations_unset)
         self.stamps_zero_dropped.update(other.stamps_zero_dropped)
         for reason in other.reasons:
             self.note(reason)
@@ -222,12 +276,14 @@ class Losses:
             ("stamps jump out of line and were not trusted for the order", self.stamp_jumps),
             ("messages without stamp; the log's time was taken", self.stamps_zero),
             ("messages without stamp were dropped", self.stamps_zero_dropped),
+            ("orientations are quaternions of zeros; the heading 0 was taken", self.orientations_unset),
         )
         plain = (
             (self.damaged_chunks, "damaged chunks were skipped"),
             (self.bytes_lost, "bytes were lost"),
             (self.truncated_files, "files end too early (cut off, or never closed)"),
             (self.late_messages, "messages came later than the window of reordering"),
+            (self.log_times_repaired, "messages with an impossible log time; the time of the one before was taken"),
         )
         found = [f"{count} {text}" for count, text in plain if count]
         found += [f"{n} chunks in unknown compression {name!r}" for name, n in self.unknown_compression.items()]

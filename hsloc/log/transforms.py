@@ -78,9 +78,10 @@ class Transform3:
         return Transform3((-tx, -ty, -tz), turned.rotation)
 
 
-MOVED_METRES = 1e-3
-MOVED_RADIANS = 2e-3
-"""From here on a mounting counts as moving: the noise of a joint's encoder stays below."""
+_MAX_STATEMENTS = 8
+"""Different values of one static transform that are kept for the warning."""
+MOVED_METRES, MOVED_RADIANS = 1e-3, 2e-3
+"""Change (m, rad) above which a mounting counts as moving. Internal: above the noise of a joint's encoder."""
 
 
 class FrameTree:
@@ -89,6 +90,7 @@ class FrameTree:
     def __init__(self) -> None:
         self._links: dict[str, tuple[str, Transform3]] = {}
         self._moving: set[str] = set()
+        self._statements: dict[str, list[tuple[str, Transform3]]] = {}
 
     def add(self, parent: str, child: str, transform: Transform3) -> None:
         """State (or restate) a frame's pose in its parent's."""
@@ -97,6 +99,30 @@ class FrameTree:
         if known is not None and (known[0] != parent or _moved(known[1], transform)):
             self._moving.add(child)
         self._links[child] = (parent, transform)
+        statements = self._statements.setdefault(child, [])
+        if len(statements) < _MAX_STATEMENTS and not any(
+            above == parent and not _moved(stated, transform) for above, stated in statements
+        ):
+            statements.append((parent, transform))
+
+    def statements(self, frame: str) -> list[tuple[str, Transform3]]:
+        """Different (parent, transform) that were stated of a frame, in their order; of many the first few."""
+        return self._statements.get(frame, [])
+
+    def resolve(self, frame: str, beside: str = "") -> str | None:
+        """The frame under the name that the tree has for it: itself, or with or without a prefix.
+
+        Of several with one last name the one with the prefix of `beside` is meant; None where it cannot be told.
+        """
+        if frame in self:
+            return frame
+        name = frame.rpartition("/")[2]
+        found = [known for known in self.frames() if known.rpartition("/")[2] == name]
+        alike = [known for known in found if known.rpartition("/")[0] == beside.rpartition("/")[0]]
+        for candidates in (alike, found):
+            if len(candidates) == 1:
+                return candidates[0]
+        return None
 
     def __contains__(self, frame: str) -> bool:
         return frame in self._links or any(parent == frame for parent, _ in self._links.values())
@@ -129,12 +155,27 @@ class FrameTree:
         return up_target[: up_target.index(common)], up_source[: up_source.index(common)]
 
     def lookup(self, target: str, source: str) -> Transform3 | None:
-        """T_target_source, or None where the frames are not connected."""
+        """T_target_source, or None where the frames are not connected.
+
+        Where a frame was given several parents, the last one that connects the two counts.
+        """
         path = self.path(target, source)
         if path is None:
-            return None
+            return self._lookup_by_earlier_parents(target, source)
         from_target, from_source = (self._climb(frames) for frames in path)
         return from_target.inverse() @ from_source
+
+    def _lookup_by_earlier_parents(self, target: str, source: str) -> Transform3 | None:
+        for child, statements in self._statements.items():
+            last = self._links[child]
+            for statement in reversed(statements[:-1]):
+                self._links[child] = statement
+                path = self.path(target, source)
+                found = None if path is None else [self._climb(frames) for frames in path]
+                self._links[child] = last
+                if found is not None:
+                    return found[0].inverse() @ found[1]
+        return None
 
     def _climb(self, frames: list[str]) -> Transform3:
         """The pose of the first frame in the parent of the last."""

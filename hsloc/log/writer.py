@@ -137,9 +137,10 @@ class LogWriter:
         links: Sequence[tuple[str, str, Pose2 | Transform3]],
         static: bool = False,
         log_time_ns: int | None = None,
+        topic: str | None = None,
     ) -> None:
-        """tf2_msgs/TFMessage on /tf, or /tf_static; links are (parent, child, T_parent_child)."""
-        topic = "/tf_static" if static else "/tf"
+        """tf2_msgs/TFMessage on /tf, or /tf_static, or a topic by name; links are (parent, child, T_parent_child)."""
+        topic = topic or ("/tf_static" if static else "/tf")
         self._add(topic, definitions.TF_MESSAGE, stamp_ns, encode.transforms(stamp_ns, links), log_time_ns)
 
     def occupancy_grid(

@@ -25,8 +25,9 @@ if TYPE_CHECKING:
 
 FREE_PIXEL, UNKNOWN_PIXEL, OCCUPIED_PIXEL = 254, 205, 0
 UNKNOWN_PROBABILITY = (255 - UNKNOWN_PIXEL) / 255
-"""0.19608: what pixel 205 says. A free_thresh at or above makes the unknown free."""
+"""Occupancy of pixel 205, 0.19608. A free_thresh at or above makes the unknown free."""
 MAX_CELLS = 100_000_000
+"""Maximum number of cells of a map that is read. Internal: guards the memory against a damaged file."""
 IMAGES = (".pgm", ".png", ".bmp", ".pnm")
 
 
@@ -41,7 +42,7 @@ class LoadedMap:
 class _Pixels(NamedTuple):
     """Brightness 0 .. 1 and opacity, first row on top.
 
-    For grey images they stand for each level of grey once, and `level` says which level each pixel has.
+    For grey images there is one for each level of grey, and `level` is the level of each pixel.
     """
 
     shade: Plane
@@ -90,7 +91,9 @@ def _read_image(path: Path, metadata: MapMetadata) -> _Pixels:
                 opened.load()
                 return _planes(opened, metadata.mode)
     except FileNotFoundError as error:
-        raise MapError(f"{path}: its image {image} does not exist") from error
+        raise MapError(
+            f"{path}: its image {image} does not exist; put {image.name} beside the YAML, or name it under `image:`"
+        ) from error
     except MapError:
         raise
     except Exception as error:  # Decoders of images raise whatever they please on damage.

@@ -18,7 +18,7 @@ MAX_YAML_BYTES = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class MapMetadata:
-    """What map.yaml says. `origin` is the pose of the lower-left corner of the image in the map frame."""
+    """The content of map.yaml. `origin` is the pose of the lower-left corner of the image in the map frame."""
 
     image: Path
     resolution: float
@@ -45,7 +45,7 @@ def read_metadata(path: Path) -> MapMetadata:
     if mode not in MODES:
         raise MapError(f"{path}: mode must be one of {', '.join(MODES)}, not {mode!r}")
     return MapMetadata(
-        image=path.parent / image,
+        image=_image(path, image),
         resolution=resolution,
         origin=_origin(path, values),
         negate=_negate(path, values),
@@ -53,6 +53,14 @@ def read_metadata(path: Path) -> MapMetadata:
         free_thresh=free,
         mode=str(mode),
     )
+
+
+def _image(path: Path, image: str) -> Path:
+    """The image that a YAML names; where that path is of another machine, the file of that name beside the YAML."""
+    named = path.parent / image
+    name = image.replace("\\", "/").rstrip("/").rpartition("/")[2]
+    beside = path.parent / name
+    return beside if name and not named.exists() and beside.exists() else named
 
 
 def _load_yaml(path: Path) -> dict[str, Any]:
@@ -117,6 +125,6 @@ def metadata_text(image: str, resolution: float, origin: Pose2) -> str:
 
 
 def _decimal(value: float) -> str:
-    """Three decimals where they say it all, else every digit: what is read back is what was written."""
+    """Three decimals where they are exact, else every digit: what is read back is what was written."""
     short = f"{value:.3f}"
     return short if float(short) == value else repr(float(value))

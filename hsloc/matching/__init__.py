@@ -1,4 +1,4 @@
-"""POSE SEARCH: find the pose in a box that fits a scan best."""
+"""Scan matching: the pose in a window that fits a scan best."""
 
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.hide import Hide

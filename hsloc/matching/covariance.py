@@ -15,9 +15,10 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
 
 _CELL_SIGMA = 1.0 / np.sqrt(12.0)
-"""Standard deviation of a wall's place within its cell, in cells."""
+"""Standard deviation of a wall's place within its cell, in cells. Internal: that of a uniform distribution."""
 _CORRELATED = 30.0
-"""Neighbouring beams see the same wall with the same error of the map: this many count as one."""
+"""Number of beams that count as one. Internal: neighbouring beams see one wall with one error of the map, and
+a covariance is only compared with that of the odometry, whose parameters are what is to be set."""
 
 
 def match_covariance(information: F64, n_points: int, fitness: float, field: LikelihoodField, window: Window) -> F64:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import ceil, log, radians
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 
 import numpy as np
 
-from hsloc.errors import ConfigError
 from hsloc.kernels.fitness import normal_equations
-from hsloc.kernels.search import STOPPED_AGREEMENT, SearchParameters, search, search_boxes
+from hsloc.kernels.search import STOPPED_AGREEMENT, Box, Found, SearchParameters, search, search_boxes
 from hsloc.matching.covariance import match_covariance
 from hsloc.matching.match import Match, StopReason
+from hsloc.parameters import LARGEST, Count, CountOrNone, Parameters, Positive, Range, Ratio
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -25,18 +25,21 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
 
 _GOLDEN = 0.6180339887498949
+"""The golden ratio less 1, which spreads a sequence most evenly."""
 _ALL = 10**9
+"""Number of points that no scan has."""
 _ONE_BASIN = 0.2 * 0.2 * radians(8.0)
-"""A window of +-0.2 m and 8 degrees, m^2 rad: about what one optimum of an indoor scan draws in."""
+"""Size of a window of +-0.2 m and 8 degrees (m^2 rad), about the basin of one optimum of an indoor scan. Internal:
+`agreement` is what is to be set, this scales it with the window."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HarmonySearch:
+class HarmonySearch(Parameters):
     """Harmony Search; the algorithm is its parameters.
 
     A memory of `memory_size` poses (HMS), the prediction first, the others uniform in the box. Each improvisation takes
     every coordinate from a random row with probability `consideration_rate` (HMCR), and then moves it by up to the
-    bandwidth with probability PAR; otherwise it draws it anew. It replaces the worst row if it is fitter.
+    bandwidth with probability PAR; otherwise it is uniform in the box. It replaces the worst row if it is fitter.
     PAR rises linearly from `par_min` to `par_max`, the bandwidth falls exponentially ([IHS]).
 
     Readings of the papers (design choices, all of them can be set):
@@ -49,36 +52,39 @@ class HarmonySearch:
 
     Ours, and off in the presets of the papers: `restarts` of the whole search, ended early when `agreement` of them
     found the same best pose (one more for each time the window is four times as large as +-0.2 m, 8 degrees);
-    `search_points`, at most so many of the scan's points, evenly chosen, while searching; `polish_iterations`
+    `search_points`, the maximum number of the scan's points, evenly chosen, while searching; `polish_iterations`
     Gauss-Newton steps on the interpolated field at the end of each restart, and for the winner on all points.
     """
 
     PAPER_BUDGET: ClassVar[int] = 250
     """NI of the scan matching in [P] and [M]."""
 
-    memory_size: int = 30
-    consideration_rate: float = 0.88
-    par_min: float = 0.55
-    par_max: float = 0.98
-    bandwidth_max: float = 0.3
-    bandwidth_min: float = 0.003
+    memory_size: Annotated[int, Range(2, LARGEST)] = 30
+    """Number of poses in the harmony memory (HMS)."""
+    consideration_rate: Ratio = 0.88
+    """Probability that a coordinate is taken from the memory (HMCR); otherwise it is uniform in the window."""
+    par_min: Ratio = 0.55
+    """Probability at the beginning that a coordinate from the memory is moved (PAR)."""
+    par_max: Ratio = 0.98
+    """Probability at the end that a coordinate from the memory is moved (PAR)."""
+    bandwidth_max: Positive = 0.3
+    """Maximum move of a coordinate at the beginning, as a ratio to the window's half-width or in metres and radians."""
+    bandwidth_min: Positive = 0.003
+    """Maximum move of a coordinate at the end, as a ratio to the window's half-width or in metres and radians."""
     relative_bandwidth: bool = True
-    budget: int = 240
+    """Whether the bandwidths are ratios to the window's half-width; otherwise they are metres and radians alike."""
+    budget: Count = 240
+    """Number of fitness evaluations in each restart (NI, NFE)."""
     count_improvisations: bool = False
-    restarts: int = 24
-    agreement: int = 2
-    search_points: int = 80
-    polish_iterations: int = 15
-
-    def __post_init__(self) -> None:
-        check(self.memory_size >= 2, "memory_size", self.memory_size, "at least 2")
-        for name in ("consideration_rate", "par_min", "par_max"):
-            check(0.0 <= getattr(self, name) <= 1.0, name, getattr(self, name), "in [0, 1]")
-        check(self.bandwidth_max > 0.0, "bandwidth_max", self.bandwidth_max, "positive")
-        check(self.bandwidth_min > 0.0, "bandwidth_min", self.bandwidth_min, "positive")
-        for name in ("budget", "restarts", "agreement", "search_points"):
-            check(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        check(self.polish_iterations >= 0, "polish_iterations", self.polish_iterations, "0 or more")
+    """Whether the budget counts improvisations alone; otherwise it counts every fitness evaluation."""
+    restarts: Count = 24
+    """Maximum number of searches in a match."""
+    agreement: Count = 2
+    """Number of restarts with the same best pose that end a match; larger windows ask for more."""
+    search_points: Count = 80
+    """Maximum number of points of a scan that the search uses; the result is refined on all of them."""
+    polish_iterations: CountOrNone = 15
+    """Maximum number of Gauss-Newton steps at the end of each restart, and on all points at the end of a match."""
 
     @classmethod
     def paper(cls) -> Self:
@@ -115,7 +121,7 @@ class HarmonySearch:
         *,
         keep_history: bool = False,
     ) -> Match:
-        """See `Matcher`. With `keep_history` the Match tells the best fitness after each evaluation."""
+        """See `Matcher`. With `keep_history` the Match has the best fitness after each evaluation."""
         return run_search(self, self._parameters(field, window), points, field, window, rng, keep_history)
 
     def match_boxes(
@@ -131,8 +137,7 @@ class HarmonySearch:
             field.packed,
             scaled,
             scaled[: self.search_points],
-            cells,
-            half_widths_in(field, windows[0]) * (1.0 / field.resolution, 1.0 / field.resolution, 1.0),
+            Box(cells, half_widths_in(field, windows[0]) * (1.0 / field.resolution, 1.0 / field.resolution, 1.0)),
             self._parameters(field, windows[0]),
             rng,
             poses,
@@ -168,12 +173,6 @@ class HarmonySearch:
         )
 
 
-def check(ok: bool, name: str, value: object, rule: str) -> None:
-    """Raise ConfigError for a parameter outside its range."""
-    if not ok:
-        raise ConfigError(f"matcher: {name} is {value}; it must be {rule}")
-
-
 def half_widths_in(field: LikelihoodField, window: Window) -> F64:
     """Half-widths of the window along the axes of the field, which may be turned in the map."""
     half = window.half_widths()
@@ -195,7 +194,7 @@ def run_search(
     rng: Generator,
     keep_history: bool,
 ) -> Match:
-    """Scale to cells, search, and dress the answer."""
+    """Scale to cells, search, and convert the result to metres."""
     half = half_widths_in(field, window)
     if len(points) == 0:
         return Match(window.centre, 0.0, np.diag(half**2 / 3.0), 0, StopReason.NO_POINTS)
@@ -208,13 +207,10 @@ def run_search(
         field.packed,
         scaled,
         few,
-        field.to_cells(window.centre),
-        half * (1.0 / field.resolution, 1.0 / field.resolution, 1.0),
+        Box(field.to_cells(window.centre), half * (1.0 / field.resolution, 1.0 / field.resolution, 1.0)),
         parameters,
         rng,
-        pose,
-        information,
-        history,
+        Found(pose, information, history),
     )
     if parameters.polish_iterations == 0:
         information = information_at(field, scaled, pose)

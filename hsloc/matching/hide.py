@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from hsloc.matching.harmony_search import HarmonySearch, check
+from hsloc.matching.harmony_search import HarmonySearch
+from hsloc.parameters import Count, NonNegative
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,14 +21,12 @@ class Hide(HarmonySearch):
     PAPER_BUDGET: ClassVar[int] = 220
     """NFE of the scan matching in [P] and [M]."""
 
-    improvisations_per_pass: int = 14
-    attraction: float = 0.7
-    differential_weight: float = 0.44
-
-    def __post_init__(self) -> None:
-        # Two-argument super: dataclass(slots=True) makes a new class, which the short form does not know.
-        super(Hide, self).__post_init__()
-        check(self.improvisations_per_pass >= 1, "improvisations_per_pass", self.improvisations_per_pass, "at least 1")
+    improvisations_per_pass: Count = 14
+    """Number of improvisations between two passes of differential evolution (HRT)."""
+    attraction: NonNegative = 0.7
+    """Factor of a row's move towards the best row of the memory (lambda of [DE])."""
+    differential_weight: NonNegative = 0.44
+    """Factor of the difference of two random rows that is added to a row (F of [DE])."""
 
     def _differential_evolution(self) -> tuple[int, float, float]:
         return self.improvisations_per_pass, self.attraction, self.differential_weight

@@ -1,4 +1,4 @@
-"""Iterative closest point, point to point: the baseline of the report ([P] II)."""
+"""Iterative closest point, point to point: the baseline of the course report ([P] II)."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.matching.covariance import match_covariance
-from hsloc.matching.harmony_search import check, half_widths_in, information_at
+from hsloc.matching.harmony_search import half_widths_in, information_at
 from hsloc.matching.match import Match, StopReason
 from hsloc.model.pose2 import Pose2
+from hsloc.parameters import Count, NonNegative, Parameters, Positive
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -27,21 +28,18 @@ _trees: weakref.WeakKeyDictionary[LikelihoodField, cKDTree] = weakref.WeakKeyDic
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Icp:
+class Icp(Parameters):
     """Pair each point with the nearest wall, solve for the rigid motion in closed form (Arun et al. 1987), repeat.
 
-    Pairs farther apart than `max_distance` metres are left out. It ends when a step is below `tolerance` (metres and
-    radians) or after `iterations`. It starts at the window's centre and knows no window otherwise.
+    It starts at the window's centre and knows no window otherwise.
     """
 
-    iterations: int = 50
-    max_distance: float = 1.0
-    tolerance: float = 1e-4
-
-    def __post_init__(self) -> None:
-        check(self.iterations >= 1, "iterations", self.iterations, "at least 1")
-        check(self.max_distance > 0.0, "max_distance", self.max_distance, "positive")
-        check(self.tolerance >= 0.0, "tolerance", self.tolerance, "0 or more")
+    iterations: Count = 50
+    """Maximum number of iterations."""
+    max_distance: Positive = 1.0
+    """Maximum distance of a point from the wall that it is paired with [m]."""
+    tolerance: NonNegative = 1e-4
+    """Step below which the iteration has converged, in metres and radians alike."""
 
     def match(self, points: F64, field: LikelihoodField, window: Window, rng: Generator) -> Match:
         """See `Matcher`; `rng` is not used."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
 
 _MOST_CELLS = 2e8
-"""A field needs about 30 bytes a cell while it is made: 6 GB."""
+"""Maximum number of cells of a field. Internal: 30 bytes a cell while it is made, 6 GB."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
@@ -131,7 +131,7 @@ class LikelihoodField:
         return float(fitness_many(self.packed, self.scale(points), self.to_cells(pose)[None, :])[0])
 
     def distances(self, points: F64, pose: Pose2 = IDENTITY) -> F64:
-        """Distance in metres from each point, seen from `pose`, to the nearest wall, as the field tells it.
+        """Distance in metres from each point, seen from `pose`, to the nearest wall, from the field's score.
 
         Infinite outside the field.
         """

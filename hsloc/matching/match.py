@@ -1,4 +1,4 @@
-"""What a matcher says, and what every matcher must do."""
+"""The result of a matcher, and the protocol of all matchers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class StopReason(StrEnum):
     """Why a matcher stopped."""
 
     BUDGET = "budget"
-    """All that it may spend was spent."""
+    """The budget was spent."""
     AGREEMENT = "agreement"
     """Enough restarts found the same best pose."""
     CONVERGED = "converged"

@@ -1,4 +1,4 @@
-"""NOUNS: frozen values without behaviour of their own beyond geometry."""
+"""Frozen value types: poses, trajectories, scans, odometry, estimates and occupancy grids."""
 
 from hsloc.model.estimate import Estimate, ScanDiagnostics, Status
 from hsloc.model.events import Event, Odometry, PairedScan, Scan, Truth

@@ -1,4 +1,4 @@
-"""What an estimator says after an event, and the columns of all it said."""
+"""An estimate after an event, and the columns of all estimates of a run."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class Estimate:
     """The pose of the base in the map at a stamp, and how it came about.
 
     `covariance` is 3 x 3 over (x, y, theta) in the map frame (m^2, m rad, rad^2). `fitness` is in (0, 1] where
-    a scan was matched, else None. `evaluations` counts the fitness evaluations spent. `reason` says in words
-    why a scan was skipped or refused. `revision` corrects what was said before, where the estimator now knows better:
+    a scan was matched, else None. `evaluations` counts the fitness evaluations spent. `reason` is a text on
+    why a scan was skipped or refused. `revision` corrects earlier estimates:
     pairs (k, T_map_odom), each valid from the k-th odometry message (from 0) until the next pair's.
     """
 
@@ -61,7 +61,7 @@ class ScanDiagnostics:
 
     `status` holds values of `Status`; `fitness` is NaN where nothing was matched; `sigma` (n, 3) are the standard
     deviations of x, y (m) and theta (rad), NaN where unknown; `evaluations` counts fitness evaluations;
-    `reason` is empty where there is nothing to say.
+    `reason` is empty where there is no reason to state.
     """
 
     stamps_ns: NDArray[np.int64]

@@ -1,4 +1,4 @@
-"""What a log tells, decoded at the door: odometry, scans and, where there is one, the truth."""
+"""Events of a log, decoded when it is read: odometry, scans and, where there is one, the truth."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ class Odometry:
     """Dead reckoning: the base's pose in the odometry frame.
 
     `covariance` is the 3 x 3 covariance of (x, y, theta) that the log states (m^2, rad^2), or None where it
-    states none (all zero means unknown, not perfect).
+    states none (all zero means unknown, not perfect). `has_heading` is False where the log states no orientation
+    (a quaternion of zeros); the heading is then 0.
     """
 
     stamp_ns: int
     T_odom_base: Pose2
     covariance: NDArray[np.float64] | None = None
+    has_heading: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +89,7 @@ class Scan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairedScan:
-    """A scan, and where odometry says the base was at its stamp.
+    """A scan, and the pose of the base at its stamp by odometry.
 
     Of several lasers, scans of about the same time are matched together: `companions` are those that this one carries,
     and a scan that another one will carry `is_held`: nothing is to be matched yet.
@@ -111,7 +113,7 @@ class PairedScan:
 
 
 HELD = "matched together with the next laser's scan"
-"""What an estimator says of a scan that is held."""
+"""Reason of the estimate of a scan that is held."""
 
 
 Event = Odometry | Scan | Truth

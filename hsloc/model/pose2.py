@@ -31,7 +31,7 @@ def wrap_angles(angles: Array) -> Array:
 class Pose2:
     """A frame's pose in another: x and y in metres, theta in radians, counter-clockwise.
 
-    Poses compose with `@`, and the frames stand in the names: `T_map_base @ T_base_laser` is
+    Poses compose with `@`, and names contain the frames: `T_map_base @ T_base_laser` is
     `T_map_laser`; `T_map_laser @ points_laser` are the points, shape (n, 2), seen from the map.
     """
 

@@ -1,1 +1,1 @@
-"""From log events to what an estimator takes: merged scans, deskewing, continuous odometry."""
+"""Preprocessing of events: merged scans, deskewing, continuous odometry."""

@@ -1,7 +1,7 @@
 """Deskewing: a lidar that turns while the robot drives measures each beam from another place.
 
-Beam i was measured at `stamp + i * time_increment`; odometry says how far the base had moved by then. The scan waits
-until odometry has told of its last beam.
+Beam i was measured at `stamp + i * time_increment`; odometry gives the pose of the base at that time. The scan waits
+for the odometry of its last beam.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     Paired = Odometry | PairedScan | Truth
 
 _RECENT = 512
-"""Odometry messages remembered: a fifth of a second at 2.5 kHz."""
+"""Odometry messages that are kept. Internal: a fifth of a second at 2.5 kHz, longer than a sweep."""
 _WAITING = 16
-"""Scans that may wait for odometry; then what has been told must do."""
+"""Maximum number of scans that wait for odometry; then the odometry until now is used. Internal: bounds the memory."""
 _LONGEST_NS = 2_000_000_000
-"""A turn that takes longer is an error of the log."""
+"""Maximum duration of a sweep. Internal: no lidar turns more slowly, a longer one is an error of the log."""
 
 
 def deskewed(events: Iterable[Paired]) -> Iterator[Paired]:
@@ -46,7 +46,7 @@ def deskewed(events: Iterable[Paired]) -> Iterator[Paired]:
             yield event
             if isinstance(event, Odometry):
                 recent.append(event)
-        while waiting and (len(waiting) > _WAITING or (recent and _is_told(waiting[0].scan, recent[-1]))):
+        while waiting and (len(waiting) > _WAITING or (recent and _is_covered(waiting[0].scan, recent[-1]))):
             yield _moved(waiting.popleft(), recent)
     while waiting:
         yield _moved(waiting.popleft(), recent)
@@ -58,7 +58,7 @@ def _sweep_ns(scan: Scan) -> int:
     return round(sweep) if abs(sweep) <= _LONGEST_NS else 0
 
 
-def _is_told(scan: Scan, latest: Odometry) -> bool:
+def _is_covered(scan: Scan, latest: Odometry) -> bool:
     sweep = _sweep_ns(scan)
     return sweep <= 0 or latest.stamp_ns >= scan.stamp_ns + sweep
 
@@ -69,8 +69,8 @@ def _moved(paired: PairedScan, recent: Iterable[Odometry]) -> PairedScan:
     if sweep == 0 or len(scan.ranges) == 0:
         return paired
     first, last = scan.stamp_ns + min(sweep, 0) - _LONGEST_NS, scan.stamp_ns + max(sweep, 0) + _LONGEST_NS
-    told = [(o.stamp_ns, o.T_odom_base) for o in recent if first <= o.stamp_ns <= last]
-    track = Trajectory.from_pairs([*told, (scan.stamp_ns, paired.T_odom_base)])
+    poses_then = [(o.stamp_ns, o.T_odom_base) for o in recent if first <= o.stamp_ns <= last]
+    track = Trajectory.from_pairs([*poses_then, (scan.stamp_ns, paired.T_odom_base)])
     beams = np.arange(len(scan.ranges), dtype=np.float64)
     stamps = scan.stamp_ns + np.round(beams * (scan.time_increment * 1e9)).astype(np.int64)
     poses = track.interpolated(stamps)

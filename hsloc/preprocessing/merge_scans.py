@@ -1,8 +1,9 @@
 """Several lasers: scans taken at about the same time are matched as one cloud.
 
-Matched one by one, lasers that measure together would never all be heard: the first scan after each step of the robot
-passes the motion gate, and that is always the same laser's. A laser that looks to one side knows less, too, than all
-together. So a scan is held until every laser has told of about the same moment; the last of them carries the others.
+Matched one by one, lasers that measure together would not all be used: the first scan after each step of the robot
+passes the motion gate, and that is always the same laser's. One laser's view also determines less than all of them
+together. So a scan is held until every laser has a scan of about the same time; the last of them has the others as
+companions.
 """
 
 from __future__ import annotations
@@ -20,29 +21,31 @@ if TYPE_CHECKING:
     Paired = Odometry | PairedScan | Truth
 
 _JITTER = 0.1
-"""Scans of n lasers are one cloud within (n - 1) / n of the slowest one's period and this part of it: where all turn
-equally fast, (n - 1) / n of it always hold a scan of each, and stamps jitter."""
+"""Tolerance for jitter of stamps as a ratio to the period.
+
+Scans of n lasers are merged within (n - 1) / n of the slowest laser's period plus this: where all turn equally fast,
+(n - 1) / n of it always contain a scan of each. Internal: it follows from how drivers stamp."""
 _USUAL_NS, _LONGEST_NS = 100_000_000, 400_000_000
-"""A laser's period before it is known, and at most."""
+"""A laser's period before it is known, and its maximum. Internal: 2D lidars turn at 5 to 40 Hz."""
 _SILENT_NS = 500_000_000
-"""A laser that has told nothing for so long is not waited for."""
+"""Silence after which a laser is not waited for. Internal: longer than the longest period."""
 
 
-def clouds(events: Iterable[Paired]) -> Iterator[Paired]:
-    """Events as `hsloc.replay.engine.pair` gives them, scans of several lasers (by `frame_id`) joined.
+def merged_scans(events: Iterable[Paired]) -> Iterator[Paired]:
+    """Events as `hsloc.replay.engine.pair` gives them, scans of several lasers (by `frame_id`) merged.
 
     All events pass in their order. Each scan is either held (`is_held`), or is to be matched together with its
-    `companions`, which were. Without odometry nothing tells how the robot moved between two scans: none is held then.
+    `companions`, which were. Without odometry the motion between two scans is unknown: none is held then.
     """
     lasers = _Lasers()
-    told = False
+    has_odometry = False
     for event in events:
-        told = told or isinstance(event, Odometry)
-        yield lasers.joined(event) if told and isinstance(event, PairedScan) else event
+        has_odometry = has_odometry or isinstance(event, Odometry)
+        yield lasers.merge(event) if has_odometry and isinstance(event, PairedScan) else event
 
 
 class _Lasers:
-    """When each laser was heard of and matched last, and which scans wait to be carried."""
+    """The last scan and the last match of each laser, and the scans that are held."""
 
     def __init__(self) -> None:
         self._last: dict[str, int] = {}
@@ -50,16 +53,16 @@ class _Lasers:
         self._held: dict[str, PairedScan] = {}
         self._matched: dict[str, int] = {}
 
-    def joined(self, paired: PairedScan) -> PairedScan:
+    def merge(self, paired: PairedScan) -> PairedScan:
         """The scan, held or with its companions."""
         frame, stamp = paired.scan.frame_id, paired.scan.stamp_ns
-        self._hear(frame, stamp)
+        self._record(frame, stamp)
         if len(self._last) == 1:
             self._matched[frame] = stamp
             return paired
         lasers, period = len(self._last), max(self._period.values())
-        reach = round(((lasers - 1) / lasers + _JITTER) * period)
-        self._held = {name: held for name, held in self._held.items() if abs(stamp - held.scan.stamp_ns) <= reach}
+        max_age = round(((lasers - 1) / lasers + _JITTER) * period)
+        self._held = {name: held for name, held in self._held.items() if abs(stamp - held.scan.stamp_ns) <= max_age}
         self._held.pop(frame, None)
         awake = {name for name, last in self._last.items() if abs(stamp - last) < _SILENT_NS}
         # A laser whose scans never come near the others' must not wait for ever.
@@ -72,7 +75,7 @@ class _Lasers:
         self._held[frame] = paired
         return replace(paired, is_held=True)
 
-    def _hear(self, frame: str, stamp_ns: int) -> None:
+    def _record(self, frame: str, stamp_ns: int) -> None:
         last = self._last.get(frame)
         if last is None:
             self._period[frame] = _USUAL_NS

@@ -1,1 +1,1 @@
-"""THE SHELL: events in, estimates out; one call from a log to a result."""
+"""Replay: from a log to a result in one call."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 from hsloc.model.events import Odometry, PairedScan, Scan, Truth
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.preprocessing.deskew import deskewed
-from hsloc.preprocessing.merge_scans import clouds
+from hsloc.preprocessing.merge_scans import merged_scans
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -39,7 +39,7 @@ def replay(
     events: Iterable[Event], estimator: Estimator, *, deskew: bool = False, first: Pose2 | None = None
 ) -> Iterator[tuple[Odometry | PairedScan | Truth, Estimate | None]]:
     """Each event with what the estimator says to it (None for the truth, which it does not see)."""
-    for event in clouds(pair(events, deskew=deskew, first=first)):
+    for event in merged_scans(pair(events, deskew=deskew, first=first)):
         yield event, None if isinstance(event, Truth) else estimator.update(event)
 
 

@@ -15,14 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import EvaluationError, HslocError
-from hsloc.evaluation import read_tum
-from hsloc.log import TF, TF_NAMES, TF_STATIC, FrameTree, ReadOptions, is_log, open_log
+from hsloc.log import TF, TF_NAMES, FrameTree, ReadOptions, is_log, is_static_topic, open_log
 from hsloc.model import Odometry, Pose2, Trajectory, Truth
+from hsloc.trajectory_io.reader import read_trajectory
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from hsloc.log import LinkMessage, Log
+    from hsloc.warnings import RunWarning
 
     Stamped = tuple[int, Pose2]
 
@@ -31,8 +32,10 @@ _OF_FILES = (".tum", ".csv", ".txt", ".gz", ".mcap", ".bag", ".db3")
 _ANY = ReadOptions(require_scan=False, require_odometry=False)
 
 
-def read_reference(text: str, logs: Sequence[Path] = ()) -> Trajectory:
+def read_reference(text: str, logs: Sequence[Path] = (), warnings: list[RunWarning] | None = None) -> Trajectory:
     """The poses that `text` names, see above; topics alone are those of `logs`.
+
+    What there is to know of how a file was read is added to `warnings`.
 
     Raises EvaluationError, or the LogError of a log that cannot be read.
     """
@@ -42,7 +45,10 @@ def read_reference(text: str, logs: Sequence[Path] = ()) -> Trajectory:
             raise EvaluationError(f"{text}: no such file; a topic needs a log: LOG:{text}")
         return _of_log(text, logs, topic)
     if topic is None and not is_log(path):
-        return read_tum(path)
+        loaded = read_trajectory(path)
+        if warnings is not None:
+            warnings += loaded.warnings
+        return loaded.trajectory
     return _of_log(text, (path,), topic)
 
 
@@ -127,7 +133,7 @@ def _links(log: Log) -> Iterator[tuple[int, LinkMessage, bool]]:
     for topic, log_time, message in log.observations():
         if isinstance(message, list):
             for link in message:
-                yield log_time, link, topic.lstrip("/") == TF_STATIC.lstrip("/")
+                yield log_time, link, is_static_topic(topic)
 
 
 def _candidates(log: Log) -> str:

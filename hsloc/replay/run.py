@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,7 @@ from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
 from hsloc.preprocessing.odometry_resets import ContinuousOdometry
+from hsloc.preprocessing.odometry_watch import OdometryWatch, UnusableOdometry
 from hsloc.replay.engine import replay
 from hsloc.replay.garbage import seldom_collected
 from hsloc.replay.initial_pose import find_start, first_odometry
@@ -28,6 +29,7 @@ from hsloc.replay.map_sources import load_grid, load_state, maps_beside, unread_
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory
 from hsloc.request import RunRequest
+from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.parameters import Resume
 from hsloc.slam.point_mapper import PointMapper
@@ -69,6 +71,8 @@ class Result:
     `trajectory` has one pose for each odometry message; where there are none, one for each scan. `localised` says
     which of them are believed. `grid` is the map that was used, or, in `mode` "slam", the one that was drawn; then
     `true_grid` is the one that the log carries, if any. `likelihood` is the field that was matched on, of a given map.
+    With `lidar_only` the log's odometry was not used: a localiser's `odometry` is then that of the scans. `deskewed`
+    says whether the beams were moved to where the robot was when each was measured.
     """
 
     spec: RunRequest
@@ -87,6 +91,8 @@ class Result:
     mapping: MappingResult | None = None
     true_grid: OccupancyGrid | None = None
     likelihood: LikelihoodField | None = None
+    lidar_only: bool = False
+    deskewed: bool = False
 
     @property
     def matcher_name(self) -> str | None:
@@ -124,14 +130,35 @@ def run(
 
 
 def _run(spec: RunRequest, progress: Callable[[Progress], None] | None) -> Result:
+    """The run; without the odometry of the log where that proves unusable on the way."""
+    try:
+        return _run_with(spec, progress, lidar_only=spec.no_odometry)
+    except UnusableOdometry as error:
+        warning = RunWarning(
+            WarningCode.ODOMETRY_UNUSABLE,
+            f"the odometry is ignored: {error}",
+            "repair its source, or name another with --odom-topic",
+        )
+        return _run_with(spec, progress, lidar_only=True, warnings=(warning,))
+
+
+def _run_with(
+    spec: RunRequest,
+    progress: Callable[[Progress], None] | None,
+    *,
+    lidar_only: bool,
+    warnings: tuple[RunWarning, ...] = (),
+) -> Result:
     begin = time.perf_counter()
     log = open_log(spec.logs, spec.reading())
-    reference = None if spec.reference is None else read_reference(spec.reference, spec.logs)
-    grid, warnings = find_map(spec, log)
+    of_reference: list[RunWarning] = []
+    reference = None if spec.reference is None else read_reference(spec.reference, spec.logs, of_reference)
+    grid, of_map = find_map(spec, log)
     state, of_state = load_state(spec)
-    warnings = (*warnings, *of_state)
-    draws = spec.mode == "slam" or spec.no_odometry or state is not None
-    localise = spec.mode == "localise" or (grid is not None and not draws)
+    warnings = (*warnings, *of_map, *of_state, *of_reference)
+    # Without odometry the map of a log is used where the user asks for it.
+    builds = spec.mode == "slam" or state is not None or (spec.no_odometry and spec.map_path is None)
+    localise = spec.mode == "localise" or (grid is not None and not builds)
     opened = time.perf_counter()
     if progress is not None:
         progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
@@ -144,21 +171,21 @@ def _run(spec: RunRequest, progress: Callable[[Progress], None] | None) -> Resul
         estimator: Estimator = _localiser(spec, require_map(grid), likelihood, start)
     else:
         require_matcher(spec)
-        likelihood, estimator = None, _mapper(spec, state)
-    first = None if spec.no_odometry else first_odometry(log.events())
+        likelihood, estimator = None, _mapper(spec, state, lidar_only)
+    first = None if lidar_only else first_odometry(log.events())
     prepared = time.perf_counter()
-    history, events = RunHistory(), ContinuousOdometry(_events(spec, log), log.summary.odom_topic)
+    history, events = RunHistory(), ContinuousOdometry(_events(spec, log, lidar_only, localise), log.summary.odom_topic)
+    # Turns that were joined of segments are known beam by beam; a whole turn is deskewed if the user asks for it.
+    deskew = spec.read.deskew or (log.summary.segments > 1 and not lidar_only)
     with seldom_collected():
-        for event, estimate in replay(
-            _reported(log, events, history, progress), estimator, deskew=spec.read.deskew, first=first
-        ):
+        for event, estimate in replay(_reported(log, events, history, progress), estimator, deskew=deskew, first=first):
             history.add(event, estimate)
     replayed = time.perf_counter()
     if history.scans == 0:
         where = "between --start and --end" if _cut(spec) else f"on {log.summary.scan_topic} that could be read"
         lost = "".join(f": {line}" for line in ["; ".join(log.losses.lines())] if line)
         raise LogError(f"{spec.logs[0]}: no scan {where}{lost}")
-    if first is None and not spec.no_odometry:
+    if first is None and not lidar_only:
         where = "between --start and --end" if _cut(spec) else f"on {log.summary.odom_topic} that could be read"
         raise LogError(f"{spec.logs[0]}: no odometry {where}")
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
@@ -187,6 +214,8 @@ def _run(spec: RunRequest, progress: Callable[[Progress], None] | None) -> Resul
         mapping=mapping,
         true_grid=true_grid,
         likelihood=likelihood,
+        lidar_only=lidar_only,
+        deskewed=deskew,
     )
 
 
@@ -199,11 +228,15 @@ def _mapped(history: RunHistory, mapping: MappingResult) -> tuple[Trajectory, ND
     return Trajectory(stamps, poses), np.ones(len(stamps), dtype=np.bool_)
 
 
-def _events(spec: RunRequest, log: Log) -> Iterator[Event]:
-    """The events of the log; without its odometry if that is not to be looked at."""
-    for event in log.events():
-        if not (spec.no_odometry and isinstance(event, Odometry)):
-            yield event
+def _events(spec: RunRequest, log: Log, lidar_only: bool, localise: bool) -> Iterable[Event]:
+    """The events of the log; its odometry watched, or left out, or replaced for a localiser by that of the scans."""
+    if not lidar_only:
+        # The point mapper cannot do without odometry, whatever that is like.
+        return log.events() if spec.config.mapper == "point" and not localise else OdometryWatch(log.events())
+    if localise:
+        rng = np.random.default_rng((spec.seed, 1))
+        return with_laser_odometry(log.events(), spec.config.graph_mapper.front_end, rng)
+    return (event for event in log.events() if not isinstance(event, Odometry))
 
 
 def _share(progress: Callable[[Progress], None] | None, total: float, scans: int) -> Callable[[float], None] | None:
@@ -248,9 +281,9 @@ def require_matcher(spec: RunRequest) -> None:
         )
 
 
-def _mapper(spec: RunRequest, state: MapState | None) -> Mapper | PointMapper:
+def _mapper(spec: RunRequest, state: MapState | None, lidar_only: bool) -> Mapper | PointMapper:
     if spec.config.mapper == "point":
-        if spec.no_odometry:
+        if lidar_only:
             raise ConfigError("the point mapper predicts with odometry; leave out --no-odom, or use --mapper graph")
         start = IDENTITY if spec.initial_pose is None else spec.initial_pose
         return PointMapper(spec.matcher, spec.config.point_mapper, np.random.default_rng(spec.seed), start)
@@ -260,7 +293,9 @@ def _mapper(spec: RunRequest, state: MapState | None) -> Mapper | PointMapper:
         field = LikelihoodField.from_grid(state.grid, config.likelihood_field.sigma, config.likelihood_field.margin)
         begin = None if spec.unknown_start else spec.initial_pose
         resume = Resume(state, field, spec.matcher, config.localiser.relocaliser, begin)
-    return Mapper(spec.mapping(), np.random.default_rng(spec.seed), resume)
+    return Mapper(
+        replace(spec.config.graph_mapper, use_odometry=not lidar_only), np.random.default_rng(spec.seed), resume
+    )
 
 
 def _localiser(spec: RunRequest, grid: OccupancyGrid, likelihood: LikelihoodField, start: Pose2 | None) -> Estimator:

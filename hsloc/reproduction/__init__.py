@@ -1,4 +1,4 @@
-"""THE PAPERS' EXPERIMENTS, run again: E1 to E4 of the report [P] and the windows of Mirkhani et al. [M] (M1).
+"""The experiments of the papers, run again: E1 to E4 of [P] and the windows of Mirkhani et al. [M] (M1).
 
 [P] "Harmonic Search Based Algorithms For Mobile Robot Localization" (course report).
 [M] Mirkhani, Forsati, Shahri, Moayedikia, "A novel efficient algorithm for mobile robot localization", Robotics and

@@ -32,7 +32,7 @@ COUNTS = ("improvisations", "evaluations")
 class Curve:
     """Best fitness after iteration 1 .. 1000, shape (seeds, 1000).
 
-    `counts` says what an iteration is: an improvisation, as in the program of [P], which counts none of HIDE's
+    `counts` is what an iteration means: an improvisation, as in the program of [P], which counts none of HIDE's
     differential evolution, or a fitness evaluation [M], the initial ones included.
     """
 

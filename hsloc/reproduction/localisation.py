@@ -1,4 +1,4 @@
-"""E3 (Fig. 5, 6 of [P]): localisation of the report's vehicle along the waypoints, with the product's localiser."""
+"""E3 (Fig. 5, 6 of [P]): localisation of the vehicle of [P] along the waypoints, with the product's localiser."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MATCHERS = ("hide", "harmony_search")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
-    """A drive to draw: the points of the map are in the material, all else is here."""
+    """A run for a figure: the points of the map are in the material, all else is here."""
 
     estimate: Trajectory
     truth: Trajectory
@@ -83,11 +83,11 @@ class Drive:
 def run_localisation(world: World, seeds: int, progress: Callable[[float], None]) -> tuple[Drive, ...]:
     """Drive with the seeds 0 to `seeds` - 1; each drive is localised by HIDE and HS with each preset.
 
-    Vehicle, sensor (every point within 50 m, seen through walls) and noise are the report's; so is the start, which
+    Vehicle, sensor (every point within 50 m, seen through walls) and noise are those of [P]; so is the start, which
     is known to within P0.
     """
     if world.points is None:
-        raise ValueError(f"the world {world.name} has no points: the report's sensor sees nothing")
+        raise ValueError(f"the world {world.name} has no points: the course report's sensor sees nothing")
     scenario = scenario_preset("paper")
     grid = world.occupancy_grid(scenario.map_resolution)
     configs = {

@@ -1,4 +1,4 @@
-"""E4 (Fig. 7, 8 of [P]): SLAM of the report's vehicle along the waypoints, with the product's point mapper."""
+"""E4 (Fig. 7, 8 of [P]): SLAM of the vehicle of [P] along the waypoints, with the product's point mapper."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
 
 RANGE = 60.0
-"""Every point within so many metres is seen, through walls [P]."""
+"""Distance (m) within which every point is seen, through walls, as in [P]."""
 NOISE = SteeringNoise(0.2, radians(1.0))
 """Of the wheels (m/s) and of the steering (rad) [P]."""
 NEAR = 3.0
@@ -83,7 +83,7 @@ class Mapped:
 def run_mapping(world: World, seeds: int, progress: Callable[[float], None]) -> tuple[Mapped, ...]:
     """Drive with the seeds 0 to `seeds` - 1; each drive is mapped with HIDE and HS, with each of `PRESETS`."""
     if world.points is None:
-        raise ValueError(f"the world {world.name} has no points: the report's sensor sees nothing")
+        raise ValueError(f"the world {world.name} has no points: the course report's sensor sees nothing")
     scenario = scenario_preset("paper")
     scenario = replace(scenario, sensor=replace(scenario.sensor, range_max=RANGE), odometry=NOISE)
     configs = {(name, matcher): replace(preset(name), matcher=matcher) for name in PRESETS for matcher in MATCHERS}

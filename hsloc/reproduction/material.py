@@ -1,4 +1,4 @@
-"""What the experiments are run on: the report's own data where it is at hand, and a set-up of ours in any case."""
+"""Data of the experiments: the course report's own where it is at hand, and a set-up of ours in any case."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ class Material:
 
 
 def report_material(folder: Path) -> Material:
-    """The report's data: scan1.csv, localisation_map.csv and waypoints.csv (x_m,y_m). Raises ConfigError."""
+    """The course report's data: scan1.csv, localisation_map.csv and waypoints.csv (x_m,y_m). Raises ConfigError."""
     for name in FILES:
         if not (folder / name).is_file():
             raise ConfigError(f"{folder / name}: no such file; --data must hold {', '.join(FILES)}")
     return Material(
         name="report",
-        title="the report's data",
+        title="the course report's data",
         scan=read_rows(folder / "scan1.csv", (2,)),
         world=load_world(folder / "localisation_map.csv", folder / "waypoints.csv"),
     )
@@ -56,7 +56,7 @@ def report_material(folder: Path) -> Material:
 def own_material() -> Material:
     """Our own: a scan of the built-in office from its start, free of noise, and the points of the built-in `paper`.
 
-    The scan is laid where the report's lies, so that pose, start and box of E1 stay the same.
+    The scan is laid where the course report's lies, so that pose, start and box of E1 stay the same.
     """
     office = built_in("office")
     rng = np.random.default_rng(0)

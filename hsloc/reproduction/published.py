@@ -1,4 +1,4 @@
-"""What the papers print."""
+"""Figures that the papers print."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ E2 = {"HS": "0.955 after 1000", "HIDE": "0.99 before 100"}
 """[P] Fig. 4."""
 
 E3_RMSE = {"HS": (0.572, 0.886, 0.0386), "HIDE": (0.0447, 0.0623, 0.0351)}
-"""[P] V: x, y in m, theta in rad, wrapped. The report prints 0.467 and 0.362 rad: it did not wrap the difference, and
-one pose on the other side of pi counts as 2 pi."""
+"""[P] V: x, y in m, theta in rad, wrapped. [P] prints 0.467 and 0.362 rad: it did not wrap the difference, and one
+pose on the other side of pi counts as 2 pi."""
 E3_SECONDS = {"HS": 141.0, "HIDE": 576.0}
 E3_PATH = (359.0, 119.8)
 """Metres and seconds."""

@@ -83,8 +83,8 @@ def reproduce(
 ) -> Reproduction:
     """Run `experiments` (of `EXPERIMENTS`) on each material; M1 has a world of its own and runs once.
 
-    `seeds` overrides `SEEDS` for all of them. `progress` is told the experiment's name and its share of 1. The same
-    arguments give the same result but for the times.
+    `seeds` overrides `SEEDS` for all of them. `progress` is called with the experiment's name and its share of 1. The
+    same arguments give the same result but for the times.
     """
     count = dict.fromkeys(SEEDS, seeds) if seeds is not None else SEEDS
 
@@ -94,16 +94,16 @@ def reproduce(
     results = []
     for material in materials:
 
-        def tell(name: str, material: Material = material) -> Callable[[float], None]:
+        def report(name: str, material: Material = material) -> Callable[[float], None]:
             return lambda share: progress(f"{name} ({material.name})", share)
 
         results.append(
             MaterialResults(
                 material,
-                run_scan_match(material.scan, run_for("E1"), tell("E1")) if "E1" in experiments else (),
-                run_convergence(material.scan, run_for("E2"), tell("E2")) if "E2" in experiments else None,
-                run_localisation(material.world, run_for("E3"), tell("E3")) if "E3" in experiments else (),
-                run_mapping(material.world, run_for("E4"), tell("E4")) if "E4" in experiments else (),
+                run_scan_match(material.scan, run_for("E1"), report("E1")) if "E1" in experiments else (),
+                run_convergence(material.scan, run_for("E2"), report("E2")) if "E2" in experiments else None,
+                run_localisation(material.world, run_for("E3"), report("E3")) if "E3" in experiments else (),
+                run_mapping(material.world, run_for("E4"), report("E4")) if "E4" in experiments else (),
             )
         )
     windows = run_windows(run_for("M1"), lambda share: progress("M1", share)) if "M1" in experiments else ()

@@ -69,7 +69,7 @@ class Windows:
 def run_windows(count: int, progress: Callable[[float], None]) -> tuple[Windows, ...]:
     """`count` scans, evenly chosen from a drive through the built-in office, each in a window of its own.
 
-    The window's centre is off the truth by a uniform draw from the window itself, the same for all matchers. The map
+    The window's centre is off the truth by a uniform sample of the window itself, the same for all matchers. The map
     is the office in cells of 5 cm, so that its walls are known to a few centimetres only.
     """
     grid = built_in("office").occupancy_grid(0.05)

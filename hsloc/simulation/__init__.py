@@ -1,1 +1,1 @@
-"""THE RECORDER'S ROBOT: worlds, robots, sensors, scenarios."""
+"""Simulation of recordings with known truth: worlds, robots, sensors, scenarios."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def office() -> World:
-    """Nine rooms on both sides of a corridor, 27 x 16 m, with doors, furniture and one way from room to room."""
+    """Nine rooms on both sides of a corridor, 27 x 16 m, with doors, furniture and one path from room to room."""
     rooms: list[Box] = [
         (0.523, 7.034, 27.317, 9.171),  # the corridor
         (0.523, 9.312, 5.631, 15.874),
@@ -173,7 +173,7 @@ def hall() -> World:
 
 
 def paper() -> World:
-    """The report's set-up on a site of our own: some 400 points on the outlines of what stands there."""
+    """The course report's set-up on a site of our own: some 400 points on the outlines of what stands there."""
     random = Random(25)
     outlines: list[list[Point]] = [
         [(-78, -62), (-20, -81), (44, -92), (98, -70), (139, -41)],
@@ -220,9 +220,9 @@ def figure_of_eight() -> World:
 
 
 def symmetric_corridor() -> World:
-    """A corridor of 60 m whose every 5 m look the same, with a room at each end that are twins too but for a box.
+    """A corridor of 60 m whose every 5 m look the same, with a room at each end that look alike, too, but for a box.
 
-    What is nearby never tells where along it one is: a mapper that believes in likeness closes wrong loops here.
+    Scans do not determine the position along it: a mapper that accepts every likeness closes wrong loops here.
     """
     rooms: list[Box] = [
         (0.0, 0.0, 60.117, 2.043),

@@ -1,4 +1,4 @@
-"""Draw floor plans: rooms are cut out of solid rock, furniture is put into them, and what is seen are the faces."""
+"""Floor plans: rooms are cut out of solid material, furniture is put into them, and their faces are the walls."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def polygon(corners: Iterable[Point]) -> Array:
 
 
 def box_at(x: float, y: float, length: float, width: float, degrees: float) -> Array:
-    """A rectangle about its centre (x, y), turned by `degrees`: a desk that nobody put straight."""
+    """A rectangle about its centre (x, y), turned by `degrees`: a desk that is not parallel to a wall."""
     c, s = cos(degrees * pi / 180), sin(degrees * pi / 180)
     half = [(a * length / 2, b * width / 2) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     return _rounded(polygon((x + c * a - s * b, y + s * a + c * b) for a, b in half))

@@ -1,4 +1,4 @@
-"""Odometry as a robot's wheels would tell it: the true motion, with noise, and with the covariance of that noise.
+"""Simulated odometry: the true motion, with noise, and with the covariance of that noise.
 
 Source of the motion model: Thrun, Burgard, Fox, *Probabilistic Robotics*, Table 5.6 (sample_motion_model_odometry).
 There the pose is sampled around the odometry; here the truth is known, and the odometry is sampled around it.
@@ -28,7 +28,7 @@ class MotionNoise(Protocol):
 
     @property
     def interval_s(self) -> float:
-        """Seconds between two draws; a draw holds in between. 0: a new draw for each step."""
+        """Seconds between two samples of the noise; a sample holds in between. 0: a new one for each step."""
         ...
 
     def deviations(self, rot1: float, trans: float, rot2: float, step_s: float) -> tuple[float, float, float]:
@@ -44,8 +44,8 @@ class OdometryNoise:
         trans: alpha3 trans^2 + alpha4 (rot1^2 + rot2^2)
         rot2:  alpha1 rot2^2 + alpha2 trans^2
 
-    The variance that this gives to a path depends on how finely it is cut: with a fresh draw for each message of a
-    50 Hz odometry, all but the wildest alphas average out. So a draw is held for `interval_s` seconds: over each
+    The variance that this gives to a path depends on how finely it is cut: with a new sample for each message of a
+    50 Hz odometry, all but the wildest alphas average out. So a sample is held for `interval_s` seconds: over each
     interval of straight or evenly bent motion the error is what the book gives for that motion as a whole,
     spread evenly over its messages. `interval_s = 0` is the book's model on every message.
     """
@@ -67,9 +67,9 @@ class OdometryNoise:
 
 @dataclass(frozen=True, slots=True)
 class SteeringNoise:
-    """The report's noise on speed (m/s) and steering angle (rad) [P V], drawn anew at every step.
+    """The noise of [P] V on speed (m/s) and steering angle (rad), sampled at every step.
 
-    A step of the report's vehicle is rot1 = g, trans = v dt, rot2 = 0, so it is noise on rot1 and trans.
+    A step of the course report's vehicle is rot1 = g, trans = v dt, rot2 = 0, so it is noise on rot1 and trans.
     """
 
     speed: float = 0.1
@@ -85,7 +85,7 @@ class SteeringNoise:
 class Slip:
     """Wheels that lose their grip from `at_s` on, for `duration_s` seconds.
 
-    The odometry counts `factor` times the way that was made, and a turn of `turn_rate` rad/s that was not. It
+    The odometry counts `factor` times the distance that was driven, and a turn of `turn_rate` rad/s that was not. It
     does not know: its covariance stays as it would be.
     """
 
@@ -112,10 +112,8 @@ class Odometer:
         self._hold = max(1, round(noise.interval_s / step_s))
         self._steps = 0
         self._draw: Array = np.zeros(3)
-        self._settled: Array = (
-            np.eye(3) * self.INITIAL_VARIANCE
-        )  # of what was drawn in earlier intervals, propagated to here
-        self._held: Array = np.zeros((3, 3))  # how the pose answers to the present draw
+        self._settled: Array = np.eye(3) * self.INITIAL_VARIANCE  # of earlier samples, propagated to here
+        self._held: Array = np.zeros((3, 3))  # derivative of the pose by the present sample
 
     @property
     def covariance(self) -> Array:
@@ -148,7 +146,7 @@ class Odometer:
         self.twist = (snap(trans / self._step_s), 0.0, snap((rot1 + rot2) / self._step_s))
 
     def _propagate(self, rot1: float, trans: float, deviations: Array) -> None:
-        """Covariance to first order: what is settled moves along, the present draw adds up coherently."""
+        """Covariance to first order: earlier samples are propagated, the present one adds up coherently."""
         c, s = cos(self.T_odom_base.theta + rot1), sin(self.T_odom_base.theta + rot1)
         by_pose = np.array(((1.0, 0.0, -trans * s), (0.0, 1.0, trans * c), (0.0, 0.0, 1.0)))
         by_motion = np.array(((-trans * s, c, 0.0), (trans * c, s, 0.0), (1.0, 0.0, 1.0)))
@@ -157,9 +155,9 @@ class Odometer:
 
 
 def decompose(before: Pose2, after: Pose2) -> tuple[float, float, float]:
-    """A motion as a turn, a straight way and a turn (rad, m, rad), as in *Probabilistic Robotics*, Table 5.6.
+    """A motion as a turn, a straight line and a turn (rad, m, rad), as in *Probabilistic Robotics*, Table 5.6.
 
-    On the spot the direction of the way means nothing, and all of the turn is the second.
+    On the spot the direction of the translation is undefined, and all of the turn is the second.
     """
     dx, dy = after.x - before.x, after.y - before.y
     trans = hypot(dx, dy)

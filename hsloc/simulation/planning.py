@@ -1,4 +1,4 @@
-"""A way through a world that came without one: round trips that keep clear of the walls."""
+"""Plan a path through a world without waypoints: round trips that keep clear of the walls."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 CLEARANCE = 0.35
-"""Metres that the way keeps from every wall."""
+"""Minimum distance (m) of the path from every wall."""
 GOALS = 8
 """Places that are visited."""
 COARSE = 0.15
@@ -27,7 +27,7 @@ COARSE = 0.15
 def plan_round_trip(free: NDArray[np.bool_], grid: OccupancyGrid) -> Array:
     """Waypoints (n, 2) in metres of a closed tour through the `free` cells of `grid`, shape (height, width).
 
-    The places to visit are spread out: each is the one farthest from those before. Between them the way is the
+    The places to visit are spread out: each is the one farthest from those before. Between them the path is the
     shortest, where metres near a wall count more. Raises ConfigError where no cell has enough room.
     """
     from scipy.ndimage import distance_transform_edt, label

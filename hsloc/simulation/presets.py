@@ -19,11 +19,11 @@ WIDE = Lidar(beams=271, field_of_view=radians(270.0), range_max=20.0, mounting=P
 SIDEWAYS = Lidar(range_max=18.0, mounting=Pose2(-0.047, 0.0, pi / 2.0))
 """One mounted turned to the left, as on a TurtleBot 4."""
 HANGING = Lidar(range_max=12.0, mounting=Pose2(0.141, -0.018, 0.3), upside_down=True)
-"""One that hangs head down, and not straight."""
+"""A laser that is mounted upside down, and not straight."""
 
 BRISK = DifferentialDrive(speed=1.2, turn_rate=1.5)
 DRIFTING = OdometryNoise(alpha1=2e-4, alpha2=2.5e-5, alpha3=1e-3, alpha4=2e-4)
-"""About 3 % of the way over a loop of 130 m, and more where heading errors happen early."""
+"""About 3 % of the path length over a loop of 130 m, and more where heading errors happen early."""
 
 OFFICE = Scenario("office", robot=BRISK, sensor=AHEAD)
 CORRIDOR_LOOP = Scenario("corridor-loop", robot=BRISK, sensor=WIDE, laps=1.05)

@@ -48,7 +48,7 @@ def rasterise(
     resolution: float,
     margin: float = 0.5,
 ) -> OccupancyGrid:
-    """The map that a perfect surveyor would draw of `segments`, shape (n, 4), in metres.
+    """The exact map of `segments`, shape (n, 4), in metres.
 
     Occupied: every cell through which a wall passes. Free: what can be reached from the points `inside`, shape
     (m, 2), without crossing an occupied cell. Unknown: all else. The grid's origin is a multiple of `resolution`.
@@ -76,7 +76,7 @@ def outline(solid: NDArray[np.bool_], xs: NDArray[np.float64], ys: NDArray[np.fl
     """The borders between solid and open cells as segments x0 y0 x1 y1, shape (n, 4), straight runs joined.
 
     `solid` has shape (len(ys) - 1, len(xs) - 1); `xs` and `ys` are the coordinates of the lines between cells.
-    Beyond the array nothing is drawn.
+    What lies beyond the array is left out.
     """
     segments: list[tuple[float, float, float, float]] = []
     # a border above row j lies between rows j and j + 1; a run goes on while the same side is solid

@@ -53,7 +53,7 @@ def record(
 ) -> Recording:
     """Drive `scenario` and write the log to `path`.
 
-    `world` overrides the scenario's, which is found by its name. `progress` is told the seconds and metres
+    `world` overrides the scenario's, which is found by its name. `progress` is called with the seconds and metres
     driven, once a simulated second. The file appears only when it is complete. Raises ConfigError for a world
     that is unknown, OutputError where the file exists (unless `overwrite`) or cannot be written.
     """

@@ -1,4 +1,4 @@
-"""Robots that follow a path of waypoints: a differential drive, and the report's steered vehicle.
+"""Robots that follow a path of waypoints: a differential drive, and the course report's steered vehicle.
 
 A robot is a frozen set of limits; `drive` yields where its base truly is, one pose a step, until the path ends.
 """
@@ -83,10 +83,10 @@ class DifferentialDrive:
 
 @dataclass(frozen=True, slots=True)
 class SteeredVehicle:
-    """The vehicle of the report [P V]: constant speed, heading `g + theta`, x += v dt cos(g + theta), theta += g.
+    """The vehicle of [P] V: constant speed, heading `g + theta`, x += v dt cos(g + theta), theta += g.
 
     Reading: [P] limits g "to a rate of 20 deg/s". Taken as g = the bearing of the next waypoint, clipped to
-    +-rate * dt each step, and a waypoint as reached within 1 m, the report's path of six waypoints takes 119.7 s
+    +-rate * dt each step, and a waypoint as reached within 1 m, the course report's path of six waypoints takes 119.7 s
     and 359.2 m; published are 119.8 s and 359 m. (Taken as a limit on the change of g from step to step, with
     theta += g, the heading swings about its aim and the figures are 119.3 s and 358.0 m.)
     """

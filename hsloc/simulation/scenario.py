@@ -105,7 +105,7 @@ class Scenario:
         return float(ceil(seconds * self.robot.speed / lap_length) + 1)
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values for JSON; `kind` tells the classes of robot, sensor and odometry."""
+        """As plain values for JSON; `kind` is the class of robot, sensor and odometry."""
         result = _plain(self)
         assert isinstance(result, dict)
         return result

@@ -1,4 +1,4 @@
-"""What the robot sees with: a 2D lidar, and the sensor of the report that looks through walls."""
+"""What the robot sees with: a 2D lidar, and the sensor of the course report that looks through walls."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Sensor(Protocol):
 
     @property
     def upside_down(self) -> bool:
-        """Whether it hangs head down: its beams then turn clockwise, seen from above."""
+        """Whether it is mounted upside down: its beams then turn clockwise, seen from above."""
         ...
 
     @property
@@ -133,7 +133,7 @@ class Lidar:
 
 @dataclass(frozen=True, slots=True)
 class PointSensor:
-    """The report's sensor [P V]: every point of the world within range, seen through walls, free of noise.
+    """The course report's sensor [P V]: every point of the world within range, seen through walls, free of noise.
 
     A scan message has evenly spaced beams, the points have not: each is put into the nearest of `beams`
     directions, all others are +inf. With 14,400 beams that moves a point 50 m away by at most 1.1 cm sideways,
@@ -184,5 +184,5 @@ def within_reach(segments: Array, origin: Array, reach: float) -> Array:
 
 
 def _single(value: float) -> float:
-    """As the message's 32 bits hold it: what the log says is then exactly what was done."""
+    """As the message's 32 bits hold it: the log is then exact."""
     return float(np.float32(value))

@@ -26,7 +26,7 @@ class World:
     """Walls and a way through them, in metres in the map frame.
 
     `segments` (n, 4) are x0 y0 x1 y1. `waypoints` (m, 2) are corners of the path that the robot follows; where
-    `closed`, it goes on from the last to the first, lap after lap. `points` (k, 2) are what the report's sensor
+    `closed`, it goes on from the last to the first, lap after lap. `points` (k, 2) are what the course report's sensor
     sees, whatever stands between, or None where the world has walls. `start_heading` is the robot's heading at the
     first waypoint in radians, or None: towards the second. `grid` is the map that the world was made from, if any,
     and `warnings` are those of its map.

@@ -1,4 +1,4 @@
-"""Worlds from files: a text of segments, the report's points and waypoints, or a nav2 map."""
+"""Worlds from files: a text of segments, the course report's points and waypoints, or a nav2 map."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""WHERE AM I, while drawing the map."""
+"""Simultaneous localisation and mapping."""

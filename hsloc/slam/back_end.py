@@ -17,7 +17,7 @@ from hsloc.slam.loop_closer import TORN, LoopCloser, loop_edges
 from hsloc.slam.map_extension import connect, unconnected
 from hsloc.slam.map_session import from_front_end
 from hsloc.slam.map_state import MapState, fingerprint
-from hsloc.slam.occupancy_mapper import draw_grid
+from hsloc.slam.occupancy_mapper import build_grid
 from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
 from hsloc.slam.result import MappingQuality, MappingResult
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 _UNSETTLED_M = 0.01
 """Another pass is made if 1 of 100 keyscans moved farther than this [m] in the last round: a fifth of a cell."""
 _RESIDUAL_SCANS = 400
-"""Scans whose residuals are measured."""
+"""Scans whose residuals are measured. Internal: a sample for the metrics, no pose depends on it."""
 
 
 def finish(
@@ -53,11 +53,11 @@ def finish(
     progress: Callable[[float], None] | None = None,
     resume: Resume | None = None,
 ) -> MappingResult:
-    """Close loops, refine, draw; with `resume`, in and with a saved map.
+    """Close loops, refine, build the map; with `resume`, in and with a saved map.
 
     Raises MapError if the log cannot be connected with the saved map.
     """
-    tell = progress if progress is not None else _silent
+    report = progress if progress is not None else _silent
     if not scans:
         if resume is not None:
             raise MapError(unconnected(resume.state))
@@ -65,13 +65,13 @@ def finish(
     gathered = from_front_end(scans, stamps_ns, local, track, parameters)
     if resume is not None:
         gathered = connect(resume, gathered, parameters, rng)
-    poses, loops, loop_edges = _close_loops(gathered, parameters, rng, lambda part: tell(0.5 * part))
+    poses, loops, loop_edges = _close_loops(gathered, parameters, rng, lambda part: report(0.5 * part))
     if resume is not None and not any(loop.accepted and _connects(loop, gathered) for loop in loops):
         raise MapError(unconnected(resume.state))
     edges = Edges.concatenate([gathered.steps, loop_edges])
-    refined, passes = _refine(poses, gathered.scans, edges, parameters, lambda part: tell(0.5 + 0.4 * part))
-    grid = draw_grid(refined.poses, gathered.scans, parameters.occupancy)
-    tell(1.0)
+    refined, passes = _refine(poses, gathered.scans, edges, parameters, lambda part: report(0.5 + 0.4 * part))
+    grid = build_grid(refined.poses, gathered.scans, parameters.occupancy)
+    report(1.0)
     of_log = refined.poses[gathered.first :]
     calibration = track.calibrated(of_log) if parameters.use_odometry else OdometryCalibration()
     odometry_poses, scan_poses = track.corrected(of_log, calibration)
@@ -154,7 +154,7 @@ def _close_loops(
 def _refine(
     poses: F64, scans: KeyScans, edges: Edges, parameters: GraphMapperParameters, progress: Callable[[float], None]
 ) -> tuple[Registration, int]:
-    """Passes over the whole log, each with partners chosen anew, until nothing moves."""
+    """Passes over the whole log, each with partners chosen again, until nothing moves."""
     most, p = parameters.passes, parameters.joint_registration
     # Later passes begin near their end: no wide gates.
     later = replace(p, gates=p.gates[-1:])
@@ -239,4 +239,4 @@ def _empty(track: EventLog) -> MappingResult:
 
 
 def _silent(_: float) -> None:
-    """Nobody is told."""
+    """Progress without a listener."""

@@ -1,6 +1,6 @@
-"""What the scans say of the odometry, once they know better: its scale, and how late it is.
+"""Calibration of the odometry by the final poses of the scans: its scale, and its delay.
 
-Wheels are a few per cent too large or too small, and a message may tell of a moment some hundredths of a second before
+Wheels are a few per cent too large or too small, and a message may hold the pose of some hundredths of a second before
 or after the scan that bears its stamp. Neither matters to the keyscans; between two of them, where poses come from the
 odometry alone, both do. Delays are counted in messages, not in seconds: stamps of real logs run backwards.
 """
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class OdometryCalibration:
-    """The odometry is the one told `delay` messages earlier, its turns times `turn`, its way times `way`."""
+    """The odometry of `delay` messages earlier, its rotations times `turn`, its translations times `way`."""
 
     delay: float = 0.0
     way: float = 1.0
@@ -33,23 +33,23 @@ class OdometryCalibration:
 
 
 _FEWEST = 100
-"""Steps without which nothing is said."""
+"""Minimum number of steps of an estimate. Internal: fewer do not average the noise out."""
 _DELAYS = np.arange(-10, 11) / 10.0
-"""Delays tried (messages)."""
+"""Delays that are tried, in periods of the odometry. Internal: the grid of a line search."""
 _OUTLIER = 0.1
-"""A step whose turn the scans see so differently (rad) slipped."""
+"""Difference (rad) between odometry and scans above which a step slipped. Internal: far above the noise of both."""
 _STRETCH = 20
-"""Steps in a row over which turns are compared."""
+"""Steps in a row over which rotations are compared. Internal: it averages the noise of the single steps."""
 _GAIN = 0.97
-"""A delay must bring the error of the turns below this part of what it is without one."""
+"""Ratio of the rotation error with a delay to that without one that is enough. Internal: a test of significance."""
 _WORST_SCALE = 0.15
-"""A scale farther from 1 is not believed."""
+"""Maximum difference of a scale from 1. Internal: wheels are not wrong by more, such an estimate is an artefact."""
 
 
 def calibrate(index: F64, odometry: F64, keys: I64, key_poses: F64) -> OdometryCalibration:
     """Find the calibration that brings the steps of the odometry nearest to those of the keyscans.
 
-    `odometry` (n, 3) are poses told at `index` (n,), counted in messages; rows `keys` (m,) are keyscans, in the end at
+    `odometry` (n, 3) are poses at `index` (n,), counted in messages; rows `keys` (m,) are keyscans, in the end at
     `key_poses` (m, 3).
     """
     seen = relative_poses(key_poses[:-1], key_poses[1:])
@@ -57,8 +57,8 @@ def calibrate(index: F64, odometry: F64, keys: I64, key_poses: F64) -> OdometryC
         return OdometryCalibration()
 
     def turns(delay: float) -> tuple[F64, float]:
-        told = delayed(index, odometry, delay)[keys]
-        steps = relative_poses(told[:-1], told[1:])
+        measured = delayed(index, odometry, delay)[keys]
+        steps = relative_poses(measured[:-1], measured[1:])
         # Each delay is judged with the scale that suits it best, or a wrong scale would drown it.
         error = np.abs(wrap_angles(_turn_scale(steps, seen) * steps[:, 2] - seen[:, 2]))
         return steps, float(np.minimum(error, _OUTLIER).mean())
@@ -73,41 +73,41 @@ def calibrate(index: F64, odometry: F64, keys: I64, key_poses: F64) -> OdometryC
     return OdometryCalibration(delay, way, _turn_scale(steps, seen), int(fair.sum()))
 
 
-def _turn_scale(told: F64, seen: F64) -> float:
+def _turn_scale(measured: F64, seen: F64) -> float:
     """The scale of turns, from stretches of `_STRETCH` steps.
 
     In single steps a delay, or the interpolation that undoes it, blurs the beginning and end of every turn, and least
     squares would take the blur for a scale.
     """
-    fair = np.abs(wrap_angles(told[:, 2] - seen[:, 2])) < _OUTLIER
-    sums = [np.concatenate(([0.0], np.cumsum(np.where(fair, steps[:, 2], 0.0)))) for steps in (told, seen)]
-    told_turns, seen_turns = (turned[_STRETCH:] - turned[:-_STRETCH] for turned in sums)
-    return _scale(told_turns, seen_turns)
+    fair = np.abs(wrap_angles(measured[:, 2] - seen[:, 2])) < _OUTLIER
+    sums = [np.concatenate(([0.0], np.cumsum(np.where(fair, steps[:, 2], 0.0)))) for steps in (measured, seen)]
+    measured_turns, seen_turns = (turned[_STRETCH:] - turned[:-_STRETCH] for turned in sums)
+    return _scale(measured_turns, seen_turns)
 
 
-def _scale(told: F64, seen: F64) -> float:
+def _scale(measured: F64, seen: F64) -> float:
     """Least squares, held towards 1 by as much as a hundred steps of average length would."""
-    power = float((told**2).sum())
-    prior = 100.0 * power / max(len(told), 1)
-    scale = (float((told * seen).sum()) + prior) / (power + prior) if power > 0.0 else 1.0
+    power = float((measured**2).sum())
+    prior = 100.0 * power / max(len(measured), 1)
+    scale = (float((measured * seen).sum()) + prior) / (power + prior) if power > 0.0 else 1.0
     return scale if abs(scale - 1.0) <= _WORST_SCALE else 1.0
 
 
 def apply(calibration: OdometryCalibration, index: F64, odometry: F64) -> F64:
     """The odometry as it should have been, shape (n, 3); the first pose stays."""
-    told = delayed(index, odometry, calibration.delay)
+    measured = delayed(index, odometry, calibration.delay)
     if calibration.way == 1.0 and calibration.turn == 1.0:
-        return told
-    steps = relative_poses(told[:-1], told[1:]) * (calibration.way, calibration.way, calibration.turn)
-    theta = told[0, 2] + np.concatenate(([0.0], np.cumsum(steps[:, 2])))
+        return measured
+    steps = relative_poses(measured[:-1], measured[1:]) * (calibration.way, calibration.way, calibration.turn)
+    theta = measured[0, 2] + np.concatenate(([0.0], np.cumsum(steps[:, 2])))
     c, s = np.cos(theta[:-1]), np.sin(theta[:-1])
-    x = told[0, 0] + np.concatenate(([0.0], np.cumsum(c * steps[:, 0] - s * steps[:, 1])))
-    y = told[0, 1] + np.concatenate(([0.0], np.cumsum(s * steps[:, 0] + c * steps[:, 1])))
+    x = measured[0, 0] + np.concatenate(([0.0], np.cumsum(c * steps[:, 0] - s * steps[:, 1])))
+    y = measured[0, 1] + np.concatenate(([0.0], np.cumsum(s * steps[:, 0] + c * steps[:, 1])))
     return np.column_stack((x, y, wrap_angles(theta)))
 
 
 def delayed(index: F64, odometry: F64, delay: float) -> F64:
-    """The poses told `delay` messages before each, interpolated, shape (n, 3); `index` never decreases."""
+    """The poses `delay` messages before each, interpolated, shape (n, 3); `index` never decreases."""
     if delay == 0.0:
         return odometry
     wanted = np.clip(index - delay, index[0], index[-1])

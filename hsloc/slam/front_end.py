@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.errors import ConfigError
 from hsloc.localisation.motion import OdometryNoise
 from hsloc.matching.hide import Hide
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Status
 from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle
+from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive, Ratio
 from hsloc.slam.keyscans import KeyScan
 from hsloc.slam.local_map import LocalMap
 from hsloc.slam.recent_scans import SURPRISE, MovingScan, RecentScans, ScanRegistration, fused_covariance
@@ -33,67 +33,52 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FrontEndParameters:
+class FrontEndParameters(Parameters):
     """When a scan becomes a keyscan, what it is matched against and in which window."""
 
-    keyscan_min_d: float = 0.1
-    """A scan becomes a keyscan after so many metres (m)."""
-    keyscan_min_a: float = 0.05
-    """Or after so much turning (rad)."""
-    min_points: int = 20
-    """A scan with fewer hits is not matched."""
-    local_range: float = 30.0
-    """Hits farther away are neither drawn nor matched here (m)."""
-    resolution: float = 0.05
-    """Of the local field (m)."""
-    sigma: float = 0.1
-    """Decay of the score with the distance from a wall (m)."""
-    max_distance: float = 0.4
-    """Beyond it the score is zero (m)."""
-    submap_length: float = 4.0
-    """A local map begins after so many metres of the way, and another one later it takes over (m)."""
-    turn_length: float = 0.3
-    """A turn of one radian counts as so many metres of the way (m)."""
-    window_sigmas: float = 3.0
-    """Half-width of the window in standard deviations of the prediction."""
-    window_min: float = 0.1
-    """But at least so many metres (m)."""
-    window_min_angle: float = radians(4.0)
-    """And so much of an angle (rad)."""
-    wide_window: float = 0.6
-    """Half-width [m] of the window that is searched where the first window holds no credible pose."""
-    wide_window_angle: float = radians(90.0)
-    """Half-width [rad] of that window: turns are missed by odometry more often than translations."""
-    min_fitness: float = 0.35
-    """A match that contradicts the odometry is refused below this fitness."""
-    min_fitness_ratio: float = 0.9
-    """A match that contradicts the odometry is refused below this part of the usual fitness."""
-    restart_after: int = 3
-    """A new local map begins after so many refused matches in a row."""
+    keyscan_min_d: NonNegative = 0.1
+    """Minimum translation between two keyscans [m]; a larger rotation alone makes a keyscan, too."""
+    keyscan_min_a: NonNegative = 0.05
+    """Minimum rotation between two keyscans [rad]; a larger translation alone makes a keyscan, too."""
+    min_points: Count = 20
+    """Minimum number of hits of a scan that is matched."""
+    local_range: Positive = 30.0
+    """Maximum range of the hits that the front end uses [m]."""
+    resolution: Positive = 0.05
+    """Distance of two nodes of the local likelihood field [m]."""
+    sigma: Positive = 0.1
+    """Decay length of a point's score with its distance from a wall of the local map [m]."""
+    max_distance: Positive = 0.4
+    """Distance from a wall of the local map beyond which a point scores zero [m]."""
+    submap_length: Positive = 4.0
+    """Path length after which a new local map begins [m]; it is matched against after the same length again."""
+    turn_length: NonNegative = 0.3
+    """Path length that a rotation of one radian counts as [m]."""
+    window_sigmas: Positive = 3.0
+    """Half-width of the search window in standard deviations of the prediction."""
+    window_min: Positive = 0.1
+    """Minimum half-width of the search window in x and y [m]."""
+    window_min_angle: Angle = radians(4.0)
+    """Minimum half-width of the search window in heading [rad]."""
+    wide_window: Positive = 0.6
+    """Half-width of the window that is searched after a refused registration [m]; the length of the step is added."""
+    wide_window_angle: Angle = radians(90.0)
+    """Half-width in heading of the window that is searched after a refused registration [rad]."""
+    min_fitness: Ratio = 0.35
+    """Minimum fitness of a match that contradicts the odometry."""
+    min_fitness_ratio: Ratio = 0.9
+    """Minimum ratio of the fitness of a match that contradicts the odometry to the usual fitness, a running mean."""
+    restart_after: Count = 3
+    """Number of refused matches in a row after which a new local map begins."""
     hide: Hide = field(default_factory=lambda: Hide(restarts=6, agreement=2, budget=200, memory_size=20))
+    """Search of the window of the prediction."""
     hide_wide: Hide = field(default_factory=lambda: Hide(restarts=16, agreement=3, budget=400))
-    """The search of the wide window."""
+    """Search of the wide window."""
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
-    no_odometry_window: float = 0.6
-    """Without odometry: half-width of the window around the constant-velocity prediction (m)."""
-    no_odometry_window_angle: float = radians(45.0)
-    """And in theta (rad)."""
-
-    def __post_init__(self) -> None:
-        for name in ("keyscan_min_d", "keyscan_min_a"):
-            if not getattr(self, name) >= 0.0:
-                raise ConfigError(f"front_end: {name} is {getattr(self, name)}; it must be 0 or more")
-        for name in (
-            "local_range",
-            "resolution",
-            "sigma",
-            "max_distance",
-            "submap_length",
-            "window_min",
-            "window_min_angle",
-        ):
-            if not getattr(self, name) > 0.0:
-                raise ConfigError(f"front_end: {name} is {getattr(self, name)}; it must be positive")
+    no_odometry_window: Positive = 0.6
+    """Half-width of the window around the constant-velocity prediction where there is no odometry [m]."""
+    no_odometry_window_angle: Angle = radians(45.0)
+    """Half-width in heading of the window around the constant-velocity prediction [rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +101,7 @@ class LocalMatch:
 
 
 FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
-"""No motion is known better than this (m^2, rad^2)."""
+"""Least covariance of a motion (m^2, rad^2). Internal: a part of a cell, keeps the equations solvable."""
 _FORGET = 0.05
 """Weight of a new match in the usual fitness."""
 _LONGEST_PREDICTION = 4.0
@@ -331,7 +316,7 @@ class FrontEnd:
         )
 
     def _keep(self, paired: PairedScan, points: F64, found: LocalMatch) -> LocalMatch:
-        """Make the scan a keyscan: draw it into the local maps."""
+        """Make the scan a keyscan: add it to the local maps."""
         p = self._parameters
         self._way += hypot(found.motion.x, found.motion.y) + p.turn_length * abs(wrap_angle(found.motion.theta))
         if self._refused >= p.restart_after:
@@ -346,7 +331,7 @@ class FrontEnd:
         moved = found.pose @ points[np.hypot(points[:, 0], points[:, 1]) < p.local_range]
         if found.status is Status.MATCHED or len(self._maps) == 1:
             for local, _ in self._maps:
-                local.draw(moved, _KNOWN)
+                local.add(moved, _KNOWN)
             self._recent.add(found.pose, _moving(paired))
         return found
 

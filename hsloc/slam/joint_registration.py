@@ -1,7 +1,7 @@
-"""All scans against all: the poses at which every scan agrees best with all the scans that see the same walls.
+"""Joint registration: the poses at which every scan agrees best with all the scans that see the same walls.
 
 Where a scan-to-map matcher holds the map fixed, here both sides of each pair may move, and all pairs are solved for
-at once (a bundle adjustment of planar scans). Each round associates anew, assembles the normal equations of all pairs
+at once (a bundle adjustment of planar scans). Each round associates again, assembles the normal equations of all pairs
 (hsloc/kernels/normal_equations.py) and of the edges, the odometry among them, and solves them sparsely.
 """
 
@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.errors import ConfigError
-from hsloc.kernels.normal_equations import add_edges, assemble_pairs
+from hsloc.kernels.normal_equations import Equations, add_edges, assemble_pairs
 from hsloc.model.pose2 import wrap_angles
+from hsloc.parameters import Count, CountOrNone, NonNegative, Parameters, Positive
 from hsloc.slam.pose_graph import apply_increment, solve_anchored
 from hsloc.slam.sparse_solver import BlockSystem
 
@@ -31,45 +31,36 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JointRegistrationParameters:
-    """Which scans are compared, and how they are pulled onto each other."""
+class JointRegistrationParameters(Parameters):
+    """Which scans are compared, and how their differences are weighted."""
 
-    radius: float = 3.0
-    """Scans taken so near to each other are compared (m)."""
-    max_partners: int = 8
-    """Each scan chooses so many of them, of different places and headings."""
-    max_scans_per_view: int = 16
-    """Of more scans of one place and heading, so many stand for all: a room crossed all day is known by then."""
-    temporal: int = 3
-    """And is compared with so many scans before it."""
-    gates: tuple[float, ...] = (0.3, 0.2, 0.15)
-    """Points farther than this from the other scan's wall are not paired (m), round by round; the last one stays."""
-    scale_of_gate: float = 0.33
-    """Scale of the Geman-McClure weight, as a part of the gate."""
-    sigma: float = 0.02
-    """Standard deviation of a point from a wall (m)."""
-    correlated_points: float = 20.0
-    """So many points count as one: neighbouring beams, and pairs of neighbouring scans, share their errors."""
-    points_per_scan: int = 90
-    """About so many hits of a scan are used."""
-    rounds: int = 3
-    """At most, in a pass."""
-    convergence_tolerance: float = 0.002
-    """Nothing moves when 99 of 100 poses move less than this (m; rad: a fifth)."""
-
-    def __post_init__(self) -> None:
-        for name in ("radius", "sigma", "correlated_points", "scale_of_gate"):
-            if not getattr(self, name) > 0.0:
-                raise ConfigError(f"joint_registration: {name} is {getattr(self, name)}; it must be positive")
-        if not self.gates or min(self.gates) <= 0.0:
-            raise ConfigError(f"joint_registration: gates is {self.gates}; it must hold at least one positive length")
-        if min(self.points_per_scan, self.rounds, self.max_scans_per_view) < 1:
-            raise ConfigError("joint_registration: points_per_scan, rounds and max_scans_per_view must be at least 1")
+    radius: Positive = 3.0
+    """Maximum distance between the poses of two scans that are compared [m]."""
+    max_partners: Count = 8
+    """Maximum number of scans that each scan is compared with, each in another place or with another heading."""
+    max_scans_per_view: Count = 16
+    """Maximum number of scans with one place and heading that are used as partners."""
+    temporal: CountOrNone = 3
+    """Number of scans just before a scan that it is compared with in any case."""
+    gates: tuple[Positive, ...] = (0.3, 0.2, 0.15)
+    """Maximum distance of a point to the wall that it is paired with [m], round by round; the last one stays."""
+    scale_of_gate: Positive = 0.33
+    """Scale of the Geman-McClure weight as a ratio to the gate."""
+    sigma: Positive = 0.02
+    """Standard deviation of a point's distance to its wall [m]."""
+    correlated_points: Positive = 20.0
+    """Number of points that count as one independent measurement, as neighbouring beams share their errors."""
+    points_per_scan: Count = 90
+    """Approximate number of hits of a scan that are used."""
+    rounds: Count = 3
+    """Maximum number of rounds in a pass."""
+    convergence_tolerance: NonNegative = 0.002
+    """Step below which a pass has converged [m], the 99th percentile over the poses; angles count 5 m/rad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """What a pass found; `counts` (m, 5) of the pairs (m, 2) as in `kernels.surfels.pair_terms`."""
+    """What a pass found; `counts` (m, 5) of the pairs (m, 2) as in `kernels.point_to_line.pair_terms`."""
 
     poses: F64
     pairs: I64
@@ -104,7 +95,7 @@ def refine(
     system = BlockSystem(
         len(poses), np.concatenate((pairs[:, 0], edges.pairs[:, 0])), np.concatenate((pairs[:, 1], edges.pairs[:, 1]))
     )
-    chosen, chosen_start = scans.chosen(p.points_per_scan)
+    arrays = scans.arrays(p.points_per_scan)
     weights = np.full(len(pairs), 1.0 / (p.sigma**2 * p.correlated_points))
     counts = np.zeros((len(pairs), 5))
     pair_blocks, edge_blocks = np.empty((len(pairs), 3, 3)), np.empty((len(edges), 3, 3))
@@ -112,12 +103,10 @@ def refine(
     for rounds in range(1, p.rounds + 1):
         gate = p.gates[min(rounds, len(p.gates)) - 1]
         diagonal, right = np.zeros((len(poses), 3, 3)), np.zeros((len(poses), 3))
-        add_edges(poses, edges.pairs, edges.measured, edges.information, edges.scale, diagonal, edge_blocks, right)
-        assemble_pairs(
-            poses, pairs, weights, scans.points, scans.normals, scans.centroids, scans.start, scans.hit_of_beam,
-            scans.ranges, scans.table_start, scans.geometry, chosen, chosen_start, gate, p.scale_of_gate * gate,
-            diagonal, pair_blocks, right, counts,
-        )  # fmt: skip
+        of_edges = Equations(diagonal, edge_blocks, right)
+        add_edges(poses, edges.pairs, edges.measured, edges.information, edges.scale, of_edges)
+        of_pairs = Equations(diagonal, pair_blocks, right)
+        assemble_pairs(poses, pairs, weights, arrays, gate, p.scale_of_gate * gate, of_pairs, counts)
         step = solve_anchored(system, diagonal, np.concatenate((pair_blocks, edge_blocks)), right)
         poses = apply_increment(poses, step)
         moved = moved_scans(step)
@@ -137,16 +126,17 @@ def moved_scans(step: F64) -> float:
 
 
 _HEADINGS = 8
+"""Sectors of heading that count as different views. Internal: `max_partners` is what is to be set."""
 _AT_ONCE = 512
-"""Scans whose neighbours are listed together: of all at once the lists would fill the memory."""
+"""Scans whose neighbours are listed together. Internal: memory alone, the results are the same."""
 
 
 def neighbour_pairs(poses: F64, radius: float, most: int, temporal: int, crowd: int) -> I64:
     """Pairs of scans that should see the same walls: those just before, and the near ones in space.
 
     Among the scans within `radius` metres the nearest of each of `most` sorts is taken, the sorts being
-    places (a grid) and headings: a hundred scans from one spot say less than ten from ten. Of a sort with more than
-    `crowd` scans only so many, even in time, are taken as partners, so that the equations stay sparse.
+    places (a grid) and headings: a hundred scans from one place add less than ten from ten. Of a sort with more than
+    `crowd` scans only `crowd`, even in time, are taken as partners, so that the equations stay sparse.
     Returns (m, 2), the earlier first, sorted.
     """
     from scipy.spatial import cKDTree
@@ -155,7 +145,7 @@ def neighbour_pairs(poses: F64, radius: float, most: int, temporal: int, crowd: 
     sector = np.floor(poses[:, 2] / (2.0 * np.pi) * _HEADINGS).astype(np.int64) % _HEADINGS
     cell = np.floor(poses[:, :2] / (0.5 * radius)).astype(np.int64)
     sort = (cell[:, 0] * 1000003 + cell[:, 1]) * _HEADINGS + sector
-    known = _standing_for_all(sort, crowd)
+    known = _thinned(sort, crowd)
     tree = cKDTree(poses[known, :2])
     keys = [np.arange(n - gap) * n + np.arange(gap, n) for gap in range(1, temporal + 1)]
     for begin in range(0, n, _AT_ONCE):
@@ -175,7 +165,7 @@ def neighbour_pairs(poses: F64, radius: float, most: int, temporal: int, crowd: 
     return np.column_stack((unique // n, unique % n)).astype(np.int64)
 
 
-def _standing_for_all(sort: I64, crowd: int) -> I64:
+def _thinned(sort: I64, crowd: int) -> I64:
     """Of each sort all scans, or `crowd` of them, even in time; ascending."""
     order = np.argsort(sort, kind="stable")
     _, start, count = np.unique(sort[order], return_index=True, return_counts=True)

@@ -1,4 +1,4 @@
-"""The scans that carry the map, in the flat arrays that the kernels want."""
+"""Keyscans, the scans that make up the map, in the flat arrays that the kernels take."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.point_to_line import choose_hits, fit_surfels
+from hsloc.kernels.point_to_line import ScanArrays, choose_hits, fit_surfels
 from hsloc.model.events import Scan
 from hsloc.model.pose2 import Pose2
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
 
 _SURFEL_RADIUS = 0.2
-"""Hits within this distance (m) are fitted together."""
+"""Distance (m) of the hits to which a line is fitted. Internal: the size of the smallest walls, door frames."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,8 +119,15 @@ class KeyScans:
         """Hits of a scan in the base's frame, shape (n, 2)."""
         return self.points[self.start[index] : self.start[index + 1]]
 
+    def arrays(self, most: int) -> ScanArrays:
+        """All of it for the kernels, with about `most` chosen hits of each scan."""
+        return ScanArrays(
+            self.points, self.normals, self.centroids, self.start, self.hit_of_beam, self.ranges, self.table_start,
+            self.geometry, *self.chosen(most),
+        )  # fmt: skip
+
     def chosen(self, most: int) -> tuple[I32, I64]:
-        """About `most` hits of each scan, evenly by the directions of their walls (`kernels.surfels.choose_hits`).
+        """About `most` hits of each scan, evenly by the directions of their walls (`choose_hits`).
 
         Returns the rows within each scan, one scan after the other, and where each begins, shape (n + 1,).
         """

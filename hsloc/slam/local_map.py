@@ -1,4 +1,4 @@
-"""A score field that grows with every scan drawn into it."""
+"""A likelihood field that grows with every scan that is added."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 
 class LocalMap:
-    """exp(-d / sigma) of the distance d to the nearest point drawn so far, on nodes `resolution` metres apart.
+    """exp(-d / sigma) of the distance d to the nearest point added so far, on nodes `resolution` metres apart.
 
     Beyond `max_distance` metres from every point the score is zero. The array grows by half its size where points fall
-    outside; drawing is local. `field` is what matchers want; it stays valid until the next `draw`.
+    outside; adding is local. `field` is what matchers take; it stays valid until the next `add`.
     """
 
     def __init__(self, resolution: float, sigma: float, max_distance: float) -> None:
@@ -35,7 +35,7 @@ class LocalMap:
         self._corner = np.zeros(2, dtype=np.int64)
         self._low = np.zeros(2)
         self._high = np.zeros(2)
-        self.drawn = 0
+        self.added = 0
 
     @property
     def field(self) -> LikelihoodField:
@@ -49,8 +49,8 @@ class LocalMap:
         """Scores on the nodes, shape (h, w)."""
         return self._scores
 
-    def draw(self, points: F64, saturation_score: float = 0.98) -> int:
-        """Draw points (n, 2) in metres in the map's frame; those whose nearest node scores `known` already are spared.
+    def add(self, points: F64, saturation_score: float = 0.98) -> int:
+        """Add points (n, 2) in metres in the map's frame but those whose nearest node has `saturation_score` already.
 
         Returns how many points were new.
         """
@@ -58,9 +58,9 @@ class LocalMap:
             return 0
         self._make_room(points)
         cells = np.ascontiguousarray(points / self._resolution - self._corner, dtype=np.float32)
-        drawn = int(splat(self._scores, self._packed, cells, self._table, self._radius, saturation_score))
-        self.drawn += drawn
-        return drawn
+        added = int(splat(self._scores, self._packed, cells, self._table, self._radius, saturation_score))
+        self.added += added
+        return added
 
     def _make_room(self, points: F64) -> None:
         low = np.floor(points.min(axis=0) / self._resolution).astype(np.int64) - self._margin
@@ -88,6 +88,6 @@ class LocalMap:
 
 def field_of_points(points: F64, resolution: float, sigma: float, max_distance: float) -> LikelihoodField:
     """The field of a set of points at once."""
-    drawn = LocalMap(resolution, sigma, max_distance)
-    drawn.draw(points, saturation_score=2.0)
-    return drawn.field
+    local = LocalMap(resolution, sigma, max_distance)
+    local.add(points, saturation_score=2.0)
+    return local.field

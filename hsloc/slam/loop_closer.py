@@ -1,4 +1,4 @@
-"""Closing loops: is this place one that was seen before, long ago on the way?
+"""Loop closing: submaps that were visited before.
 
 Places are visited in their order. Those seen before that could be near, by a drift that is assumed too large rather
 than too small, are compared (`hsloc.slam.loop_matcher`). A loop that is believed becomes an edge of the pose graph
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.model.pose2 import Pose2, relative_poses
-from hsloc.slam.loop_matcher import Loop, LoopMatcher, LoopParameters
+from hsloc.slam.loop_matcher import Loop, LoopMatcher
 from hsloc.slam.pose_graph import Edges, edge_errors, solve_edges
 
 if TYPE_CHECKING:
@@ -25,12 +25,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.slam.keyscans import KeyScans
+    from hsloc.slam.loop_matcher import LoopParameters
     from hsloc.slam.submaps import Submaps
 
     F64 = NDArray[np.float64]
 
-MAX_EDGE_CHI = 6.0
-"""A loop whose chi is larger than this once the graph is solved was wrong."""
 TORN = "torn"
 """How the reason begins for which such a loop is refused."""
 _SWEEPS = 3
@@ -41,8 +40,9 @@ _STILL = 1e-3
 """A solve between two loops ends when no place moves farther (m; rad): the windows are metres wide."""
 _NARROWER = 0.7
 """A pair is searched again if its window is narrower than before by this factor."""
-_CONNECTED_WAY = 12.0
-"""A place that was found on the whole map is known as well as after so many metres of the way."""
+_CONNECTED_PATH_LENGTH = 12.0
+"""Path length (m) after which a pose is as uncertain as one that the global search found. Internal: it only sizes the
+window of the first loops of a map that is extended, which are checked as all loops are."""
 
 
 class LoopCloser:
@@ -95,7 +95,7 @@ class LoopCloser:
         near = [
             int(old) for old in np.argsort(distance, kind="stable") if distance[old] < self._parameters.search_radius
         ]
-        return [self._search(old, place, _CONNECTED_WAY) for old in near[: self._parameters.max_candidates]]
+        return [self._search(old, place, _CONNECTED_PATH_LENGTH) for old in near[: self._parameters.max_candidates]]
 
     def edges(self) -> Edges:
         """The accepted loops as edges between the places."""
@@ -104,7 +104,7 @@ class LoopCloser:
     def solve(self) -> None:
         """Solve the graph of the places: the front end's steps, and the loops with robust weights."""
         places = self._places
-        steps = Edges.chain(places.steps, places.covariances, places.doubted)
+        steps = Edges.chain(places.steps, places.covariances, places.uncertain)
         self.poses = solve_edges(self.poses, Edges.concatenate([steps, self.edges()]), still=_STILL, widened=_WIDENED)
 
     def _visit(self, place: int) -> int:
@@ -112,8 +112,8 @@ class LoopCloser:
         searched = accepted = 0
         left = self._unknown(place)
         while left and searched < self._parameters.max_candidates:
-            old, way = left[0]
-            loop = self._search(old, place, way)
+            old, path_length = left[0]
+            loop = self._search(old, place, path_length)
             self._found[old, place] = loop
             searched += 1
             accepted += loop.accepted
@@ -124,12 +124,13 @@ class LoopCloser:
         return accepted
 
     def _unknown(self, place: int) -> list[tuple[int, float]]:
-        """Candidates that were not searched, or in a much wider window, and the way to each."""
-        return [
-            (old, way)
-            for old, way in self._candidates(place)
-            if (before := self._found.get((old, place))) is None or self._window(way)[0] < _NARROWER * before.window[0]
-        ]
+        """Candidates that were not searched, or in a much wider window, and the path length to each."""
+        unknown = []
+        for old, path_length in self._candidates(place):
+            before = self._found.get((old, place))
+            if before is None or self._window(path_length)[0] < _NARROWER * before.window[0]:
+                unknown.append((old, path_length))
+        return unknown
 
     def _tear(self) -> int:
         """Refuse the loop that the solved graph contradicts most, until it contradicts none; returns how many."""
@@ -137,7 +138,7 @@ class LoopCloser:
         while accepted := self.accepted:
             _, _, chi = edge_errors(self.poses, self.edges())
             worst = int(np.argmax(chi))
-            if not chi[worst] > MAX_EDGE_CHI:
+            if not chi[worst] > self._parameters.max_edge_chi:
                 break
             loop = accepted[worst]
             reason = f"{TORN}: {chi[worst]:.0f} sigma off, the graph solved"
@@ -147,50 +148,54 @@ class LoopCloser:
         return torn
 
     def _candidates(self, place: int) -> list[tuple[int, float]]:
-        """Old places that could be near, nearest first, with the way to each over the graph."""
+        """Old places that could be near, nearest first, with the path length to each over the graph."""
         p = self._parameters
-        way = self._ways(place)
+        path_length = self._path_lengths(place)
         old = np.arange(place)
         distance = np.hypot(*(self.poses[:place, :2] - self.poses[place, :2]).T)
-        # Places next to each other are built from the same scans: those would match themselves.
+        # Submaps next to each other contain the same scans: those would match themselves.
         apart = place - old > 3
-        could = apart & (way >= p.min_path_length) & (distance <= p.search_radius + p.sigmas * p.drift * way)
+        could = (
+            apart
+            & (path_length >= p.min_path_length)
+            & (distance <= p.search_radius + p.sigmas * p.drift * path_length)
+        )
         order = np.lexsort((old[could], distance[could]))
         chosen: list[tuple[int, float]] = []
         for candidate in old[could][order]:
             if all(abs(candidate - other) > 2 for other, _ in chosen):
-                chosen.append((int(candidate), float(way[candidate])))
+                chosen.append((int(candidate), float(path_length[candidate])))
             if len(chosen) == p.max_candidates:
                 break
         return chosen
 
-    def _ways(self, place: int) -> F64:
-        """Metres from a place to each earlier one along the way and over closed loops, shape (place,)."""
+    def _path_lengths(self, place: int) -> F64:
+        """Metres from a submap to each earlier one along the path and over closed loops, shape (place,)."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra
 
         loops = self.accepted
-        # Where two logs are connected the way may lead over places that are still to be visited.
+        # Where two logs are connected the path may lead over submaps that are still to be visited.
         last = place if self._first == 0 else len(self._places) - 1
         rows = [*range(last), *(loop.first for loop in loops)]
         columns = [*range(1, last + 1), *(loop.second for loop in loops)]
         lengths = [
-            *np.maximum(np.diff(self._places.way[: last + 1]), 1e-3),
+            *np.maximum(np.diff(self._places.path_length[: last + 1]), 1e-3),
             *(max(hypot(loop.T_first_second.x, loop.T_first_second.y), 0.1) for loop in loops),
         ]
         graph = coo_array((lengths, (rows, columns)), shape=(len(self._places), len(self._places)))
         distances: F64 = dijkstra(graph.tocsr(), directed=False, indices=np.array([place]))
         return distances[0, :place]
 
-    def _window(self, way: float) -> tuple[float, float]:
-        """Half-widths (m, rad) of the window after so many metres of the way."""
+    def _window(self, path_length: float) -> tuple[float, float]:
+        """Half-widths (m, rad) of the window after a path length (m)."""
         p = self._parameters
-        angle = p.sigmas * p.drift_angle * sqrt(way) + radians(2.0)
-        return p.sigmas * p.drift * way + 0.3, min(angle, float(np.pi))
+        angle = p.sigmas * p.drift_angle * sqrt(path_length) + radians(2.0)
+        return p.sigmas * p.drift * path_length + 0.3, min(angle, float(np.pi))
 
-    def _search(self, old: int, place: int, way: float) -> Loop:
+    def _search(self, old: int, place: int, path_length: float) -> Loop:
         centre = Pose2.from_array(relative_poses(self.poses[None, old], self.poses[None, place])[0])
-        return self._matcher.search(old, place, centre, self._window(way))
+        return self._matcher.search(old, place, centre, self._window(path_length))
 
 
 def loop_edges(accepted: list[Loop], nodes: NDArray[np.int64], robust: float) -> Edges:

@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.branch_and_bound import best_on_lattice, pool
-from hsloc.kernels.registration import RegistrationParameters, ScanArrays, register
+from hsloc.kernels.branch_and_bound import Excluded, Lattice, best_on_lattice, pool
+from hsloc.kernels.point_to_line import ScanArrays
+from hsloc.kernels.registration import Prior, RegistrationParameters, Scene, register
 from hsloc.matching.harmony_search import low_discrepancy_order
 from hsloc.matching.hide import Hide
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2, relative_poses
+from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive, Ratio
 from hsloc.slam.keyscans import starts_of
 
 if TYPE_CHECKING:
@@ -35,55 +37,63 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LoopParameters:
-    """Where loops are looked for, and when one is believed."""
+class LoopParameters(Parameters):
+    """Where loops are searched for, and when one is accepted."""
 
-    submap_length: float = 3.0
-    """A place is so much of the way (m)."""
-    min_path_length: float = 12.0
-    """Places nearer along the way or over loops already closed are let be (m)."""
-    search_radius: float = 3.0
-    """Places are compared that could lie so near (m)."""
-    drift: float = 0.02
-    """Assumed standard deviation of the drift, as a part of the way."""
-    drift_angle: float = radians(0.3)
-    """And of the heading, times the square root of the way in metres (rad)."""
-    sigmas: float = 3.0
-    """Half-width of the window in these standard deviations."""
-    max_candidates: int = 3
-    """Old places searched for each place, the nearest ones of different times."""
-    resolution: float = 0.1
-    """Of the field of a place (m)."""
-    sigma: float = 0.2
-    """Decay of its score (m)."""
-    scan_range: float = 15.0
-    """Hits farther away are left out (m)."""
-    min_fitness: float = 0.25
-    """Minimum fitness of a place's points on the other place's field."""
-    high_fitness: float = 0.5
-    """Fitness from which on `max_rival` holds, below it `max_rival_low`."""
-    max_rival: float = 0.85
-    """Maximum fitness of any other pose in the window, as a part of the match's."""
-    max_rival_low: float = 0.8
-    """The same for a match whose fitness is low: one place has seen much that the other has not."""
-    wide: float = 2.0
-    """A window with half-widths of more metres is a wide one (m): where so much is possible, more is asked."""
-    min_margin: float = 0.11
-    """In a wide window the fitness must be so much above that of any other pose."""
-    min_consistency: float = 0.9
-    """Minimum part of points on walls of the other place, of those on its walls or where it looked through. Of 2,300
-    pairs of places of five logs none that was off by more than 1 m passes this, `min_paired` and `max_rival_low`."""
-    min_paired: float = 0.1
-    """Minimum part of the points that both places could see that lie on walls of the other place."""
-    sigma_edge: float = 0.05
-    """Standard deviation of a loop beside that of its match (m)."""
-    sigma_edge_angle: float = radians(0.5)
-    """And of its angle (rad)."""
-    robust: float = 2.0
-    """Scale of Cauchy's weight on chi."""
+    submap_length: Positive = 3.0
+    """Path length of a submap [m]."""
+    min_path_length: NonNegative = 12.0
+    """Minimum path length between two submaps that are compared [m], measured over accepted loops as well."""
+    search_radius: NonNegative = 3.0
+    """Distance between two submaps up to which they are compared [m], to which the assumed drift is added."""
+    drift: NonNegative = 0.02
+    """Assumed standard deviation of the drift in position per path length."""
+    drift_angle: NonNegative = radians(0.3)
+    """Assumed standard deviation of the drift in heading after 1 m [rad]; it grows with the root of the path length."""
+    sigmas: Positive = 3.0
+    """Half-width of the search window in standard deviations of the drift."""
+    max_candidates: Count = 3
+    """Maximum number of earlier submaps that are searched for each submap, the nearest ones of different times."""
+    resolution: Positive = 0.1
+    """Distance of two nodes of a submap's likelihood field [m]."""
+    sigma: Positive = 0.2
+    """Decay length of a point's score with its distance from a wall of the submap [m]."""
+    scan_range: Positive = 15.0
+    """Maximum range of the hits that are compared [m]."""
+    min_fitness: Ratio = 0.25
+    """Minimum fitness of a submap's points on the other submap's field."""
+    high_fitness: Ratio = 0.5
+    """Fitness from which on `max_rival` is the limit, below it `max_rival_low`."""
+    max_rival: Ratio = 0.85
+    """Maximum fitness of any other pose in the window as a ratio to that of the match."""
+    max_rival_low: Ratio = 0.8
+    """The same limit for a match of low fitness, where one submap has seen much that the other has not."""
+    wide: NonNegative = 2.0
+    """Half-width above which a window counts as wide [m], so that `min_margin` applies."""
+    min_margin: Ratio = 0.11
+    """Minimum difference in a wide window between the fitness of the match and that of any other pose."""
+    min_consistency: Ratio = 0.9
+    """Minimum ratio of points on walls of the other submap to those on its walls or where it saw free space."""
+    min_paired: Ratio = 0.1
+    """Minimum ratio of points in the other submap's view that lie on its walls."""
+    sigma_edge: Positive = 0.05
+    """Standard deviation of a loop edge in x and y in addition to that of its match [m]."""
+    sigma_edge_angle: Positive = radians(0.5)
+    """Standard deviation of a loop edge in heading in addition to that of its match [rad]."""
+    distinct_distance: Positive = 0.8
+    """Distance from the match beyond which another pose is a rival [m]."""
+    distinct_angle: Angle = radians(12.0)
+    """Difference in heading from the match beyond which another pose is a rival [rad]."""
+    max_edge_chi: Positive = 6.0
+    """Maximum residual of a loop edge in the solved graph, in standard deviations; a loop with more is removed."""
+    refused_path_length: NonNegative = 5.0
+    """Path length that a refused match counts as when loops are searched for [m], as it may hide a slip."""
+    robust: Positive = 2.0
+    """Scale of the Cauchy weight of a loop edge, in standard deviations of its residual."""
     hide: Hide = field(
         default_factory=lambda: Hide(restarts=12, agreement=3, budget=600, memory_size=40, search_points=150)
     )
+    """Search of the window of a loop."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,8 +125,6 @@ _REGISTRATION = RegistrationParameters((0.5, 0.4, 0.3), 0.33, 1.0 / (0.02**2 * 2
 place, so that their points count once."""
 _VISITS = 3_000_000
 """Bounds computed for a window before it counts as ambiguous."""
-_DISTINCT = (0.8, radians(12.0))
-"""A pose farther from the match than this is another one (m, rad)."""
 
 
 class LoopMatcher:
@@ -139,7 +147,7 @@ class LoopMatcher:
         match = p.hide.match(points, likelihood, Window(centre, half, half, half_angle), self._rng)
         prior = np.diag((1.0 / half**2, 1.0 / half**2, 1.0 / half_angle**2)) * p.sigmas**2
         pose, information, paired, conflict = self._registered(first, second, match.pose, centre, prior)
-        if match.pose.distance(pose) > _DISTINCT[0]:
+        if match.pose.distance(pose) > p.distinct_distance:
             pose = match.pose
         fitness = likelihood.fitness(points, pose)
         consistency = paired / (paired + conflict) if paired > 0.0 else 0.0
@@ -173,10 +181,8 @@ class LoopMatcher:
             for k, m in ((first, old), (second, new))
         ]
         pose, information, counts = start.to_array(), np.zeros((3, 3)), np.zeros(5)
-        register(
-            pose, len(old), np.concatenate(seen_from), self._arrays(np.concatenate((old, new))), centre.to_array(),
-            prior, _REGISTRATION, information, counts,
-        )  # fmt: skip
+        scene = Scene(len(old), np.concatenate(seen_from), self._arrays(np.concatenate((old, new))))
+        register(pose, scene, Prior(centre.to_array(), prior), _REGISTRATION, information, counts)
         seen = max(float(counts[2]), 1.0)
         return Pose2.from_array(pose), information, float(counts[0]) / seen, float(counts[1]) / seen
 
@@ -208,8 +214,8 @@ class LoopMatcher:
         found = self._fields.pop(place, None)
         if found is None:
             p = self._parameters
-            drawn = self._places.field(place, 1, self._scans, p.scan_range, p.resolution, p.sigma)
-            found = (drawn.field, pool(drawn.scores, 5))
+            local = self._places.field(place, 1, self._scans, p.scan_range, p.resolution, p.sigma)
+            found = (local.field, pool(local.scores, 5))
         self._fields[place] = found
         if len(self._fields) > _CACHED:
             del self._fields[next(iter(self._fields))]
@@ -233,13 +239,13 @@ class LoopMatcher:
         near = np.array((1.0, 1.0, step))
         nowhere = np.array((-1.0, -1.0, -1.0))
         here, found = likelihood.to_cells(pose), np.empty(3)
-        own, _ = best_on_lattice(pooled[:1], few, here, near, step / 2.0, here, nowhere, 0.0, _VISITS, found)
+        finer = Lattice(here, near, step / 2.0)
+        own, _ = best_on_lattice(pooled[:1], few, finer, Excluded(here, nowhere), 0.0, _VISITS, found)
         if own <= 0.0:
             return float("nan")
         needed = 0.7 * own
         box = np.array((ceil(half / cell), ceil(half / cell), half_angle))
-        distinct = np.array((_DISTINCT[0] / cell, _DISTINCT[0] / cell, _DISTINCT[1]))
-        other, _ = best_on_lattice(
-            pooled, few, likelihood.to_cells(centre), box, step, here, distinct, needed, _VISITS, found
-        )
+        distinct = np.array((p.distinct_distance / cell, p.distinct_distance / cell, p.distinct_angle))
+        lattice = Lattice(likelihood.to_cells(centre), box, step)
+        other, _ = best_on_lattice(pooled, few, lattice, Excluded(here, distinct), needed, _VISITS, found)
         return float("nan") if other < 0.0 else float(other / own)

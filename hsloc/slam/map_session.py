@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
 
 _ODOMETRY_FLOOR = np.diag((0.01**2, 0.01**2, 0.005**2))
-"""No step of the odometry is known better than this (m^2, rad^2)."""
+"""Least covariance of an odometry edge (m^2, rad^2). Internal: keeps the equations solvable."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +80,9 @@ def from_front_end(
         covariances=covariances,
         refused=refused,
         steps=_odometry_edges(motions, covariances, refused, track, parameters),
-        places=Submaps.along(poses, motions, covariances, length, turn, refused),
+        places=Submaps.split_by_path_length(
+            poses, motions, covariances, length, turn, refused, parameters.loops.refused_path_length
+        ),
     )
 
 
@@ -88,7 +90,9 @@ def from_map_state(state: MapState, parameters: GraphMapperParameters) -> MapSes
     """Of a saved map. What was refined is what is measured: the graph holds the old map in its shape."""
     motions = np.concatenate((np.zeros((1, 3)), relative_poses(state.poses[:-1], state.poses[1:])))
     length, turn = parameters.loops.submap_length, parameters.front_end.turn_length
-    places = Submaps.along(state.poses, motions, state.covariances, length, turn, state.refused)
+    places = Submaps.split_by_path_length(
+        state.poses, motions, state.covariances, length, turn, state.refused, parameters.loops.refused_path_length
+    )
     return MapSession(
         scans=state.scans,
         stamps_ns=state.stamps_ns,
@@ -129,7 +133,7 @@ def concatenate(old: MapSession, new: MapSession) -> MapSession:
 
 
 def _loops(state: MapState, places: Submaps) -> tuple[Loop, ...]:
-    """The saved loops, carried from their keyscans to the references of the places in which those lie."""
+    """The saved loops, moved from their keyscans to the references of the submaps that contain those."""
     owner = np.repeat(np.arange(len(places)), np.diff(places.start))
     loops = []
     nan = float("nan")
@@ -150,7 +154,7 @@ def _loops(state: MapState, places: Submaps) -> tuple[Loop, ...]:
 def _odometry_edges(
     motions: F64, covariances: F64, refused: NDArray[np.bool_], track: EventLog, parameters: GraphMapperParameters
 ) -> Edges:
-    """Steps from keyscan to keyscan by odometry alone, the scans being compared anew; without it, the matches'."""
+    """Steps from keyscan to keyscan by odometry alone, as the scans are compared again; without it, the matches'."""
     if not parameters.use_odometry:
         return Edges.chain(motions[1:], covariances[1:] + _ODOMETRY_FLOOR, refused[1:])
     odometry = track.key_odometry()

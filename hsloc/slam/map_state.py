@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
 
 VERSION = 1
+"""Version of the format of a saved map."""
 STATE_FILE = "map.npz"
 _FLAT = {
     "points": "f4", "hit_of_beam": "i4", "ranges": "f4", "point_start": "i8", "beam_start": "i8", "geometry": "f8",
@@ -42,9 +43,9 @@ _FLAT = {
 class MapState:
     """A finished map: keyscans at `poses` (n, 3), stamped.
 
-    `covariances` (n, 3, 3) tell how well the front end knew the motion to each keyscan from the one before it,
+    `covariances` (n, 3, 3) are those of the motion in the front end to each keyscan from the one before it,
     in whose frame they are; `refused` (n,) where it had odometry alone. `steps` are the odometry from keyscan to
-    keyscan (n - 1), `loops` those that were believed. `fingerprint` is that of the parameters that drew it.
+    keyscan (n - 1), `loops` the accepted ones. `fingerprint` is that of the mapper's parameters.
     """
 
     scans: KeyScans
@@ -61,7 +62,7 @@ class MapState:
 
 
 def fingerprint(parameters: object) -> str:
-    """Of parameters (dataclasses, whose repr says all): differs where a value does."""
+    """Of parameters (dataclasses, whose repr is complete): differs where a value does."""
     return hashlib.sha256(repr(parameters).encode()).hexdigest()
 
 
@@ -114,11 +115,11 @@ def read_state(path: Path) -> MapState:
         raise MapError(f"{path}: not a saved map; give the map.npz of a mapping run")
     if arrays["version"].shape != () or int(arrays["version"]) != VERSION:
         raise MapError(
-            f"{path}: a saved map of version {arrays['version']}, this hsloc reads {VERSION}; draw the map anew"
+            f"{path}: a saved map of version {arrays['version']}, this hsloc reads {VERSION}; build the map again"
         )
     wrong = _flaw(arrays)
     if wrong:
-        raise MapError(f"{path}: a damaged saved map: {wrong}; draw the map anew")
+        raise MapError(f"{path}: a damaged saved map: {wrong}; build the map again")
     return _state(arrays, str(path))
 
 

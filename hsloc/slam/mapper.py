@@ -2,7 +2,7 @@
 
 While the log is read, each scan is matched against the scans just before it. At its end loops are closed between
 places, the pose graph is solved, all scans are refined against all that see the same walls, until nothing moves, and
-the map is drawn.
+the map is built.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 class Mapper:
-    """An `Estimator` that draws its own map; `finish` tells what the whole log knows."""
+    """An `Estimator` that builds its own map; `finish` gives the result of the whole log."""
 
     def __init__(self, parameters: GraphMapperParameters, rng: Generator, resume: Resume | None = None) -> None:
         self._parameters = parameters
@@ -56,7 +56,7 @@ class Mapper:
     def update(self, event: Odometry | PairedScan) -> Estimate:
         """Take an event; the estimate at its stamp, in the map as it is known so far (it drifts)."""
         if isinstance(event, Odometry):
-            # Without odometry the message tells nothing: it stands where the last scan stood.
+            # Without odometry the message gives no motion: the pose is that of the last scan.
             T_odom_base = event.T_odom_base if self._parameters.use_odometry else self._T_last_scan
             self._track.add(T_odom_base, is_scan=False)
             return Estimate(event.stamp_ns, self._T_map_odom @ T_odom_base, Status.PREDICTED)
@@ -95,7 +95,7 @@ class Mapper:
     def _keep_companions(self, event: PairedScan, found: LocalMatch) -> LocalMatch:
         """Make the companions of a keyscan keyscans before it; the keyscan's match, seen from the last of them.
 
-        From scan to scan of one cloud the odometry tells the motion: each keeps its own beams, for each has an origin.
+        Between the scans of one cloud the motion is the odometry's: each keeps its own beams, for each has an origin.
         """
         numbers = {id(held.scan): number for number, held in self._held}
         motion, covariance = found.motion, found.covariance
@@ -109,7 +109,7 @@ class Mapper:
         return replace(found, motion=motion, covariance=covariance)
 
     def finish(self, progress: Callable[[float], None] | None = None) -> MappingResult:
-        """Close loops, refine, draw; `progress` is told parts from 0 to 1. May be called once, at the end.
+        """Close loops, refine, build the map, once at the end; `progress` is called with parts from 0 to 1.
 
         Raises MapError if no connection with the saved map is found.
         """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from hsloc.errors import ConfigError
 from hsloc.kernels.occupancy_counts import trace
 from hsloc.model.occupancy_grid import UNKNOWN, OccupancyGrid
 from hsloc.model.pose2 import Pose2
+from hsloc.parameters import NonNegative, Parameters, Positive, Range
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,39 +22,30 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OccupancyMapperParameters:
-    """How beams become cells."""
+class OccupancyMapperParameters(Parameters):
+    """How beams become cells of the map."""
 
-    resolution: float = 0.05
-    """Side of a cell (m)."""
-    hit_probability: float = 0.7
+    resolution: Positive = 0.05
+    """Side of a cell of the map [m]."""
+    hit_probability: Annotated[float, Range(0.5, 1, is_open=True)] = 0.7
     """Probability that a cell in which a beam ended is occupied."""
-    miss_probability: float = 0.45
-    """Probability that a cell through which a beam passed is occupied: grazing beams pass through many walls."""
-    max_probability: float = 0.97
-    """No cell is surer than this, of either."""
-    max_range: float = 30.0
-    """Beams are traced so far (m); a hit beyond counts as none."""
-    no_return_range: float = 4.0
-    """A beam without a return clears so much (m): glass and black walls give none either."""
-    margin: float = 0.5
-    """Around the outermost hit (m)."""
-
-    def __post_init__(self) -> None:
-        for name in ("resolution", "max_range"):
-            if not getattr(self, name) > 0.0:
-                raise ConfigError(f"occupancy: {name} is {getattr(self, name)}; it must be positive")
-        if not 0.0 < self.miss_probability < 0.5 < self.hit_probability < 1.0:
-            raise ConfigError(
-                f"occupancy: miss_probability is {self.miss_probability}, hit_probability {self.hit_probability}; "
-                "it must be 0 < miss_probability < 0.5 < hit_probability < 1"
-            )
+    miss_probability: Annotated[float, Range(0, 0.5, is_open=True)] = 0.45
+    """Probability that a cell through which a beam passed is occupied; near 0.5, as beams graze walls."""
+    max_probability: Annotated[float, Range(0.5, 1, is_open=True)] = 0.97
+    """Maximum probability of a cell to be occupied, and to be free."""
+    max_range: Positive = 30.0
+    """Maximum length of a beam that is traced [m]; a hit farther away does not count."""
+    no_return_range: NonNegative = 4.0
+    """Length that a beam without a return clears [m]; short, as glass and black walls give no return either."""
+    margin: NonNegative = 0.5
+    """Margin of the map around its outermost hit [m]."""
 
 
 _MOST_CELLS = 400_000_000
+"""Maximum number of cells of a map. Internal: its counts take 3.2 GB of memory."""
 
 
-def draw_grid(poses: F64, scans: KeyScans, parameters: OccupancyMapperParameters) -> OccupancyGrid:
+def build_grid(poses: F64, scans: KeyScans, parameters: OccupancyMapperParameters) -> OccupancyGrid:
     """The occupancy grid of keyscans at `poses` (n, 3), n at least 1; what no beam met stays unknown.
 
     Each cell's log odds are `hits * logit(hit) + misses * logit(miss)`, clamped: people who walked through
@@ -65,7 +57,7 @@ def draw_grid(poses: F64, scans: KeyScans, parameters: OccupancyMapperParameters
     width, height = (int(n) for n in np.ceil(high / p.resolution + p.margin / p.resolution) - corner)
     if width * height > _MOST_CELLS:
         raise ConfigError(
-            f"drawing: the map would have {width} x {height} cells of {p.resolution} m; choose a larger resolution"
+            f"occupancy: the map would have {width} x {height} cells of {p.resolution} m; choose a larger resolution"
         )
     hits, misses = np.zeros((height, width), dtype=np.int32), np.zeros((height, width), dtype=np.int32)
     for k in range(len(scans)):

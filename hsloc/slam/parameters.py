@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from hsloc.parameters import Count, Parameters
 from hsloc.slam.front_end import FrontEndParameters
 from hsloc.slam.joint_registration import JointRegistrationParameters
 from hsloc.slam.loop_matcher import LoopParameters
@@ -19,17 +20,17 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GraphMapperParameters:
-    """All of the graph mapper's, one default for all logs."""
+class GraphMapperParameters(Parameters):
+    """Parameters of the graph mapper; one default for all logs."""
 
     front_end: FrontEndParameters = field(default_factory=FrontEndParameters)
     loops: LoopParameters = field(default_factory=LoopParameters)
     joint_registration: JointRegistrationParameters = field(default_factory=JointRegistrationParameters)
     occupancy: OccupancyMapperParameters = field(default_factory=OccupancyMapperParameters)
     use_odometry: bool = True
-    """Otherwise a constant velocity predicts, and the log's odometry is not looked at."""
-    passes: int = 3
-    """The whole log is gone over again at most so often, until nothing moves."""
+    """Whether odometry predicts each scan's pose; otherwise a constant velocity does."""
+    passes: Count = 3
+    """Maximum number of passes of loop search and joint registration over the whole log."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
-"""The report's SLAM ([P] V): a map of points, each scan matched against the points so far.
+"""The SLAM of [P] V: a map of points, each scan matched against the points so far.
 
 The first scan is the map. Each later scan is localised against it inside the box of the prediction; where its fitness
 is at least 0.5, the points farther than a threshold from the map are added. A scan with too few points leaves the
-prediction. There is no way back: a bad pose spoils the map, as [P] says itself; the graph mapper is the answer to that.
+prediction. A bad pose spoils the map for good, as [P] states itself; the graph mapper corrects poses.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from hsloc.model.estimate import Estimate, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.parameters import Angle, Count, Parameters, Positive, Ratio
 from hsloc.slam.local_map import LocalMap
 
 if TYPE_CHECKING:
@@ -31,41 +32,40 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PointMapperParameters:
-    """The report's, at its own scale: a site of some 190 x 170 m."""
+class PointMapperParameters(Parameters):
+    """Parameters of the mapper of [P] at its own scale, a site of some 190 m by 170 m."""
 
-    sigma: float = 1.0
-    """Decay of a point's score with its distance to the map (m)."""
-    threshold: float = 1.5
-    """A point farther than this from the map is new (m)."""
-    min_fitness: float = 0.5
-    """A scan that fits worse adds nothing."""
-    min_points: int = 3
-    """A scan with fewer points is not matched ([P]: more than 2)."""
-    window_sigmas: float = 3.0
-    """Half-width of the window in standard deviations of the prediction."""
-    window_min: float = 0.3
-    """But at least so many metres (m)."""
-    window_min_angle: float = 0.035
-    """And so much of an angle (rad)."""
-    resolution: float = 0.25
-    """Between the nodes of the field (m)."""
-    max_distance: float = 6.0
-    """Beyond, a point scores nothing (m); [P] has no such limit, exp(-6) is 0.002."""
+    sigma: Positive = 1.0
+    """Decay length of a point's score with its distance from the map [m]."""
+    threshold: Positive = 1.5
+    """Distance from the map beyond which a point is added to it [m]."""
+    min_fitness: Ratio = 0.5
+    """Minimum fitness of a scan whose points are added to the map."""
+    min_points: Count = 3
+    """Minimum number of hits of a scan that is matched; [P] asks for more than 2."""
+    window_sigmas: Positive = 3.0
+    """Half-width of the search window in standard deviations of the prediction."""
+    window_min: Positive = 0.3
+    """Minimum half-width of the search window in x and y [m]."""
+    window_min_angle: Angle = 0.035
+    """Minimum half-width of the search window in heading [rad]."""
+    resolution: Positive = 0.25
+    """Distance of two nodes of the likelihood field [m]."""
+    max_distance: Positive = 6.0
+    """Distance from the map beyond which a point scores zero [m]; [P] has no such limit, but exp(-6) is 0.002."""
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
 
-    def __post_init__(self) -> None:
-        for name in ("sigma", "threshold", "window_sigmas", "window_min", "window_min_angle", "resolution"):
-            if not getattr(self, name) > 0.0:
-                raise ConfigError(f"point_mapper: {name} is {getattr(self, name)}; it must be positive")
-        if not self.max_distance >= self.threshold:
-            raise ConfigError(f"point_mapper: max_distance is {self.max_distance}; it must be at least the threshold")
-        if self.min_points < 1:
-            raise ConfigError(f"point_mapper: min_points is {self.min_points}; it must be at least 1")
+    def check_relations(self) -> None:
+        """The field must reach as far as the threshold."""
+        if self.max_distance < self.threshold:
+            raise ConfigError(
+                f"PointMapperParameters.max_distance is {self.max_distance}; it must be at least the threshold, "
+                f"{self.threshold}"
+            )
 
 
 _START = np.diag((1e-6, 1e-6, 1e-8))
-"""The pose of the first scan is taken as known."""
+"""Covariance of the first pose (m^2, rad^2). Internal: the map begins there, so that it is known by definition."""
 
 
 class PointMapper:
@@ -106,7 +106,7 @@ class PointMapper:
         return estimate
 
     def grid(self, resolution: float = 0.1) -> OccupancyGrid:
-        """The points as occupied cells; all else is unknown, for points tell nothing of what is free."""
+        """The points as occupied cells; all else is unknown, for points do not show what is free."""
         points = self.points
         if len(points) == 0:
             return OccupancyGrid(np.full((1, 1), UNKNOWN, dtype=np.int8), resolution)
@@ -139,4 +139,4 @@ class PointMapper:
     def _add(self, points: F64) -> None:
         if len(points):
             self._points.append(points)
-            self._map.draw(points, saturation_score=2.0)
+            self._map.add(points, saturation_score=2.0)

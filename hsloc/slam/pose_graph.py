@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import LogFormatError, OutputError
-from hsloc.kernels.normal_equations import add_edges
+from hsloc.kernels.normal_equations import Equations, add_edges
 from hsloc.model.pose2 import wrap_angles
 from hsloc.slam.sparse_solver import BlockSystem
 
@@ -42,14 +42,14 @@ class Edges:
         return Edges(np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
 
     @staticmethod
-    def chain(measured: F64, covariances: F64, doubted: NDArray[np.bool_] | None = None) -> Edges:
+    def chain(measured: F64, covariances: F64, uncertain: NDArray[np.bool_] | None = None) -> Edges:
         """Edges from each node to the next: `measured` (n - 1, 3) with covariances (n - 1, 3, 3).
 
-        They are trusted, but for those `doubted` (n - 1,), which may tear (Cauchy's weight with scale 1).
+        They are trusted, but for those `uncertain` (n - 1,), which may tear (Cauchy's weight with scale 1).
         """
         first = np.arange(len(measured))
         information: F64 = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
-        scale = np.full(len(first), np.inf) if doubted is None else np.where(doubted, 1.0, np.inf)
+        scale = np.full(len(first), np.inf) if uncertain is None else np.where(uncertain, 1.0, np.inf)
         return Edges(np.column_stack((first, first + 1)), measured, information, scale)
 
     @staticmethod
@@ -92,7 +92,7 @@ class PoseGraph:
 
     @staticmethod
     def read_g2o(path: str | Path) -> PoseGraph:
-        """Read a planar graph; nodes are numbered anew in the order of the file, stamps are zero, edges trusted.
+        """Read a planar graph; nodes are numbered in the order of the file, stamps are zero, edges trusted.
 
         Lines other than VERTEX_SE2 and EDGE_SE2 are passed over. Raises LogFormatError that names the line.
         """
@@ -132,7 +132,7 @@ class PoseGraph:
 def solve_edges(
     poses: F64, edges: Edges, rounds: int = 20, still: float = 1e-5, widened: tuple[float, ...] = ()
 ) -> F64:
-    """Gauss-Newton on a pose graph, robust weights found anew in each round; the first pose stays.
+    """Gauss-Newton on a pose graph, robust weights recomputed in each round; the first pose stays.
 
     In the first rounds the scales of the robust weights are multiplied by `widened`, so that edges which are far off at
     the start pull at all (graduated non-convexity, Yang et al. 2020).
@@ -147,7 +147,8 @@ def solve_edges(
     for k in range(rounds):
         diagonal, right = np.zeros((len(poses), 3, 3)), np.zeros((len(poses), 3))
         scale = edges.scale * widened[k] if k < len(widened) else edges.scale
-        add_edges(poses, edges.pairs, edges.measured, edges.information, scale, diagonal, blocks, right)
+        equations = Equations(diagonal, blocks, right)
+        add_edges(poses, edges.pairs, edges.measured, edges.information, scale, equations)
         step = solve_anchored(system, diagonal, blocks, right)
         poses = apply_increment(poses, step)
         if np.abs(step).max() < still and k >= len(widened):

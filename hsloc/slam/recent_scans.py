@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.point_to_line import choose_hits
-from hsloc.kernels.registration import RegistrationParameters, ScanArrays, register
+from hsloc.kernels.point_to_line import ScanArrays, choose_hits
+from hsloc.kernels.registration import Prior, RegistrationParameters, Scene, register
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.slam.keyscans import starts_of
 
@@ -142,8 +142,8 @@ class RecentScans:
             _GATES, _SCALE_OF_GATE, 1.0 / (_POINT_SIGMA**2 * _CORRELATED), _PRIOR_SCALE, _ROUNDS
         )
         pose, information, counts = start.to_array(), np.zeros((3, 3)), np.zeros(5)
-        prior: F64 = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-        chi = register(pose, len(still), poses, arrays, predicted.to_array(), prior, parameters, information, counts)
+        prior = Prior(predicted.to_array(), np.asarray(np.linalg.inv(covariance), dtype=np.float64))
+        chi = register(pose, Scene(len(still), poses, arrays), prior, parameters, information, counts)
         seen = max(float(counts[2]), 1.0)
         return ScanRegistration(
             Pose2.from_array(pose),

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 class BlockSystem:
     """A symmetric positive definite matrix of 3 x 3 blocks with a fixed pattern: n on the diagonal, m off it.
 
-    `rows` and `columns` (m,) say where the off-diagonal blocks stand, in either triangle; blocks that share a place are
-    added up.
+    `rows` and `columns` (m,) are the places of the off-diagonal blocks, in either triangle; blocks that share a place
+    are added up.
     """
 
     def __init__(self, size: int, rows: I64, columns: I64) -> None:

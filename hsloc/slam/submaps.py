@@ -20,21 +20,18 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
 
 
-REFUSED_WAY = 5.0
-"""A refused match may hide a slip: loops are looked for as if so many metres more had been driven."""
-
 UNKNOWN_STEP = 1e6 * np.eye(3)
-"""Covariance of a step of which nothing is known (m^2, rad^2)."""
+"""Covariance of a step that nothing measured (m^2, rad^2). Internal: larger than any building."""
 _FAR = 1e4
-"""Two logs count as so many metres of the way apart, until a loop connects them."""
+"""Path length (m) between two logs that no loop connects yet. Internal: any length beyond all drift."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Submaps:
-    """Place k holds keyscans start[k] to start[k + 1]; its frame is that of its middle one, `reference[k]`.
+    """Submap k holds keyscans start[k] to start[k + 1]; its frame is that of its middle one, `reference[k]`.
 
     `poses` (n, 3) are the front end's, of the keyscans; within a few places they are taken to be rigid. `steps`
-    (m - 1, 3) and `covariances` (m - 1, 3, 3) tell each place's reference in the frame of the one before.
+    (m - 1, 3) and `covariances` (m - 1, 3, 3) lead to each submap's reference in the frame of the one before.
     """
 
     start: I64
@@ -42,10 +39,10 @@ class Submaps:
     poses: F64
     steps: F64
     covariances: F64
-    doubted: NDArray[np.bool_]
+    uncertain: NDArray[np.bool_]
     """Steps (m - 1,) on which a match was refused: odometry alone, which may have slipped."""
-    way: F64
-    """Metres driven until each reference, shape (m,), a refused match counting as `REFUSED_WAY` more."""
+    path_length: F64
+    """Metres driven until each reference, shape (m,), with `refused_path_length` more for each refused match."""
     piece: I64
     """Shape (m,): where one log ends and the next begins the number changes; nothing is rigid across that."""
 
@@ -53,15 +50,19 @@ class Submaps:
         return len(self.reference)
 
     @staticmethod
-    def along(
+    def split_by_path_length(
         poses: F64,
         motions: F64,
         covariances: F64,
         length: float,
         turn_length: float,
         refused: NDArray[np.bool_] | None = None,
+        refused_path_length: float = 0.0,
     ) -> Submaps:
-        """Cut the way of keyscans into places of `length` metres; `motions` and `covariances` lead to each keyscan."""
+        """Submaps of `length` metres of the path; `motions` and `covariances` lead to each keyscan.
+
+        A rotation of one radian counts as `turn_length` metres, a refused match as `refused_path_length`.
+        """
         refused = np.zeros(len(poses), dtype=bool) if refused is None else refused
         way = np.cumsum(np.hypot(motions[:, 0], motions[:, 1]) + turn_length * np.abs(motions[:, 2]))
         index = np.floor(way / length).astype(np.int64)
@@ -77,13 +78,15 @@ class Submaps:
                 pose = pose @ motion
             chained[k] = covariance
         count = np.cumsum(refused)
-        doubted = np.diff(count[reference]) > 0
+        uncertain = np.diff(count[reference]) > 0
         piece = np.zeros(len(reference), dtype=np.int64)
-        return Submaps(start, reference, poses, steps, chained, doubted, (way + REFUSED_WAY * count)[reference], piece)
+        return Submaps(
+            start, reference, poses, steps, chained, uncertain, (way + refused_path_length * count)[reference], piece
+        )
 
     @staticmethod
     def concatenate(first: Submaps, second: Submaps) -> Submaps:
-        """Those of two logs in one map; the step from the first's last to the second's first says nothing."""
+        """Those of two logs in one map; the step from the first's last to the second's first is unknown."""
         scans = len(first.poses)
         seam = relative_poses(first.poses[None, first.reference[-1]], second.poses[None, second.reference[0]])
         return Submaps(
@@ -92,8 +95,8 @@ class Submaps:
             np.concatenate((first.poses, second.poses)),
             np.concatenate((first.steps, seam, second.steps)),
             np.concatenate((first.covariances, UNKNOWN_STEP[None], second.covariances)),
-            np.concatenate((first.doubted, [False], second.doubted)),
-            np.concatenate((first.way, first.way[-1] + _FAR + second.way)),
+            np.concatenate((first.uncertain, [False], second.uncertain)),
+            np.concatenate((first.path_length, first.path_length[-1] + _FAR + second.path_length)),
             np.concatenate((first.piece, first.piece[-1] + 1 + second.piece)),
         )
 
@@ -126,9 +129,9 @@ class Submaps:
         self, place: int, around: int, scans: KeyScans, max_range: float, resolution: float, sigma: float
     ) -> LocalMap:
         """The field of a place and its neighbours, in its frame."""
-        drawn = LocalMap(resolution, sigma, 3.0 * sigma)
-        drawn.draw(self.cloud(place, around, scans, max_range, 0.5 * resolution), saturation_score=0.95)
-        return drawn
+        local = LocalMap(resolution, sigma, 3.0 * sigma)
+        local.add(self.cloud(place, around, scans, max_range, 0.5 * resolution), saturation_score=0.95)
+        return local
 
     def expand(self, places: F64) -> F64:
         """Poses of all keyscans (n, 3) from poses of the places (m, 3), each keyscan rigid with its place."""

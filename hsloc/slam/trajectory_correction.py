@@ -1,4 +1,4 @@
-"""What a log told, event by event, and where all of it was once the keyscans' poses are known."""
+"""The events of a log, and the poses of all of them once the keyscans' poses are known."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class EventLog:
         return np.array([self._poses[k] for k in self._keys]).reshape(-1, 3)
 
     def calibrated(self, key_poses: F64) -> OdometryCalibration:
-        """What the final poses of the keyscans say of the odometry."""
+        """Calibration of the odometry by the final poses of the keyscans."""
         return calibrate(
             self._index(), np.array(self._poses).reshape(-1, 3), np.array(self._keys, dtype=int), key_poses
         )
@@ -54,7 +54,7 @@ class EventLog:
         """Poses in the map of all odometry messages (k, 3) and of all scans (m, 3).
 
         Each event lies between two keyscans, on the odometry seen from both; what they disagree in is shared out
-        along the way: a wheel errs while it turns, not while it stands.
+        along the path: a wheel errs while it turns, not while it stands.
         """
         odometry = np.array(self._poses).reshape(-1, 3)
         is_scan = np.array(self._is_scan, dtype=bool)
@@ -64,12 +64,12 @@ class EventLog:
             odometry = apply(calibration, self._index(), odometry)
         steps = relative_poses(odometry[:-1], odometry[1:])
         lengths = np.hypot(steps[:, 0], steps[:, 1]) + self._turn_length * np.abs(steps[:, 2])
-        way = np.concatenate(([0.0], np.cumsum(lengths)))
+        path_length = np.concatenate(([0.0], np.cumsum(lengths)))
         keys = np.array(self._keys, dtype=np.int64)
         before = np.clip(np.searchsorted(keys, np.arange(len(odometry)), side="right") - 1, 0, len(keys) - 1)
         after = np.minimum(before + 1, len(keys) - 1)
-        span = way[keys[after]] - way[keys[before]]
-        fraction = np.clip((way - way[keys[before]]) / np.maximum(span, 1e-12), 0.0, 1.0)
+        span = path_length[keys[after]] - path_length[keys[before]]
+        fraction = np.clip((path_length - path_length[keys[before]]) / np.maximum(span, 1e-12), 0.0, 1.0)
         from_before = compose_poses(key_poses[before], relative_poses(odometry[keys[before]], odometry))
         from_after = compose_poses(key_poses[after], relative_poses(odometry[keys[after]], odometry))
         apart = from_after - from_before
@@ -87,6 +87,6 @@ class EventLog:
         return np.asarray(np.maximum.accumulate(index), dtype=np.float64)
 
     def odometry(self) -> F64:
-        """Odometry messages as the log told them, shape (k, 3)."""
+        """Odometry messages of the log, shape (k, 3)."""
         poses: F64 = np.array(self._poses).reshape(-1, 3)[~np.array(self._is_scan, dtype=bool)]
         return poses

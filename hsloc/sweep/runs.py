@@ -15,6 +15,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hsloc.analysis.limits import exceeded_limits
 from hsloc.config import to_dict
 from hsloc.errors import HslocError
 from hsloc.export.results_folder import write_results
@@ -62,6 +63,11 @@ class Outcome:
     metrics: RunMetrics | None = None
     timings: RunTimings | None = None
     error: str = ""
+
+    @property
+    def limits(self) -> tuple[str, ...]:
+        """The limits of the request that the result does not keep."""
+        return () if self.metrics is None else exceeded_limits(self.run.spec, self.metrics)
 
     @property
     def data_lost(self) -> bool:

@@ -32,6 +32,7 @@ COLUMNS = (
     "seconds",
     "times_real_time",
     "data_lost",
+    "limits",
     "error",
 )
 """APE and RPE (per metre) are root mean squares, `residual_m` is the median distance from scan to map."""
@@ -54,6 +55,7 @@ def _row(outcome: Outcome) -> dict[str, Any]:
         "seed": outcome.run.spec.seed,
         "state": outcome.state,
         "data_lost": outcome.data_lost,
+        "limits": "; ".join(outcome.limits),
         "error": outcome.error,
     }
     if metrics is not None:
@@ -120,5 +122,5 @@ def as_text(outcomes: Sequence[Outcome]) -> str:
         "  ".join(c.ljust(w) if n < 2 else c.rjust(w) for n, (c, w) in enumerate(zip(line, widths, strict=True)))
         for line in lines
     ]
-    text += [f"{row['run']}: {row['error']}" for row in found if row["error"]]
+    text += [f"{row['run']}: {row['error'] or row['limits']}" for row in found if row["error"] or row["limits"]]
     return "\n".join(line.rstrip() for line in text) + "\n"

@@ -17,7 +17,7 @@ import numpy as np
 
 from hsloc.atomic_write import write_atomically
 from hsloc.errors import EvaluationError
-from hsloc.model import Pose2, Trajectory
+from hsloc.model import Trajectory
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -84,44 +84,25 @@ def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     write_atomically(Path(path), lambda stream: stream.writelines(text.encode() for text in _blocks(trajectory)))
 
 
-def read_tum(path: str | Path) -> Trajectory:
-    """Read a TUM file, or the planar form `t x y theta` (metres, radians); `.gz` is unpacked.
-
-    Comments, blank lines, tabs, several spaces and commas do not matter, nor does a first line of column names; the
-    order of the file is kept.
-    Raises `EvaluationError` that names the file and the line.
-    """
-    path = Path(path)
-    stamps: list[int] = []
-    poses: list[tuple[float, float, float]] = []
-    for number, line in read_lines(path):
-        fields = line.replace(",", " ").split()
-        if not stamps and number == 1 and _names_columns(path, fields):
-            continue
-        try:
-            stamp_ns, pose = _parse_pose(fields)
-        except ValueError as error:
-            raise EvaluationError(f"{path}, line {number}: {error}") from None
-        stamps.append(stamp_ns)
-        poses.append(pose)
-    if not stamps:
-        raise EvaluationError(f"{path}: holds no pose; a TUM file has lines `t x y z qx qy qz qw`")
-    return Trajectory(np.array(stamps, dtype=np.int64), np.array(poses, dtype=np.float64).reshape(-1, 3))
-
-
-def _names_columns(path: Path, fields: list[str]) -> bool:
-    """Whether a line is the head of a CSV. Raises `EvaluationError` where it has the quaternion begin with w."""
-    names = [field.strip("\"'").lower() for field in fields]
-    if not all(name[:1].isalpha() and name not in ("nan", "inf", "infinity") for name in names):
-        return False
-    w, x = ([row for row, name in enumerate(names) if name in (f"q{axis}", f"q_{axis}", axis)] for axis in "wx")
-    if w and x and w[0] < x[-1] and len(names) == 8:
-        raise EvaluationError(f"{path}: its quaternions begin with w; the order must be t x y z qx qy qz qw")
-    return True
-
-
 def read_lines(path: Path) -> Iterator[tuple[int, str]]:
     """The lines of a text file (or .gz) that hold something, with their numbers; raises `EvaluationError`."""
+    for number, line in enumerate(_text(path).splitlines(), start=1):
+        stripped = line.strip()
+        if stripped and not stripped.startswith("#"):
+            yield number, stripped
+
+
+def read_comments(path: Path) -> Iterator[str]:
+    """The comments (`#`) before the first line that holds something; raises `EvaluationError`."""
+    for line in _text(path).splitlines():
+        stripped = line.strip()
+        if stripped and not stripped.startswith("#"):
+            return
+        if stripped:
+            yield stripped
+
+
+def _text(path: Path) -> str:
     try:
         raw = path.read_bytes()
         text = (gzip.decompress(raw) if path.suffix == ".gz" else raw).decode("utf-8-sig")
@@ -131,10 +112,7 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
         raise EvaluationError(f"{path}: not a text file; expected lines of numbers") from None
     except (OSError, EOFError, zlib.error) as error:
         raise EvaluationError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
-    for number, line in enumerate(text.splitlines(), start=1):
-        stripped = line.strip()
-        if stripped and not stripped.startswith("#"):
-            yield number, stripped
+    return text
 
 
 def parse_numbers(fields: list[str]) -> list[float]:
@@ -157,18 +135,3 @@ def parse_stamp_field(field: str) -> int:
         return parse_stamp(field)
     except ValueError:
         raise ValueError(f"{field!r} is not a stamp in seconds") from None
-
-
-def _parse_pose(fields: list[str]) -> tuple[int, tuple[float, float, float]]:
-    if len(fields) not in (4, 8):
-        raise ValueError(f"{len(fields)} columns; a TUM line has 8: t x y z qx qy qz qw")
-    stamp_ns = parse_stamp_field(fields[0])
-    numbers = parse_numbers(fields[1:])
-    if len(fields) == 4:
-        x, y, theta = numbers
-        return stamp_ns, (x, y, math.remainder(theta, math.tau))
-    x, y, _, qx, qy, qz, qw = numbers
-    norm = math.hypot(qx, qy, qz, qw)
-    if abs(norm - 1.0) > QUATERNION_TOLERANCE:
-        raise ValueError(f"the quaternion has length {norm:.3g} instead of 1; its order is qx qy qz qw")
-    return stamp_ns, (x, y, Pose2.from_quaternion(x, y, qx, qy, qz, qw).theta)

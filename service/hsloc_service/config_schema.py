@@ -6,22 +6,16 @@ a second, and the server needs none of them.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import json
 import subprocess
 import sys
 import threading
-import types
 import typing
 from typing import Any
 
 from hsloc_service.errors import ServiceError
 
-_KINDS = {float: "number", int: "integer", bool: "boolean", str: "string"}
-_LARGEST: dict[str, float] = {"number": 1e300, "integer": (1 << 63) - 1}
-"""What the schema allows; the ranges that make sense are the job's to check."""
-_ITEMS = 1000
 _making = threading.Lock()
 
 
@@ -39,9 +33,9 @@ def _options() -> dict[str, Any]:
 
 
 def check(config: dict[str, Any]) -> dict[str, Any]:
-    """The parameters, whole numbers as such (to JSON Schema, 30.0 is an integer); ranges are checked by the job.
+    """The parameters, whole numbers as such (to JSON Schema, 30.0 is an integer).
 
-    Raises ServiceError 422 for an unknown key or a value of the wrong type.
+    Raises ServiceError 422 for an unknown key, and for a value of the wrong type or outside its range.
     """
     return typing.cast("dict[str, Any]", _check(config, options()["config_schema"], "config"))
 
@@ -65,14 +59,14 @@ def _check(value: Any, schema: dict[str, Any], where: str) -> Any:
                 raise _wrong(f"{where}.{key[:60]}", f"is unknown; known are {', '.join(schema['properties'])}")
         return {key: _check(item, schema["properties"][key], f"{where}.{key}") for key, item in value.items()}
     if kind == "array":
-        if not isinstance(value, list) or len(value) > _ITEMS:
-            raise _wrong(where, f"must be a list of at most {_ITEMS}")
+        if not isinstance(value, list) or not schema["minItems"] <= len(value) <= schema["maxItems"]:
+            raise _wrong(where, f"must be a list of {schema['minItems']} to {schema['maxItems']} values")
         return [_check(item, schema["items"], where) for item in value]
     if kind == "integer":
         value = whole(value)
     fits = {
-        "number": isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST["number"],
-        "integer": isinstance(value, int) and not isinstance(value, bool) and abs(value) <= _LARGEST["integer"],
+        "number": isinstance(value, int | float) and not isinstance(value, bool),
+        "integer": isinstance(value, int) and not isinstance(value, bool),
         "boolean": isinstance(value, bool),
         "string": isinstance(value, str),
     }
@@ -80,6 +74,12 @@ def _check(value: Any, schema: dict[str, Any], where: str) -> Any:
         raise _wrong(where, f"must be of type {kind}")
     if "enum" in schema and value not in schema["enum"]:
         raise _wrong(where, f"must be one of {', '.join(schema['enum'])}")
+    low = schema.get("minimum", schema.get("exclusiveMinimum"))
+    high = schema.get("maximum", schema.get("exclusiveMaximum"))
+    if low is not None and high is not None:
+        is_open = "exclusiveMinimum" in schema
+        if not (low < value < high if is_open else low <= value <= high):
+            raise _wrong(where, f"must be from {low:g} to {high:g}{', both excluded' if is_open else ''}")
     return value
 
 
@@ -88,42 +88,13 @@ def _wrong(where: str, what: str) -> ServiceError:
 
 
 def _describe() -> dict[str, Any]:
-    from hsloc.config import Config, preset, to_dict
-    from hsloc.options import MAPPERS, MATCHER_ALIASES, MATCHERS, PRESETS
+    from hsloc.config import preset, to_dict
+    from hsloc.options import PRESETS
+    from hsloc.parameter_reference import json_schema
 
-    schema = _schema(Config, Config())
-    schema["properties"]["matcher"]["enum"] = [*MATCHERS, *MATCHER_ALIASES]
-    schema["properties"]["mapper"]["enum"] = list(MAPPERS)
+    schema = json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     return {"config_schema": schema, "presets": {name: to_dict(preset(name)) for name in PRESETS}}
-
-
-def _schema(hint: Any, default: Any) -> dict[str, Any]:
-    """JSON Schema of a type of the configuration."""
-    if dataclasses.is_dataclass(hint):
-        hints = typing.get_type_hints(hint)
-        names = [each.name for each in dataclasses.fields(hint)]
-        properties = {name: _schema(hints[name], getattr(default, name)) for name in names}
-        return {"type": "object", "additionalProperties": False, "properties": properties}
-    if isinstance(hint, types.UnionType):
-        inner = next(kind for kind in hint.__args__ if kind is not type(None))
-        return {"anyOf": [_schema(inner, default), {"type": "null"}]}
-    if typing.get_origin(hint) is tuple:
-        inner = typing.get_args(hint)[0]
-        items = _bounded(_KINDS.get(inner, "number"))
-        return {"type": "array", "items": items, "maxItems": _ITEMS, "default": list(default or ())}
-    found = _bounded(_KINDS.get(typing.get_origin(hint) or hint, "string"))
-    if typing.get_origin(hint) is typing.Literal:
-        found = {"type": "string", "enum": list(typing.get_args(hint))}
-    if default is not None:
-        found["default"] = default
-    return found
-
-
-def _bounded(kind: str) -> dict[str, Any]:
-    if kind not in _LARGEST:
-        return {"type": kind}
-    return {"type": kind, "minimum": -_LARGEST[kind], "maximum": _LARGEST[kind]}
 
 
 if __name__ == "__main__":

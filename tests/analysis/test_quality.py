@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,11 +19,11 @@ from hsloc.warnings import WarningCode
 OFFICE = Path(__file__).resolve().parents[2] / "recordings" / "office.mcap"
 
 
-def rewritten(path, change, end=20.0):
+def rewritten(path: Any, change: Any, end: float = 20.0) -> Any:
     """The office, with each event changed by `change`."""
     log = open_log(OFFICE, ReadOptions(end_s=end))
     with LogWriter(path) as writer:
-        writer.occupancy_grid(log.map(), log.summary.origin_ns)
+        writer.occupancy_grid(log.map(), log.summary.origin_ns)  # type: ignore[arg-type]
         for event in map(change, log.events()):
             if isinstance(event, Scan):
                 writer.scan(event)
@@ -31,14 +32,14 @@ def rewritten(path, change, end=20.0):
     return path
 
 
-def test_a_sound_run_is_good():
+def test_a_sound_run_is_good() -> None:
     found = run(RunRequest(logs=(OFFICE,), read=ReadOptions(end_s=20.0), unknown_start=True))
     assert quality_warnings(found) == []
     assert verdict_reasons(found, found.warnings) == ()
 
 
-def test_a_laser_that_is_mounted_upside_down_unstated_is_warned_of(tmp_path):
-    def mirrored(event):
+def test_a_laser_that_is_mounted_upside_down_unstated_is_warned_of(tmp_path: Path) -> None:
+    def mirrored(event: Any) -> Any:
         return replace(event, ranges=event.ranges[::-1].copy()) if isinstance(event, Scan) else event
 
     found = run(RunRequest(logs=(rewritten(tmp_path / "run.mcap", mirrored),), unknown_start=True))
@@ -51,7 +52,7 @@ def test_a_laser_that_is_mounted_upside_down_unstated_is_warned_of(tmp_path):
     assert 0.0 <= reason.times[0][0] <= reason.times[-1][1] <= 20.0
 
 
-def test_a_log_too_short_to_be_sure_is_all_guesses():
+def test_a_log_too_short_to_be_sure_is_all_guesses() -> None:
     found = run(RunRequest(logs=(OFFICE,), read=ReadOptions(end_s=0.5), unknown_start=True))
     assert not found.localised.any()
     (warning,) = quality_warnings(found)
@@ -60,8 +61,8 @@ def test_a_log_too_short_to_be_sure_is_all_guesses():
     assert reason.verdict == "failed"
 
 
-def test_odometry_that_is_told_in_millimetres_is_not_mended(tmp_path):
-    def in_millimetres(event):
+def test_odometry_that_is_told_in_millimetres_is_not_mended(tmp_path: Path) -> None:
+    def in_millimetres(event: Any) -> Any:
         if isinstance(event, Odometry):
             pose = event.T_odom_base
             return replace(event, T_odom_base=Pose2(1000.0 * pose.x, 1000.0 * pose.y, pose.theta))
@@ -77,8 +78,8 @@ def test_odometry_that_is_told_in_millimetres_is_not_mended(tmp_path):
 
 @pytest.mark.parametrize("mode", ["localise", "slam"])
 @pytest.mark.parametrize("reset", [Pose2(5.0, 0.0, 0.0), Pose2(0.1, 0.0, 3.0), Pose2(-40.0, 7.0, -2.0)])
-def test_odometry_that_begins_anew_goes_on_where_it_was_and_is_told(tmp_path, mode, reset):
-    def begun_anew(event):
+def test_odometry_that_begins_anew_goes_on_where_it_was_and_is_told(tmp_path: Path, mode: Any, reset: Any) -> None:
+    def begun_anew(event: Any) -> Any:
         if isinstance(event, Odometry) and event.stamp_ns >= 1_700_000_010_000_000_000:
             return replace(event, T_odom_base=reset @ event.T_odom_base)
         return event
@@ -99,11 +100,11 @@ def test_odometry_that_begins_anew_goes_on_where_it_was_and_is_told(tmp_path, mo
     assert found.localised.all()
 
 
-def test_the_way_is_retraced_as_far_as_the_scans_fit_and_no_farther(tmp_path):
+def test_the_way_is_retraced_as_far_as_the_scans_fit_and_no_farther(tmp_path: Path) -> None:
     """For eight seconds the lidar sees nothing of the map, so that nobody can say where the robot was at first."""
     rng = np.random.default_rng(0)
 
-    def blind(event):
+    def blind(event: Any) -> Any:
         if isinstance(event, Scan) and event.stamp_ns < 1_700_000_008_000_000_000:
             clutter = rng.uniform(0.3, 6.0, len(event.ranges)).astype(np.float32)
             return replace(event, ranges=clutter)

@@ -7,6 +7,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import jsonschema_rs
 import numpy as np
@@ -23,12 +24,15 @@ from hsloc.run_metrics import RunMetrics, RunTimings, schema
 from hsloc.warnings import RunWarning, WarningCode
 from hsloc_service.execution.worker import summarise
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 ROOT = Path(__file__).resolve().parents[2]
 KIDNAPPED = ROOT / "recordings" / "kidnapped.mcap"
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """(folder, what the terminal shows) of a robot that is kidnapped after 30 s."""
     import contextlib
     import io
@@ -40,7 +44,7 @@ def run(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def metrics(run):
+def metrics(run: Any) -> Any:
     return RunMetrics.read(run[0] / "metrics.json")
 
 
@@ -49,15 +53,15 @@ def words(text: str) -> str:
     return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", text)).split())
 
 
-def test_the_published_schema_is_that_of_the_classes():
+def test_the_published_schema_is_that_of_the_classes() -> None:
     path = ROOT / "docs" / "schemas" / "run-metrics.json"
     made = json.dumps(schema(), indent=2, ensure_ascii=False) + "\n"
     assert path.read_text(encoding="utf-8") == made, "run: python -m hsloc.run_metrics docs/schemas"
     assert jsonschema_rs.meta.is_valid(schema())
 
 
-def test_every_number_of_the_schema_has_a_unit_or_is_a_count():
-    def numbers(part, name):
+def test_every_number_of_the_schema_has_a_unit_or_is_a_count() -> None:
+    def numbers(part: Any, name: Any) -> Iterator[Any]:
         for key, value in part.get("properties", {}).items():
             if "number" in value.get("type", ()):
                 yield f"{name}.{key}", value["description"]
@@ -73,7 +77,7 @@ def test_every_number_of_the_schema_has_a_unit_or_is_a_count():
     assert set(unitless) == {*(f"Statistics.{name}" for name in statistics), "RelativeError.delta"}
 
 
-def test_a_run_fits_the_schema_and_reads_back(run, metrics):
+def test_a_run_fits_the_schema_and_reads_back(run: Any, metrics: Any) -> None:
     written = json.loads((run[0] / "metrics.json").read_text())
     jsonschema_rs.validate(schema(), written)
     assert metrics.to_json() == written
@@ -85,7 +89,7 @@ def test_a_run_fits_the_schema_and_reads_back(run, metrics):
     assert min(times["seconds"].values()) > 0.0
 
 
-def test_what_cannot_be_measured_is_null_and_reads_back_as_nan():
+def test_what_cannot_be_measured_is_null_and_reads_back_as_nan() -> None:
     path = Trajectory(np.arange(3, dtype=np.int64), np.zeros((3, 3)))
     values = json.loads(json.dumps(sample_metrics(compare(path, path)).to_json(), allow_nan=False))
     jsonschema_rs.validate(schema(), values)
@@ -104,7 +108,7 @@ def test_what_cannot_be_measured_is_null_and_reads_back_as_nan():
         ({"log": 3}, r"RunMetrics\.log is 3; it must be an object"),
     ],
 )
-def test_other_content_is_refused_by_name(tmp_path, change, message):
+def test_other_content_is_refused_by_name(tmp_path: Path, change: Any, message: Any) -> None:
     path = tmp_path / "metrics.json"
     path.write_text(json.dumps(sample_metrics().to_json() | change))
     with pytest.raises(HslocError, match=message) as caught:
@@ -112,24 +116,24 @@ def test_other_content_is_refused_by_name(tmp_path, change, message):
     assert str(path) in str(caught.value)
 
 
-def test_keys_of_a_later_version_are_ignored():
+def test_keys_of_a_later_version_are_ignored() -> None:
     later = sample_metrics().to_json() | {"schema_version": "1.9", "brand_new": {"x": 1}}
     assert RunMetrics.from_json(later) == replace(sample_metrics(), schema_version="1.9")
 
 
-def test_every_code_is_documented():
+def test_every_code_is_documented() -> None:
     text = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8")
     assert [code for code in WarningCode if f"| `{code}` |" not in text] == []
 
 
-def test_the_worst_reason_is_the_verdict():
+def test_the_worst_reason_is_the_verdict() -> None:
     reasons = [VerdictReason(Verdict(each), "x", "x") for each in ("check", "failed", "check")]
     assert verdict_of(reasons) == Verdict.FAILED
     assert verdict_of(reasons[:1]) == Verdict.CHECK
     assert verdict_of([]) == Verdict.GOOD
 
 
-def test_every_figure_is_the_same_on_the_terminal_in_the_report_and_on_the_page(run, metrics):
+def test_every_figure_is_the_same_on_the_terminal_in_the_report_and_on_the_page(run: Any, metrics: Any) -> None:
     folder, terminal = run
     report = words((folder / "report.html").read_text())
     summary = summarise(metrics, RunTimings(seconds={"replay": 1.0}, times_real_time=None, evaluations_per_second=None))
@@ -148,14 +152,14 @@ def test_every_figure_is_the_same_on_the_terminal_in_the_report_and_on_the_page(
         assert f"{label} [{unit}] {values.rmse:.4f} {values.mean:.4f}" in report
 
 
-def test_the_error_of_a_kidnapped_robot_is_shown_where_it_is_localised_too(run, metrics):
+def test_the_error_of_a_kidnapped_robot_is_shown_where_it_is_localised_too(run: Any, metrics: Any) -> None:
     """Not 1.5 m alone, when all that is wrong is a second that the robot itself calls a guess."""
     whole, known = metrics.errors.ape.trans_part.rmse, metrics.localised_only.ape.trans_part.rmse
     assert known < 0.05 < 1.0 < whole
     assert f"APE rmse where localised {100 * known:.2f} cm" in words(run[1])
 
 
-def test_counts_of_scans_add_up(run, metrics):
+def test_counts_of_scans_add_up(run: Any, metrics: Any) -> None:
     scans = metrics.scans
     assert sum(scans.by_status.values()) == sum(scans.by_reason.values()) == scans.total
     matched, others = (row.values[0] for row in table_rows(metrics) if row.label.startswith("scans"))
@@ -164,7 +168,7 @@ def test_counts_of_scans_add_up(run, metrics):
     assert scans.used + sum(int(n) for n in re.findall(r"(\d+) [a-z]", others)) == scans.total
 
 
-def test_the_reasons_name_places_and_times(metrics):
+def test_the_reasons_name_places_and_times(metrics: Any) -> None:
     (reason,) = metrics.verdict_reasons
     assert reason.code == "poses_not_localised"
     ((begin, end),) = reason.times
@@ -172,7 +176,7 @@ def test_the_reasons_name_places_and_times(metrics):
     assert len(reason.places) == 2
 
 
-def test_a_job_keeps_all_warnings_of_the_run():
+def test_a_job_keeps_all_warnings_of_the_run() -> None:
     """Those of the analysis too, which concern the result more than those of the log."""
     warnings = (
         RunWarning(WarningCode.CLOCKS_APART, "stamps differ"),

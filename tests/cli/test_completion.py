@@ -11,7 +11,7 @@ from hsloc.cli.main import COMMANDS, main
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_every_command_is_known_to_every_shell(capsys, shell):
+def test_every_command_is_known_to_every_shell(capsys: pytest.CaptureFixture[str], shell: str) -> None:
     assert main(["completion", shell]) == 0
     script = capsys.readouterr().out
     assert all(name in script for name in COMMANDS)
@@ -25,7 +25,7 @@ def test_every_command_is_known_to_every_shell(capsys, shell):
     ("words", "expected"),
     [("hsloc re", {"record", "replay", "reproduce"}), ("hsloc replay --unk", {"--unknown-start"})],
 )
-def test_bash_completes(capsys, words, expected):
+def test_bash_completes(capsys: pytest.CaptureFixture[str], words: str, expected: set[str]) -> None:
     assert main(["completion", "bash"]) == 0
     script = capsys.readouterr().out
     asked = (
@@ -36,7 +36,7 @@ def test_bash_completes(capsys, words, expected):
     assert expected <= {word.strip() for word in done.stdout.split()}
 
 
-def test_other_shells_are_wrong_use(capsys):
+def test_other_shells_are_wrong_use(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["completion", "cmd"])
     assert stop.value.code == 2

@@ -11,24 +11,20 @@ import json
 import re
 import shutil
 import sqlite3
-import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "log"))
-
 import log_formats as formats
+import pytest
 from log_builders import chunk_data_at, chunks_of, flipped
 from mcap.writer import CompressionType, IndexType
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 SCANS = 60
 
 

@@ -8,25 +8,26 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 OFFICE = str(RECORDINGS / "office.mcap")
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def fails(capsys, *argv, code=1):
+def fails(capsys: pytest.CaptureFixture[str], *argv: str, code: int = 1) -> str:
     """Run a command that must fail; its one line on stderr."""
     try:
-        status = main(argv)
+        status: object = main(argv)
     except SystemExit as stop:
         status = stop.code
     printed = capsys.readouterr()
@@ -40,13 +41,13 @@ def fails(capsys, *argv, code=1):
     return lines[-1]
 
 
-def empty(folder):
+def empty(folder: Path) -> bool:
     return not [path for path in folder.rglob("*") if path.is_file() and path.suffix not in (".yaml", ".txt", ".mcap")]
 
 
 @pytest.mark.parametrize("argv", [["info", OFFICE, "--json"], ["config"], ["record", "--list"], ["completion", "bash"]])
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_full_disk_behind_stdout_is_one_line(argv, unbuffered):
+def test_a_full_disk_behind_stdout_is_one_line(argv: list[str], unbuffered: str) -> None:
     command = [sys.executable, "-m", "hsloc.cli.main", *argv]
     with open("/dev/full", "w") as full:
         done = subprocess.run(
@@ -58,14 +59,14 @@ def test_a_full_disk_behind_stdout_is_one_line(argv, unbuffered):
     ]
 
 
-def test_a_name_that_the_terminal_cannot_show_is_escaped(here):
+def test_a_name_that_the_terminal_cannot_show_is_escaped(here: Path) -> None:
     (here / "Büro.mcap").write_bytes(Path(OFFICE).read_bytes())
     command = [sys.executable, "-m", "hsloc.cli.main", "info", "--quick", "Büro.mcap"]
     done = subprocess.run(command, capture_output=True, env=os.environ | {"PYTHONIOENCODING": "ascii"}, check=True)
     assert rb"B\xfcro.mcap" in done.stdout
 
 
-def test_a_name_that_is_no_text_is_read_and_reported(here, capsys):
+def test_a_name_that_is_no_text_is_read_and_reported(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     name = os.fsdecode(b"B\xfcro.mcap")
     (here / name).write_bytes(Path(OFFICE).read_bytes())
     assert main(["replay", name, "--end", "2", "--out", "out", "-q"]) == 0
@@ -85,13 +86,15 @@ def test_a_name_that_is_no_text_is_read_and_reported(here, capsys):
         ([OFFICE, "--start", "5000"], "no scan between --start and --end"),
     ],
 )
-def test_what_is_not_there_is_named(here, capsys, argv, expected):
+def test_what_is_not_there_is_named(
+    here: Path, capsys: pytest.CaptureFixture[str], argv: list[str], expected: str
+) -> None:
     line = fails(capsys, "replay", *argv, "--out", "out")
     assert expected in line
     assert empty(here)
 
 
-def test_not_a_log(here, capsys):
+def test_not_a_log(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (here / "notes.txt").write_text("dear diary\n")
     assert "notes.txt: is not an MCAP, a ROS bag or a CARMEN log" in fails(capsys, "replay", "notes.txt")
     (here / "broken.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\0" * 30)
@@ -101,7 +104,7 @@ def test_not_a_log(here, capsys):
     assert empty(here)
 
 
-def write_log(path, scans=("/scan",), odometry=True, grid=False):
+def write_log(path: Path, scans: tuple[Any, ...] = ("/scan",), odometry: bool = True, grid: bool = False) -> None:
     import numpy as np
 
     from hsloc.log import LogWriter
@@ -116,7 +119,7 @@ def write_log(path, scans=("/scan",), odometry=True, grid=False):
                 writer.scan(Scan(stamp, np.ones(10, dtype=np.float32), 0.0, 0.1, 0.1, 10.0), topic=topic)
 
 
-def test_topics_missing_or_ambiguous_are_told_with_their_remedy(here, capsys):
+def test_topics_missing_or_ambiguous_are_told_with_their_remedy(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_log(here / "two.mcap", scans=("/front", "/rear"))
     line = fails(capsys, "replay", "two.mcap")
     assert "/front" in line
@@ -129,10 +132,10 @@ def test_topics_missing_or_ambiguous_are_told_with_their_remedy(here, capsys):
     assert empty(here)
 
 
-def test_localising_without_a_map_asks_for_one(here, capsys):
+def test_localising_without_a_map_asks_for_one(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_log(here / "bare.mcap")
     assert "--map" in fails(capsys, "replay", "bare.mcap", "--mode", "localise", "--out", "out")
-    line = fails(capsys, "replay", OFFICE, "--mode", "localise", "--no-odom", "--out", "out")
+    line = fails(capsys, "replay", OFFICE, "--mapper", "point", "--mode", "slam", "--no-odom", "--out", "out")
     assert "--no-odom" in line
     assert empty(here)
 
@@ -150,7 +153,9 @@ def test_localising_without_a_map_asks_for_one(here, capsys):
         ("likelihood_field: {sigma: .nan}\n", "sigma is nan"),
     ],
 )
-def test_a_wrong_configuration_is_refused_by_name(here, capsys, text, expected):
+def test_a_wrong_configuration_is_refused_by_name(
+    here: Path, capsys: pytest.CaptureFixture[str], text: str, expected: str
+) -> None:
     (here / "wrong.yaml").write_text(text)
     line = fails(capsys, "replay", OFFICE, "--config", "wrong.yaml")
     assert "wrong.yaml" in line
@@ -158,7 +163,7 @@ def test_a_wrong_configuration_is_refused_by_name(here, capsys, text, expected):
     assert empty(here)
 
 
-def test_a_map_that_cannot_be_read(here, capsys):
+def test_a_map_that_cannot_be_read(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (here / "map.yaml").write_text(
         "image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\noccupied_thresh: 0.65\nfree_thresh: 0.196\nnegate: 0\n"
     )
@@ -167,14 +172,14 @@ def test_a_map_that_cannot_be_read(here, capsys):
     assert "map.pgm" in fails(capsys, "replay", OFFICE, "--map", "map.yaml")
 
 
-def test_a_folder_that_is_full_of_something_else_is_left_alone(here, capsys):
+def test_a_folder_that_is_full_of_something_else_is_left_alone(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (here / "out").mkdir()
     (here / "out" / "thesis.tex").write_text("do not lose me")
     assert "out: exists already" in fails(capsys, "replay", OFFICE, "--out", "out")
     assert (here / "out" / "thesis.tex").read_text() == "do not lose me"
 
 
-def test_a_folder_under_a_file_cannot_be_written(here, capsys):
+def test_a_folder_under_a_file_cannot_be_written(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (here / "file.txt").write_text("")
     assert "cannot be written" in fails(capsys, "replay", OFFICE, "--out", "file.txt/out")
 
@@ -191,12 +196,12 @@ def test_a_folder_under_a_file_cannot_be_written(here, capsys):
         ["fly"],
     ],
 )
-def test_wrong_use_ends_with_2(here, capsys, argv):
+def test_wrong_use_ends_with_2(here: Path, capsys: pytest.CaptureFixture[str], argv: list[str]) -> None:
     fails(capsys, *argv, code=2)
     assert empty(here)
 
 
-def test_interrupted_runs_leave_nothing_behind(here):
+def test_interrupted_runs_leave_nothing_behind(here: Path) -> None:
     command = [sys.executable, "-m", "hsloc.cli.main", "replay", OFFICE, "--out", "out"]
     process = subprocess.Popen(
         command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
@@ -214,7 +219,7 @@ def test_interrupted_runs_leave_nothing_behind(here):
     assert list(here.iterdir()) == []
 
 
-def test_help_imports_nothing_heavy():
+def test_help_imports_nothing_heavy() -> None:
     code = (
         "import sys; from hsloc.cli.main import build_parser; build_parser().format_help();"
         "heavy = {'numpy', 'numba', 'scipy', 'matplotlib', 'rosbags', 'mcap', 'ruamel'} & set(sys.modules);"

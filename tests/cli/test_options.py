@@ -65,7 +65,8 @@ def test_submit_sends_what_was_asked_for(tmp_path: Path) -> None:
         "config": {"harmony_search": {"budget": 400}, "localiser": {"fuse": False}},
         "max_ape": 0.1,
     }
-    assert request_of({"reference": "/vicon"}, str) == {"read": {"truth_topic": "/vicon"}}
+    given = {"start_s": 2.0, "reference": "/vicon"}
+    assert request_of(given, str) == {"read": {"start_s": 2.0, "truth_topic": "/vicon"}}
 
 
 def test_submit_has_no_bar_if_none_is_wanted() -> None:

@@ -6,15 +6,17 @@ import json
 from pathlib import Path
 
 import pytest
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
 from hsloc.config import Config, load, preset
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 SLIP = str(RECORDINGS / "slip.mcap")
 
 
-def test_replay_prints_a_table_and_links_the_latest(tmp_path, monkeypatch, capsys):
+def test_replay_prints_a_table_and_links_the_latest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["replay", SLIP, "--end", "12"]) == 0
     printed = capsys.readouterr()
@@ -26,7 +28,9 @@ def test_replay_prints_a_table_and_links_the_latest(tmp_path, monkeypatch, capsy
     assert (latest / "metrics.json").is_file()
 
 
-def test_json_is_alone_on_stdout_and_says_what_the_file_says(tmp_path, capsys):
+def test_json_is_alone_on_stdout_and_says_what_the_file_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
     assert main(["replay", SLIP, "--end", "8", "--json", "--out", str(out)]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -36,7 +40,7 @@ def test_json_is_alone_on_stdout_and_says_what_the_file_says(tmp_path, capsys):
     assert written["run"]["seed"] == 0
 
 
-def test_quiet_prints_nothing_and_overwrite_replaces(tmp_path, capsys):
+def test_quiet_prints_nothing_and_overwrite_replaces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     for seed in ("1", "2"):
         argv = ["replay", SLIP, "--end", "5", "-q", "--overwrite", "--seed", seed, "--out", str(out)]
@@ -46,7 +50,7 @@ def test_quiet_prints_nothing_and_overwrite_replaces(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("matcher", ["hs", "icp"])
-def test_other_matchers_follow_the_robot_too(tmp_path, capsys, matcher):
+def test_other_matchers_follow_the_robot_too(tmp_path: Path, capsys: pytest.CaptureFixture[str], matcher: str) -> None:
     out = tmp_path / "out"
     argv = ["replay", str(RECORDINGS / "office.mcap"), "--end", "20", "--matcher", matcher, "--json", "--out", str(out)]
     assert main(argv) == 0
@@ -55,7 +59,7 @@ def test_other_matchers_follow_the_robot_too(tmp_path, capsys, matcher):
     assert told["run"]["matcher"] == ("harmony_search" if matcher == "hs" else matcher)
 
 
-def test_config_prints_what_config_reads(tmp_path, capsys):
+def test_config_prints_what_config_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("default", "paper", "paper-literal"):
         assert main(["config", "--preset", name]) == 0
         path = tmp_path / f"{name}.yaml"
@@ -65,7 +69,9 @@ def test_config_prints_what_config_reads(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["hide"]["memory_size"] == 30
 
 
-def test_flags_stand_above_the_file_and_the_file_above_the_preset(tmp_path, capsys):
+def test_flags_stand_above_the_file_and_the_file_above_the_preset(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("matcher: icp\nhide: {budget: 77}\nlocaliser: {update_min_d: 1e-1}\n")
     assert main(["config", "--preset", "paper", "--config", str(path), "--matcher", "hide", "--json"]) == 0
@@ -76,7 +82,7 @@ def test_flags_stand_above_the_file_and_the_file_above_the_preset(tmp_path, caps
     assert told["likelihood_field"]["sigma"] == 1.0
 
 
-def test_the_configuration_of_a_run_runs_again(tmp_path):
+def test_the_configuration_of_a_run_runs_again(tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     path = tmp_path / "mine.yaml"
     path.write_text("hide: {budget: 120}\n")
@@ -88,14 +94,14 @@ def test_the_configuration_of_a_run_runs_again(tmp_path):
     assert (first / "trajectory.tum").read_bytes() == (second / "trajectory.tum").read_bytes()
 
 
-def test_map_is_replay_that_draws_a_map(tmp_path, capsys):
+def test_map_is_replay_that_draws_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["map", SLIP, "--end", "4", "--out", str(tmp_path / "a"), "-q"]) == 0
     assert main(["replay", SLIP, "--mode", "slam", "--end", "4", "--out", str(tmp_path / "b"), "-q"]) == 0
     for name in ("map.pgm", "map.yaml", "trajectory.tum", "config.yaml"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
-def test_a_duration_counts_from_the_start(tmp_path, capsys):
+def test_a_duration_counts_from_the_start(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", SLIP, "--start", "2", "--duration", "3", "--out", str(tmp_path / "a"), "-q"]) == 0
     assert (
         main(["replay", SLIP, "--start", "2", "--end", "5", "--out", str(tmp_path / "b"), "-q", "--no-progress"]) == 0
@@ -110,7 +116,9 @@ def test_a_duration_counts_from_the_start(tmp_path, capsys):
     assert "--end is 1; it must be later than --start 2" in capsys.readouterr().err
 
 
-def test_the_progress_bar_can_be_left_out(tmp_path, monkeypatch, capsys):
+def test_the_progress_bar_can_be_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     command = ["replay", SLIP, "--end", "2", "--overwrite", "--out", str(tmp_path / "a")]
     assert main(command) == 0

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
 from hsloc.cli.main import main
 from hsloc.config import Config, load
 from hsloc.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 AMCL = """
 amcl:
@@ -25,9 +30,9 @@ map_server:
 """
 
 
-def test_what_means_the_same_is_taken_and_the_rest_is_named(tmp_path):
+def test_what_means_the_same_is_taken_and_the_rest_is_named(tmp_path: Path) -> None:
     (tmp_path / "nav2.yaml").write_text(AMCL)
-    warnings = []
+    warnings: list[str] = []
     config = load(tmp_path / "nav2.yaml", warnings=warnings)
     noise = config.localiser.odometry_noise
     assert (noise.alpha1, noise.alpha2, noise.alpha4) == (0.3, Config().localiser.odometry_noise.alpha2, 1.0)
@@ -40,11 +45,11 @@ def test_what_means_the_same_is_taken_and_the_rest_is_named(tmp_path):
     assert second == "parameters of map_server that are ignored: yaml_filename (give --map)"
 
 
-def test_nodes_in_namespaces_and_wildcards(tmp_path):
+def test_nodes_in_namespaces_and_wildcards(tmp_path: Path) -> None:
     (tmp_path / "p.yaml").write_text(
         "robot1:\n  amcl:\n    ros__parameters: {update_min_d: 0.7}\n/**:\n  ros__parameters: {alpha3: 0.5}\n"
     )
-    warnings = []
+    warnings: list[str] = []
     config = load(tmp_path / "p.yaml", warnings=warnings)
     assert config.localiser.update_min_d == 0.7
     assert config.localiser.odometry_noise.alpha3 == 0.5
@@ -59,14 +64,14 @@ def test_nodes_in_namespaces_and_wildcards(tmp_path):
         ("amcl: {ros__parameter: {alpha1: 1}}", "unknown key 'amcl'"),
     ],
 )
-def test_mistakes_are_named(tmp_path, text, expected):
+def test_mistakes_are_named(tmp_path: Path, text: str, expected: str) -> None:
     (tmp_path / "p.yaml").write_text(text)
     with pytest.raises(ConfigError, match=r"p\.yaml") as caught:
         load(tmp_path / "p.yaml")
     assert expected in str(caught.value)
 
 
-def test_the_command_warns(tmp_path, capsys):
+def test_the_command_warns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "nav2.yaml").write_text(AMCL)
     assert main(["config", "--config", str(tmp_path / "nav2.yaml")]) == 0
     printed = capsys.readouterr()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -16,15 +17,22 @@ from hsloc.evaluation.rpe import Delta
 from hsloc.model.pose2 import relative_poses
 from hsloc.trajectory_io.tum import format_stamp, write_tum
 
+if TYPE_CHECKING:
+    from pathlib import Path
 
-def run(*arguments):
+    from hsloc.model import Trajectory
+
+
+def run(*arguments: str) -> int:
     parser = argparse.ArgumentParser(prog="hsloc eval")
     command.add_arguments(parser)
     return command.run(parser.parse_args([str(argument) for argument in arguments]))
 
 
 @pytest.fixture
-def files(tmp_path, rng, monkeypatch):
+def files(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> tuple[Trajectory, list[Trajectory]]:
     monkeypatch.chdir(tmp_path)
     reference = make_path(rng, 200)
     estimates = [disturb(rng, reference, sigma=sigma) for sigma in (0.01, 0.1)]
@@ -40,7 +48,9 @@ def files(tmp_path, rng, monkeypatch):
     return reference, estimates
 
 
-def test_one_table_for_several_estimates(files, capsys):
+def test_one_table_for_several_estimates(
+    files: tuple[Trajectory, list[Trajectory]], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run("reference.tum", "good.tum", "bad.tum", "--alignment", "se2") == 0
     out, err = capsys.readouterr()
     assert err == ""
@@ -56,7 +66,7 @@ def test_one_table_for_several_estimates(files, capsys):
     ]  # fmt: skip
 
 
-def test_json(files, capsys):
+def test_json(files: tuple[Trajectory, list[Trajectory]], capsys: pytest.CaptureFixture[str]) -> None:
     assert run("reference.tum", "good.tum", "--json", "--delta", "2", "--delta-unit", "s") == 0
     document = json.loads(capsys.readouterr().out)
     reference, (good, _) = files
@@ -68,7 +78,9 @@ def test_json(files, capsys):
     assert found["rpe"]["angle_deg"]["max"] == pytest.approx(expected.rpe[0].statistics.angle_deg.max, abs=1e-6)
 
 
-def test_relations_beside_a_reference_and_alone(files, capsys):
+def test_relations_beside_a_reference_and_alone(
+    files: tuple[Trajectory, list[Trajectory]], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run("reference.tum", "good.tum", "--relations", "checked.relations", "--json") == 0
     (found,) = json.loads(capsys.readouterr().out)["estimates"]
     assert found["relations"]["matched"] == 15
@@ -85,7 +97,7 @@ def test_relations_beside_a_reference_and_alone(files, capsys):
     assert "APE" not in out
 
 
-def test_mistakes(files, capsys):
+def test_mistakes(files: tuple[Trajectory, list[Trajectory]], capsys: pytest.CaptureFixture[str]) -> None:
     assert run("reference.tum") == 2
     assert "give REFERENCE and at least one ESTIMATE" in capsys.readouterr().err
     assert run("reference.tum", "good.tum", "--no-reference") == 2
@@ -103,7 +115,9 @@ def test_mistakes(files, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_folders_of_results_bring_their_own_reference(files, capsys, tmp_path):
+def test_folders_of_results_bring_their_own_reference(
+    files: tuple[Trajectory, list[Trajectory]], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     reference, estimates = files
     for name, estimate in zip(("first", "second"), estimates, strict=True):
         (tmp_path / name).mkdir()

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import pytest
@@ -15,9 +16,12 @@ from evaluation_paths import disturb, make_path
 from hsloc.cli.main import main
 from hsloc.trajectory_io.tum import write_tum
 
+if TYPE_CHECKING:
+    from types import SimpleNamespace
+
 
 @pytest.fixture
-def files(tmp_path, rng, monkeypatch):
+def files(tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     reference = make_path(rng, 300)
     write_tum("reference.tum", reference)
@@ -27,7 +31,9 @@ def files(tmp_path, rng, monkeypatch):
 
 @pytest.mark.parametrize("alignment", ["none", "origin", "se2"])
 @pytest.mark.parametrize(("delta", "unit"), [(1.0, "m"), (10.0, "frames")])
-def test_the_files_hold_what_evo_would_have_saved(files, evo, alignment, delta, unit, tmp_path):
+def test_the_files_hold_what_evo_would_have_saved(
+    files: None, evo: SimpleNamespace, alignment: str, delta: float, unit: Literal["frames", "m", "s"], tmp_path: Path
+) -> None:
     from evo.tools.file_interface import load_res_file
 
     options = ["--alignment", alignment, "--delta", str(delta), "--delta-unit", unit]
@@ -51,7 +57,9 @@ def test_the_files_hold_what_evo_would_have_saved(files, evo, alignment, delta, 
                 np.testing.assert_allclose(ours.np_arrays[name], values, atol=2e-6, err_msg=name)
 
 
-def test_evo_res_prints_the_same_statistics(files, evo, capsys):
+def test_evo_res_prints_the_same_statistics(
+    files: None, evo: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["eval", "reference.tum", "good.tum", "bad.tum", "--save-results", "out"]) == 0
     table = capsys.readouterr().out.split("APE translation (m)\n")[1].splitlines()
     expected = {row.split()[0]: [float(value) for value in row.split()[1:8]] for row in table[:2]}
@@ -73,7 +81,7 @@ def test_evo_res_prints_the_same_statistics(files, evo, capsys):
         assert found == pytest.approx(ours, abs=1e-4)
 
 
-def test_the_same_results_are_the_same_bytes_and_names_do_not_clash(files):
+def test_the_same_results_are_the_same_bytes_and_names_do_not_clash(files: None) -> None:
     for folder in ("a/run", "b/run"):
         Path(folder).mkdir(parents=True)
         for name in ("reference", "trajectory"):
@@ -88,7 +96,9 @@ def test_the_same_results_are_the_same_bytes_and_names_do_not_clash(files):
         assert (Path("first") / name).read_bytes() == (Path("second") / name).read_bytes()
 
 
-def test_a_path_shorter_than_a_piece_has_no_rpe_and_relations_alone_no_errors(files, capsys):
+def test_a_path_shorter_than_a_piece_has_no_rpe_and_relations_alone_no_errors(
+    files: None, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["eval", "reference.tum", "good.tum", "--delta", "1e6", "--save-results", "out"]) == 0
     assert sorted(path.name for path in Path("out").iterdir()) == ["good.ape_angle_deg.zip", "good.ape_trans_part.zip"]
     Path("checked.relations").write_text("1 2 0 0 0 0 0 0\n")

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,7 +13,7 @@ from hsloc.evaluation.map_quality import compare_maps, crispness
 from hsloc.model import OccupancyGrid, Pose2
 
 
-def picture(text, resolution=0.05):
+def picture(text: str, resolution: float = 0.05) -> OccupancyGrid:
     """A map from a drawing: # is a wall, . is free, ? is unknown; the last line is the lowest."""
     lines = text.split()
     values = {"#": 100, ".": 0, "?": -1}
@@ -19,14 +21,14 @@ def picture(text, resolution=0.05):
     return OccupancyGrid(cells, resolution)
 
 
-def walls(*columns, height=80, width=40, resolution=0.05):
+def walls(*columns: int, height: int = 80, width: int = 40, resolution: float = 0.05) -> OccupancyGrid:
     """Walls that run from top to bottom."""
     cells = np.zeros((height, width), dtype=np.int8)
     cells[:, list(columns)] = 100
     return OccupancyGrid(cells, resolution)
 
 
-def test_a_wall_reads_its_own_thickness():
+def test_a_wall_reads_its_own_thickness() -> None:
     for columns in ((20,), (20, 21), (19, 20, 21)):
         result = crispness(walls(*columns))
         # At both ends of the wall the cloud is short, but just as wide.
@@ -34,7 +36,7 @@ def test_a_wall_reads_its_own_thickness():
         assert result.occupied_cells == 80 * len(columns)
 
 
-def test_a_doubled_wall_is_less_crisp_than_a_single_one():
+def test_a_doubled_wall_is_less_crisp_than_a_single_one() -> None:
     single, double = crispness(walls(20)), crispness(walls(20, 24))
     assert double.wall_thickness_median > 2.5 * single.wall_thickness_median
     assert double.mean_map_entropy > single.mean_map_entropy
@@ -44,7 +46,7 @@ def test_a_doubled_wall_is_less_crisp_than_a_single_one():
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.05, 0.4))
-def test_the_cloud_of_each_cell_is_what_numpy_computes(seed, radius):
+def test_the_cloud_of_each_cell_is_what_numpy_computes(seed: Any, radius: Any) -> None:
     rng = np.random.default_rng(seed)
     grid = OccupancyGrid(np.where(rng.random((9, 12)) < 0.3, 100, 0).astype(np.int8), 0.1)
     centres = grid.centres(grid.occupied())
@@ -65,7 +67,7 @@ def test_the_cloud_of_each_cell_is_what_numpy_computes(seed, radius):
     assert result.mean_map_entropy == pytest.approx(np.mean(entropy))
 
 
-def test_occupancy_entropy():
+def test_occupancy_entropy() -> None:
     assert crispness(walls(20)).occupancy_entropy == 0.0
     cells = np.full((5, 5), 50, dtype=np.int8)
     cells[2, 2] = 100
@@ -74,7 +76,7 @@ def test_occupancy_entropy():
     assert result.occupancy_entropy == pytest.approx(4 / 5)
 
 
-def test_a_map_without_walls():
+def test_a_map_without_walls() -> None:
     empty = picture("... ...")
     assert to_json(crispness(empty))["wall_thickness_median"] is None
     with pytest.raises(EvaluationError, match="true map holds no occupied cell"):
@@ -83,7 +85,7 @@ def test_a_map_without_walls():
     assert (result["precision"], result["recall"], result["map_cells"]) == (None, 0.0, 0)
 
 
-def test_comparison_by_hand():
+def test_comparison_by_hand() -> None:
     truth = picture("#.... #.... #....")
     ours = picture(".#... .#... ...#.")
     result = compare_maps(ours, truth, tolerance=0.05)
@@ -94,7 +96,7 @@ def test_comparison_by_hand():
     assert (result.map_cells, result.true_cells) == (3, 3)
 
 
-def test_a_map_agrees_with_itself_wherever_it_lies():
+def test_a_map_agrees_with_itself_wherever_it_lies() -> None:
     grid = picture("##..# .#?.# .####")
     result = compare_maps(grid, grid, tolerance=0.0)
     assert (result.precision, result.recall, result.f1) == (1.0, 1.0, 1.0)
@@ -104,6 +106,6 @@ def test_a_map_agrees_with_itself_wherever_it_lies():
     assert compare_maps(grid, moved, tolerance=0.01).f1 == 0.0
 
 
-def test_a_negative_tolerance():
+def test_a_negative_tolerance() -> None:
     with pytest.raises(EvaluationError, match="must not be negative"):
         compare_maps(walls(3), walls(3), tolerance=-0.1)

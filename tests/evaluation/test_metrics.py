@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pytest
@@ -21,21 +22,27 @@ from hsloc.model import Pose2, Trajectory
 from hsloc.model.pose2 import compose_poses
 from hsloc.trajectory_io.tum import write_tum
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import SimpleNamespace
+
+    from evo.core.result import Result
+
 NAMES = ("rmse", "mean", "median", "std", "min", "max", "sse")
 
 
-def moved(path, pose):
+def moved(path: Trajectory, pose: Pose2) -> Trajectory:
     return Trajectory(path.stamps_ns, compose_poses(pose.to_array(), path.poses))
 
 
-def line(n=11, step=1.0, period_s=1.0):
+def line(n: int = 11, step: float = 1.0, period_s: float = 1.0) -> Trajectory:
     """A robot that goes straight ahead."""
     poses = np.zeros((n, 3))
     poses[:, 0] = step * np.arange(n)
     return Trajectory((np.arange(n) * period_s * 1e9).astype(np.int64), poses)
 
 
-def check(ours, theirs):
+def check(ours: Statistics, theirs: Result) -> None:
     for name in NAMES:
         assert getattr(ours, name) == pytest.approx(theirs.stats[name], abs=1e-6, rel=1e-9), name
     assert ours.count == len(theirs.np_arrays["error_array"])
@@ -44,7 +51,14 @@ def check(ours, theirs):
 @pytest.mark.parametrize("relation", ["trans_part", "angle_deg"])
 @pytest.mark.parametrize("alignment", ["none", "origin", "se2"])
 @pytest.mark.parametrize("every", [1, 4])
-def test_ape_equals_evo(evo, as_evo, rng, relation, alignment, every):
+def test_ape_equals_evo(
+    evo: SimpleNamespace,
+    as_evo: Callable[..., Any],
+    rng: np.random.Generator,
+    relation: str,
+    alignment: str,
+    every: int,
+) -> None:
     reference = make_path(rng, 300)
     estimate = moved(disturb(rng, reference, every=every, shift_ns=1_000_000), Pose2(0.3, -0.2, 0.15))
     ours = evaluate(estimate, reference, alignment=alignment)
@@ -56,7 +70,15 @@ def test_ape_equals_evo(evo, as_evo, rng, relation, alignment, every):
 @pytest.mark.parametrize("relation", ["trans_part", "angle_deg"])
 @pytest.mark.parametrize("all_pairs", [False, True])
 @pytest.mark.parametrize(("value", "unit"), [(1, "frames"), (10, "frames"), (1.0, "m"), (0.37, "m"), (5.0, "m")])
-def test_rpe_equals_evo(evo, as_evo, rng, relation, all_pairs, value, unit):
+def test_rpe_equals_evo(
+    evo: SimpleNamespace,
+    as_evo: Callable[..., Any],
+    rng: np.random.Generator,
+    relation: str,
+    all_pairs: bool,
+    value: float,
+    unit: Literal["frames", "m", "s"],
+) -> None:
     reference = make_path(rng, 300)
     estimate = disturb(rng, reference, every=2)
     # Let the robot stand for a while: many poses then share one length of path.
@@ -68,7 +90,9 @@ def test_rpe_equals_evo(evo, as_evo, rng, relation, all_pairs, value, unit):
 
 
 @pytest.mark.parametrize("command", ["evo_ape", "evo_rpe"])
-def test_equals_the_commands_that_users_run(evo, tmp_path, rng, command):
+def test_equals_the_commands_that_users_run(
+    evo: SimpleNamespace, tmp_path: Path, rng: np.random.Generator, command: str
+) -> None:
     """The real programs on the real files, as the documentation prints them."""
     reference = make_path(rng, 200, jitter_ns=1_000_000)
     estimate = disturb(rng, reference, every=2, shift_ns=2_000_000)
@@ -89,7 +113,7 @@ def test_equals_the_commands_that_users_run(evo, tmp_path, rng, command):
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["none", "origin", "se2"]))
-def test_a_path_is_no_different_from_itself(seed, alignment):
+def test_a_path_is_no_different_from_itself(seed: Any, alignment: Any) -> None:
     path = make_path(np.random.default_rng(seed), 60)
     result = evaluate(path, path, alignment=alignment, deltas=(Delta(1, "frames"), Delta(0.5, "m"), Delta(0.2, "s")))
     for statistics in (result.ape, *(error.statistics for error in result.rpe)):
@@ -101,7 +125,7 @@ def test_a_path_is_no_different_from_itself(seed, alignment):
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.floats(-50, 50), st.floats(-50, 50), st.floats(-3, 3))
-def test_aligned_ape_and_rpe_do_not_see_a_rigid_motion(seed, x, y, theta):
+def test_aligned_ape_and_rpe_do_not_see_a_rigid_motion(seed: Any, x: Any, y: Any, theta: Any) -> None:
     rng = np.random.default_rng(seed)
     reference = make_path(rng, 60)
     estimate = disturb(rng, reference)
@@ -114,7 +138,7 @@ def test_aligned_ape_and_rpe_do_not_see_a_rigid_motion(seed, x, y, theta):
     assert near.ape.trans_part.rmse <= evaluate(estimate, reference).ape.trans_part.rmse + 1e-12
 
 
-def test_a_constant_shift_by_hand():
+def test_a_constant_shift_by_hand() -> None:
     path = line()
     shifted = Trajectory(path.stamps_ns, path.poses + np.array((0.3, -0.4, np.pi / 2)))
     result = evaluate(shifted, path)
@@ -126,7 +150,7 @@ def test_a_constant_shift_by_hand():
     assert (result.length_reference, result.length_estimate) == pytest.approx((10.0, 10.0))
 
 
-def test_theta_is_wrapped_before_it_is_squared():
+def test_theta_is_wrapped_before_it_is_squared() -> None:
     path = line()
     a, b = (Trajectory(path.stamps_ns, path.poses + np.array((0, 0, theta))) for theta in (3.1, -3.1))
     assert evaluate(a, b).axis_rmse[2] == pytest.approx(2 * np.pi - 6.2)
@@ -145,13 +169,13 @@ def test_theta_is_wrapped_before_it_is_squared():
         (Delta(11, "frames"), []),
     ],
 )
-def test_pieces_by_hand(delta, expected):
+def test_pieces_by_hand(delta: Delta, expected: list[tuple[int, int]]) -> None:
     pairs = associate(line(period_s=0.5), line(period_s=0.5))
     starts, ends = pieces(pairs, delta)
     assert list(zip(starts.tolist(), ends.tolist(), strict=True)) == expected
 
 
-def test_seconds_are_cut_in_the_order_of_time():
+def test_seconds_are_cut_in_the_order_of_time() -> None:
     path = line(n=5)
     order = [0, 2, 1, 3, 4]
     mixed = Trajectory(path.stamps_ns[order], path.poses[order])
@@ -159,7 +183,7 @@ def test_seconds_are_cut_in_the_order_of_time():
     assert list(zip(mixed.poses[starts, 0], mixed.poses[ends, 0], strict=True)) == [(0, 2), (2, 4)]
 
 
-def test_a_path_shorter_than_a_piece_has_no_rpe():
+def test_a_path_shorter_than_a_piece_has_no_rpe() -> None:
     short = line(n=2, step=0.1)
     relative = evaluate(short, short).to_dict()["rpe_1m"]
     assert relative["trans_part"]["count"] == 0
@@ -167,20 +191,20 @@ def test_a_path_shorter_than_a_piece_has_no_rpe():
 
 
 @pytest.mark.parametrize(("value", "unit"), [(0, "m"), (-1, "s"), (1.5, "frames"), (np.nan, "m"), (1, "miles")])
-def test_bad_deltas(value, unit):
+def test_bad_deltas(value: float, unit: str) -> None:
     with pytest.raises(EvaluationError):
-        Delta(value, unit)
+        Delta(value, unit)  # type: ignore[arg-type]
 
 
-def test_statistics_by_hand():
+def test_statistics_by_hand() -> None:
     statistics = Statistics.of(np.array([3.0, 4.0, 0.0, 1.0]))
     assert statistics == Statistics(
-        rmse=pytest.approx(6.5**0.5), mean=2.0, median=2.0, std=pytest.approx(2.5**0.5), min=0.0, max=4.0, sse=26.0,
+        rmse=pytest.approx(6.5**0.5), mean=2.0, median=2.0, std=pytest.approx(2.5**0.5), min=0.0, max=4.0, sse=26.0,  # type: ignore[arg-type]
         count=4,
     )  # fmt: skip
 
 
-def test_json_is_strict_and_the_same_every_time(tmp_path, rng):
+def test_json_is_strict_and_the_same_every_time(tmp_path: Path, rng: np.random.Generator) -> None:
     path = make_path(rng, 50)
     document = evaluate(disturb(rng, path), path).to_dict()
     assert set(document) >= {"alignment", "t_max_diff", "matched", "ape", "rpe", "rpe_1m", "rpe_1s", "axis_rmse"}

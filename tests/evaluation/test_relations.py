@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import gzip
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -10,20 +11,24 @@ from hsloc.errors import EvaluationError
 from hsloc.evaluation.relations import Relations, evaluate_relations, read_relations, relation_errors
 from hsloc.model import Pose2, Trajectory
 from hsloc.model.pose2 import compose_poses, relative_poses
-from hsloc.trajectory_io.tum import parse_stamp, read_tum
+from hsloc.trajectory_io.reader import read_tum
+from hsloc.trajectory_io.tum import parse_stamp
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 S = 1_000_000_000
 
 
-def trajectory(*rows):
+def trajectory(*rows: tuple[Any, ...]) -> Trajectory:
     return Trajectory(np.array([int(t * S) for t, *_ in rows]), np.array([pose for _, *pose in rows], dtype=float))
 
 
-def relation(first_s, second_s, x, y, theta):
+def relation(first_s: float, second_s: float, x: float, y: float, theta: float) -> Relations:
     return Relations(np.array([int(first_s * S)]), np.array([int(second_s * S)]), np.array([[x, y, theta]]))
 
 
-def test_by_hand():
+def test_by_hand() -> None:
     # One metre ahead and a quarter turn left, where the checked relation says 1.03 m, 0.04 m and 80 degrees.
     path = trajectory((0, 5, 5, np.pi / 2), (1, 5, 6, np.pi))
     errors = relation_errors(path, relation(0, 1, 1.03, 0.04, np.radians(80)))
@@ -31,7 +36,7 @@ def test_by_hand():
     assert errors.angle_deg == pytest.approx([10.0])
 
 
-def test_true_relations_score_zero_wherever_the_path_lies(rng):
+def test_true_relations_score_zero_wherever_the_path_lies(rng: np.random.Generator) -> None:
     path = make_path(rng, 100)
     first, second = rng.integers(0, 100, 50), rng.integers(0, 100, 50)
     relations = Relations(
@@ -44,12 +49,12 @@ def test_true_relations_score_zero_wherever_the_path_lies(rng):
     assert result.statistics.angle_deg.max == pytest.approx(0.0, abs=1e-9)
 
 
-def test_of_several_poses_with_one_stamp_the_last_counts():
+def test_of_several_poses_with_one_stamp_the_last_counts() -> None:
     path = trajectory((0, 0, 0, 0), (1, 7, 0, 0), (2, 2, 0, 0), (1, 1, 0, 0))
     assert relation_errors(path, relation(0, 1, 1, 0, 0)).trans_part == pytest.approx([0.0])
 
 
-def test_between_two_poses_it_is_interpolated_but_not_over_a_hole():
+def test_between_two_poses_it_is_interpolated_but_not_over_a_hole() -> None:
     path = trajectory((0, 0, 0, 0), (0.5, 0.5, 0, 0), (5, 5, 0, 0))
     assert relation_errors(path, relation(0, 0.25, 0.25, 0, 0)).trans_part == pytest.approx([0.0])
     with pytest.raises(EvaluationError, match="none of 1 relations"):
@@ -58,7 +63,7 @@ def test_between_two_poses_it_is_interpolated_but_not_over_a_hole():
     assert relation_errors(path, relation(0, 5, 5, 0, 0)).trans_part == pytest.approx([0.0])
 
 
-def test_beyond_the_ends_nothing_matches():
+def test_beyond_the_ends_nothing_matches() -> None:
     path = trajectory((0, 0, 0, 0), (1, 1, 0, 0))
     for first, second in ((-0.1, 0.5), (0.5, 1.1)):
         with pytest.raises(EvaluationError, match="same log"):
@@ -70,7 +75,7 @@ def test_beyond_the_ends_nothing_matches():
     assert result.to_dict()["trans_part"]["mean"] == pytest.approx(0.0)
 
 
-def test_reading(tmp_path):
+def test_reading(tmp_path: Path) -> None:
     file = tmp_path / "x.relations"
     file.write_text("# c\n976052905.167303 976052911.885496 -0.05 -0.12 0 0 0 -1.68\n\n1 2 0 0 9 9 9 4\n")
     relations = read_relations(file)
@@ -82,7 +87,7 @@ def test_reading(tmp_path):
     ("content", "message"),
     [("", "holds no relation"), ("1 2 3\n", "line 1: 3 columns"), ("1 b 0 0 0 0 0 0\n", "line 1: 'b' is not a stamp")],
 )
-def test_bad_files(tmp_path, content, message):
+def test_bad_files(tmp_path: Path, content: str, message: str) -> None:
     file = tmp_path / "bad.relations"
     file.write_text(content)
     with pytest.raises(EvaluationError, match=message):
@@ -90,7 +95,7 @@ def test_bad_files(tmp_path, content, message):
 
 
 @pytest.mark.data
-def test_intel_scores_as_published(data):
+def test_intel_scores_as_published(data: Path) -> None:
     """Raw odometry 7.37 m +- 14.3, GMapping's poses 0.046 m +- 0.040: figures found by others on these files."""
     relations = read_relations(data / "intel" / "intel.relations")
     with gzip.open(data / "intel" / "intel.clf.gz", "rt") as log:

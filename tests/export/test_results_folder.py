@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
 from hsloc.errors import OutputError
 from hsloc.export.results_folder import refuse_folder
 
+if TYPE_CHECKING:
+    from pathlib import Path
 
-def test_only_results_are_overwritten(tmp_path):
+
+def test_only_results_are_overwritten(tmp_path: Path) -> None:
     refuse_folder(tmp_path / "new", False)
     refuse_folder(tmp_path, True)
     (tmp_path / "thesis.tex").write_text("do not lose me")

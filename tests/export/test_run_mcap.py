@@ -14,24 +14,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from paths import RECORDINGS
 from rosbags.highlevel import AnyReader
 
 from hsloc.cli.main import main
 from hsloc.log import open_log
 from hsloc.maps import save_map
-from hsloc.trajectory_io.tum import read_tum
+from hsloc.trajectory_io.reader import read_tum
 
-HALL = Path(__file__).parents[2] / "recordings" / "hall.mcap"
+HALL = RECORDINGS / "hall.mcap"
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory):
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "out"
     assert main(["replay", str(HALL), "--end", "8", "--out", str(folder), "--quiet"]) == 0
     return folder
 
 
-def test_the_mcap_library_finds_index_checksums_attachment_and_metadata(results):
+def test_the_mcap_library_finds_index_checksums_attachment_and_metadata(results: Path) -> None:
     with (results / "run.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
@@ -44,18 +45,18 @@ def test_the_mcap_library_finds_index_checksums_attachment_and_metadata(results)
     assert metadata.metadata["seed"] == "0"
 
 
-def test_rosbags_decodes_every_message(results):
+def test_rosbags_decodes_every_message(results: Path) -> None:
     trajectory = read_tum(results / "trajectory.tum")
-    found = Counter()
+    found = Counter()  # type: ignore[var-annotated]
     poses = []
     with AnyReader([results / "run.mcap"]) as reader:
         for connection, _, raw in reader.messages():
             message = reader.deserialize(raw, connection.msgtype)
             found[connection.topic] += 1
             if connection.topic == "/pose":
-                poses.append((message.pose.position.x, message.pose.position.y))
+                poses.append((message.pose.position.x, message.pose.position.y))  # type: ignore[attr-defined]
             if connection.topic == "/map":
-                cells = np.asarray(message.data).reshape(message.info.height, message.info.width)
+                cells = np.asarray(message.data).reshape(message.info.height, message.info.width)  # type: ignore[attr-defined]
                 np.testing.assert_array_equal(cells, open_log(HALL).map().cells)
     scans = json.loads((results / "metrics.json").read_text())["scans"]["total"]
     of_each = {"/scan": scans, "/pose": len(trajectory), "/tf": len(trajectory)}
@@ -63,7 +64,7 @@ def test_rosbags_decodes_every_message(results):
     np.testing.assert_allclose(poses, trajectory.poses[:, :2], atol=1e-9)
 
 
-def test_evo_reads_the_poses(results, tmp_path):
+def test_evo_reads_the_poses(results: Path, tmp_path: Path) -> None:
     command = [
         str(Path(sys.executable).with_name("evo_traj")),
         "bag2",
@@ -81,7 +82,7 @@ def test_evo_reads_the_poses(results, tmp_path):
     np.testing.assert_allclose(theirs.poses, ours.poses, atol=1e-6)
 
 
-def test_the_page_tells_what_was_read_how_it_converged_and_where_the_origin_is(results):
+def test_the_page_tells_what_was_read_how_it_converged_and_where_the_origin_is(results: Path) -> None:
     page = (results / "report.html").read_text()
     assert "localised on the map of the log" in page
     assert "2023-11-14 22:13:20 UTC" in page
@@ -92,8 +93,8 @@ def test_the_page_tells_what_was_read_how_it_converged_and_where_the_origin_is(r
     assert "<h2>Warnings</h2>" not in page
 
 
-def test_the_page_tells_warnings_and_the_checksums_of_a_map_that_was_given(results, tmp_path):
-    save_map(open_log(HALL).map(), tmp_path)
+def test_the_page_tells_warnings_and_the_checksums_of_a_map_that_was_given(results: Path, tmp_path: Path) -> None:
+    save_map(open_log(HALL).map(), tmp_path)  # type: ignore[arg-type]
     text = (tmp_path / "map.yaml").read_text().replace("free_thresh: 0.196", "free_thresh: 0.25")
     (tmp_path / "map.yaml").write_text(text)
     out = tmp_path / "out"

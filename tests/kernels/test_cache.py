@@ -24,7 +24,7 @@ def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """numba finds no place of its own; what is changed for good is restored."""
 
     def refuse(_: object) -> None:
-        if not config.CACHE_DIR:
+        if not config.CACHE_DIR:  # type: ignore[attr-defined]
             raise RuntimeError("cannot cache function: no locator available")
 
     monkeypatch.setattr(config, "CACHE_DIR", "")
@@ -33,12 +33,12 @@ def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("nowhere")
 def test_the_cache_falls_back_to_a_private_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cache.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(cache.tempfile, "gettempdir", lambda: str(tmp_path))  # type: ignore[attr-defined]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         cache.choose_cache()
     (folder,) = tmp_path.iterdir()
-    assert str(folder) == config.CACHE_DIR
+    assert str(folder) == config.CACHE_DIR  # type: ignore[attr-defined]
     assert folder.stat().st_mode & 0o777 == 0o700
 
 
@@ -46,13 +46,13 @@ def test_the_cache_falls_back_to_a_private_folder(tmp_path: Path, monkeypatch: p
 def test_a_folder_that_others_may_write_to_is_not_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is loaded from the cache is executed."""
     monkeypatch.setattr(cache, "_PARENTS", (str(tmp_path),))
-    monkeypatch.setattr(cache.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(cache.tempfile, "gettempdir", lambda: str(tmp_path))  # type: ignore[attr-defined]
     folder = tmp_path / f"hsloc-kernels-{os.getuid()}"
     folder.mkdir()
     folder.chmod(0o777)
     with pytest.warns(RuntimeWarning, match="compiled in every process"):
         cache.choose_cache()
-    assert not config.CACHE_DIR
+    assert not config.CACHE_DIR  # type: ignore[attr-defined]
     numba.njit(cache=True)(lambda: 0)  # no longer raises
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import naive
 import numpy as np
 import pytest
@@ -9,9 +11,12 @@ import pytest
 from hsloc.kernels.fitness import fitness_many, normal_equations, pack, point_scores, score_sum
 from hsloc.kernels.levenberg_marquardt import polish, solve_damped
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 
 @pytest.fixture
-def scene():
+def scene() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     rng = np.random.default_rng(3)
     scores = rng.random((30, 40)).astype(np.float32)
     packed = np.empty((29, 39, 4), dtype=np.float32)
@@ -21,21 +26,27 @@ def scene():
 
 
 @pytest.mark.parametrize("pose", [(20.0, 15.0, 0.3), (2.0, 27.5, -2.0), (-5.0, 3.0, 1.0), (500.0, 500.0, 0.0)])
-def test_the_sum_is_that_of_the_naive_twin_points_outside_count_nothing(scene, pose):
+def test_the_sum_is_that_of_the_naive_twin_points_outside_count_nothing(
+    scene: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], pose: tuple[float, float, float]
+) -> None:
     scores, packed, points = scene
     expected = naive.score_sum(scores, points, *pose)
     assert score_sum(packed, points, *pose, -2.0) == pytest.approx(expected, abs=2e-4)
     assert fitness_many(packed, points, np.array([pose]))[0] == pytest.approx(expected / 37, abs=1e-5)
 
 
-def test_scores_of_the_points_add_up(scene):
+def test_scores_of_the_points_add_up(
+    scene: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+) -> None:
     _, packed, points = scene
     each = np.empty(37, dtype=np.float32)
     point_scores(packed, points, 20.0, 15.0, 0.3, each)
     assert each.sum() == pytest.approx(score_sum(packed, points, 20.0, 15.0, 0.3, -2.0), abs=1e-4)
 
 
-def test_a_candidate_is_dropped_only_if_it_cannot_win(scene):
+def test_a_candidate_is_dropped_only_if_it_cannot_win(
+    scene: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+) -> None:
     _, packed, points = scene
     total = score_sum(packed, points, 20.0, 15.0, 0.3, -2.0)
     assert score_sum(packed, points, 20.0, 15.0, 0.3, total - 1e-9) == total
@@ -43,7 +54,9 @@ def test_a_candidate_is_dropped_only_if_it_cannot_win(scene):
     assert score_sum(packed, points, 20.0, 15.0, 0.3, 36.9) == -1.0
 
 
-def test_packing_part_of_a_field_touches_that_part_alone(scene):
+def test_packing_part_of_a_field_touches_that_part_alone(
+    scene: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+) -> None:
     scores, packed, _ = scene
     changed = scores.copy()
     changed[10:12, 10:12] = 0.0
@@ -54,13 +67,15 @@ def test_packing_part_of_a_field_touches_that_part_alone(scene):
     assert np.array_equal(again, whole)
 
 
-def test_the_gradient_is_that_of_finite_differences(scene):
+def test_the_gradient_is_that_of_finite_differences(
+    scene: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+) -> None:
     scores, packed, points = scene
     pose = np.array([20.3, 14.6, 0.4])
     information, gradient = np.empty((3, 3)), np.empty(3)
-    total = normal_equations(packed, points, *pose, information, gradient)
+    total = normal_equations(packed, points, *pose, information, gradient)  # type: ignore[call-arg]
     # Single precision, and the two kernels add in another order.
-    assert total == pytest.approx(score_sum(packed, points, *pose, -2.0), abs=1e-4)
+    assert total == pytest.approx(score_sum(packed, points, *pose, -2.0), abs=1e-4)  # type: ignore[call-arg]
     jacobian = np.empty((37, 3))
     inside = np.empty(37)
     for i, point in enumerate(points):
@@ -75,7 +90,7 @@ def test_the_gradient_is_that_of_finite_differences(scene):
     np.testing.assert_allclose(gradient, jacobian[used].T @ (1.0 - inside[used]), rtol=2e-3, atol=2e-3)
 
 
-def test_the_damped_step_solves_the_equations():
+def test_the_damped_step_solves_the_equations() -> None:
     rng = np.random.default_rng(0)
     factor = rng.normal(size=(3, 3))
     information, gradient, step = factor @ factor.T + np.eye(3), rng.normal(size=3), np.empty(3)
@@ -84,24 +99,26 @@ def test_the_damped_step_solves_the_equations():
     np.testing.assert_allclose(damped @ step, gradient, atol=1e-6)
 
 
-def test_a_singular_system_gives_no_step():
+def test_a_singular_system_gives_no_step() -> None:
     step = np.ones(3)
     solve_damped(np.zeros((3, 3)), np.ones(3), 0.0, step)
     assert np.isfinite(step).all()
 
 
-def test_polish_climbs_and_stays_in_the_box(scene):
+def test_polish_climbs_and_stays_in_the_box(
+    scene: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+) -> None:
     _, packed, points = scene
     rng = np.random.default_rng(1)
     for _ in range(20):
         start = np.array([rng.uniform(5, 35), rng.uniform(5, 25), rng.uniform(-3, 3)])
-        before = score_sum(packed, points, *start, -2.0)
+        before = score_sum(packed, points, *start, -2.0)  # type: ignore[call-arg]
         pose = start.copy()
         half = np.array((0.5, 0.5, 0.05))
         low, high = start - half, start + half
         total, evaluations = polish(packed, points, pose, low, high, 15, np.zeros((3, 3)))
         assert total >= before - 1e-4
-        assert total == pytest.approx(score_sum(packed, points, *pose, -2.0), abs=1e-4)
+        assert total == pytest.approx(score_sum(packed, points, *pose, -2.0), abs=1e-4)  # type: ignore[call-arg]
         assert (pose >= low).all()
         assert (pose <= high).all()
         assert 1 <= evaluations <= 16

@@ -1,10 +1,15 @@
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 
-from hsloc.kernels.normal_equations import add_relative_term, relative
+from hsloc.kernels.normal_equations import Blocks, add_relative_term, relative
+from hsloc.kernels.point_to_line import Term
 from hsloc.model.pose2 import relative_poses
 
 
-def test_terms_of_poses_are_those_of_the_chain_rule():
+def test_terms_of_poses_are_those_of_the_chain_rule() -> None:
     random = np.random.default_rng(1)
     pose_j, pose_i = random.normal(size=(2, 3))
     root, gradient = random.normal(size=(3, 3)), random.normal(size=3)
@@ -13,7 +18,7 @@ def test_terms_of_poses_are_those_of_the_chain_rule():
     relative(pose_j, pose_i, rel)
     np.testing.assert_allclose(rel[:2], relative_poses(pose_j[None], pose_i[None])[0, :2])
 
-    def jacobian(moving):
+    def jacobian(moving: Any) -> Any:
         columns = []
         for k in range(3):
             ends = []
@@ -29,7 +34,7 @@ def test_terms_of_poses_are_those_of_the_chain_rule():
     a, b = jacobian("i"), jacobian("j")
     hjj, hji, hii = np.zeros((3, 3, 3))
     gj, gi = np.zeros((2, 3))
-    add_relative_term(pose_j, rel, information, gradient, hjj, hji, hii, gj, gi, np.empty((3, 3)))
+    add_relative_term(pose_j, rel, Term(information, gradient), Blocks(hjj, hji, hii, gj, gi), np.empty((3, 3)))
     for got, want in ((hjj, b.T @ information @ b), (hji, b.T @ information @ a), (hii, a.T @ information @ a)):
         np.testing.assert_allclose(got, want, atol=1e-6)
     np.testing.assert_allclose(gj, b.T @ gradient, atol=1e-6)

@@ -1,14 +1,21 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import pytest
 
-from hsloc.kernels.point_to_line import bearing, choose_hits, pair_terms
+from hsloc.kernels.point_to_line import Term, bearing, choose_hits, pair_terms
 from hsloc.model import Pose2, Scan
 from hsloc.slam.keyscans import KeyScan, KeyScans
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 DEGREE = np.radians(1.0)
 
 
-def room_scan(pose, *, beams=181, noise=0.0, seed=0, increment=DEGREE):
+def room_scan(pose: Pose2, *, beams: int = 181, noise: float = 0.0, seed: int = 0, increment: Any = DEGREE) -> Scan:
     """What a laser in a room of 6 x 4 m sees, by hand: the nearest of four walls."""
     angles = pose.theta - increment * (beams - 1) / 2 + increment * np.arange(beams)
     with np.errstate(divide="ignore"):
@@ -19,24 +26,30 @@ def room_scan(pose, *, beams=181, noise=0.0, seed=0, increment=DEGREE):
     return Scan(0, ranges.astype(np.float32), -increment * (beams - 1) / 2, increment, 0.05, 30.0)
 
 
-def terms(scans, i, j, pose, *, gate=0.3, scale=1e6):
+def terms(
+    scans: KeyScans,
+    i: int,
+    j: int,
+    pose: NDArray[np.float64] | tuple[float, float, float],
+    *,
+    gate: float = 0.3,
+    scale: float = 1e6,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     information, gradient, counts = np.empty((3, 3)), np.empty(3), np.empty(5)
-    chosen, chosen_start = scans.chosen(10_000)
     pair_terms(
-        i, j, *pose, scans.points, scans.normals, scans.centroids, scans.start, scans.hit_of_beam, scans.ranges,
-        scans.table_start, scans.geometry, chosen, chosen_start, gate, scale, information, gradient, counts,
-    )  # fmt: skip
+        i, j, np.array(pose, dtype=float), scans.arrays(10_000), gate, scale, Term(information, gradient), counts
+    )
     return information, gradient, counts
 
 
 @pytest.fixture(scope="module")
-def two():
+def two() -> tuple[KeyScans, NDArray[np.float64]]:
     first, second = Pose2(2.0, 1.5, 0.3), Pose2(2.4, 1.8, 0.5)
     scans = KeyScans.from_scans([KeyScan.of(room_scan(first)), KeyScan.of(room_scan(second))])
     return scans, first.between(second).to_array()
 
 
-def test_surfels_of_a_room_point_at_the_laser_across_the_walls(two):
+def test_surfels_of_a_room_point_at_the_laser_across_the_walls(two: tuple[KeyScans, NDArray[np.float64]]) -> None:
     scans, _ = two
     valid = np.hypot(*scans.normals.T) > 0
     assert valid.mean() > 0.9
@@ -49,7 +62,7 @@ def test_surfels_of_a_room_point_at_the_laser_across_the_walls(two):
     assert (towards > 0).all()
 
 
-def test_at_the_true_pose_nothing_pulls(two):
+def test_at_the_true_pose_nothing_pulls(two: tuple[KeyScans, NDArray[np.float64]]) -> None:
     scans, true = two
     _, gradient, counts = terms(scans, 1, 0, true)
     assert counts[0] > 120
@@ -59,7 +72,9 @@ def test_at_the_true_pose_nothing_pulls(two):
 
 
 @pytest.mark.parametrize("off", [(0.08, -0.05, 0.0), (0.0, 0.1, 0.02), (-0.06, 0.03, -0.03)])
-def test_a_few_steps_lead_back_to_the_true_pose(two, off):
+def test_a_few_steps_lead_back_to_the_true_pose(
+    two: tuple[KeyScans, NDArray[np.float64]], off: tuple[float, float, float]
+) -> None:
     scans, true = two
     pose = true + off
     for _ in range(6):
@@ -68,7 +83,7 @@ def test_a_few_steps_lead_back_to_the_true_pose(two, off):
     assert (np.abs(pose - true) < (0.005, 0.005, 0.002)).all()
 
 
-def test_the_gradient_is_that_of_half_the_sum_of_squares(two):
+def test_the_gradient_is_that_of_half_the_sum_of_squares(two: tuple[KeyScans, NDArray[np.float64]]) -> None:
     scans, true = two
     pose = true + np.array((0.02, 0.01, 0.004))
     _, gradient, _ = terms(scans, 1, 0, pose)
@@ -80,7 +95,7 @@ def test_the_gradient_is_that_of_half_the_sum_of_squares(two):
     np.testing.assert_allclose(gradient, numeric, rtol=0.02, atol=0.05)
 
 
-def test_a_scan_moved_into_the_room_conflicts():
+def test_a_scan_moved_into_the_room_conflicts() -> None:
     scans = KeyScans.from_scans(
         [KeyScan.of(room_scan(Pose2(1.0, 2.0, 0.0))), KeyScan.of(room_scan(Pose2(1.0, 2.0, 0.0)))]
     )
@@ -89,7 +104,7 @@ def test_a_scan_moved_into_the_room_conflicts():
     assert terms(scans, 1, 0, (0.0, 0.0, 0.0))[2][1] == 0
 
 
-def test_the_two_sides_of_a_wall_are_not_paired():
+def test_the_two_sides_of_a_wall_are_not_paired() -> None:
     """A wall at x = 1 seen from x = 0, and one 5 cm behind it seen from the other side."""
     angles = np.radians(np.arange(-40, 41))
     ranges = (1.0 / np.cos(angles)).astype(np.float32)
@@ -99,14 +114,14 @@ def test_the_two_sides_of_a_wall_are_not_paired():
     assert terms(scans, 1, 0, (2.05, 0.0, np.pi))[2][0] == 0
 
 
-def test_bearing_is_the_arctangent():
+def test_bearing_is_the_arctangent() -> None:
     angles = np.linspace(-np.pi + 1e-6, np.pi, 721)
     got = np.array([bearing(3.0 * np.sin(t), 3.0 * np.cos(t)) for t in angles])
     np.testing.assert_allclose(got, angles, atol=2e-5)
     assert bearing(0.0, 0.0) == 0.0
 
 
-def test_rare_directions_are_chosen_in_full():
+def test_rare_directions_are_chosen_in_full() -> None:
     normals = np.zeros((100, 2), np.float32)
     normals[:90] = (0.0, 1.0)
     normals[90:95] = (1.0, 0.0)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from math import inf, sqrt
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import naive_raycasting
 import numpy as np
@@ -14,13 +15,21 @@ import pytest
 
 from hsloc.kernels.raycasting import cast_rays
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 NOTHING = np.empty((0, 4))
 NOBODY = np.empty((0, 3))
 
 
-def cast(direction, segments=NOTHING, circles=NOBODY, origin=(0.0, 0.0)):
-    direction = np.array([direction]) / np.linalg.norm(direction)
-    return cast_rays(np.array([origin]), direction, np.asarray(segments, float), np.asarray(circles, float))[0]
+def cast(
+    direction: NDArray[np.float64] | tuple[Any, ...],
+    segments: NDArray[np.float64] | list[tuple[float, float, float, float]] = NOTHING,
+    circles: NDArray[np.float64] | list[tuple[float, float, float]] = NOBODY,
+    origin: Any = (0.0, 0.0),
+) -> float:
+    unit = np.array([direction]) / np.linalg.norm(direction)
+    return float(cast_rays(np.array([origin]), unit, np.asarray(segments, float), np.asarray(circles, float))[0])
 
 
 @pytest.mark.parametrize(
@@ -28,16 +37,16 @@ def cast(direction, segments=NOTHING, circles=NOBODY, origin=(0.0, 0.0)):
     [((1, 0), 2.0), ((1, 1), 2.0 * sqrt(2)), ((1, 1.0001), inf), ((-1, 0), inf), ((0, 1), inf)],
     ids=["square on", "through its end", "past its end", "behind", "parallel"],
 )
-def test_distance_to_one_wall(direction, distance):
+def test_distance_to_one_wall(direction: tuple[Any, ...], distance: float) -> None:
     assert cast(direction, [(2.0, -2.0, 2.0, 2.0)]) == pytest.approx(distance, abs=1e-12)
 
 
-def test_nearest_of_two_walls_counts_in_either_order():
+def test_nearest_of_two_walls_counts_in_either_order() -> None:
     walls = [(2.0, -1.0, 2.0, 1.0), (3.0, -1.0, 3.0, 1.0)]
     assert cast((1, 0), walls) == cast((1, 0), walls[::-1]) == 2.0
 
 
-def test_no_ray_slips_through_the_corners_of_a_room():
+def test_no_ray_slips_through_the_corners_of_a_room() -> None:
     corners = np.array([(-1.1, -2.3), (3.7, -1.9), (4.1, 2.2), (0.3, 3.3)])
     room = np.hstack((corners, np.roll(corners, -1, axis=0)))
     for corner in corners:
@@ -49,20 +58,20 @@ def test_no_ray_slips_through_the_corners_of_a_room():
     [((1, 0), 4.0), ((4, 1), inf), ((-1, 0), inf)],
     ids=["through its centre", "beside", "behind"],
 )
-def test_distance_to_a_circle(direction, distance):
+def test_distance_to_a_circle(direction: tuple[int, int], distance: float) -> None:
     assert cast(direction, circles=[(5.0, 0.0, 1.0)]) == pytest.approx(distance)
 
 
-def test_circle_around_the_origin_is_not_seen():
+def test_circle_around_the_origin_is_not_seen() -> None:
     assert cast((1, 0), circles=[(0.5, 0.0, 1.0)]) == inf
 
 
-def test_wall_before_a_circle_hides_it():
+def test_wall_before_a_circle_hides_it() -> None:
     assert cast((1, 0), [(2.0, -1.0, 2.0, 1.0)], [(5.0, 0.0, 1.0)]) == 2.0
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_equals_the_naive_twin(seed):
+def test_equals_the_naive_twin(seed: int) -> None:
     rng = np.random.default_rng(seed)
     angles = rng.uniform(-4, 4, 40)
     directions = np.column_stack((np.cos(angles), np.sin(angles)))
@@ -73,7 +82,7 @@ def test_equals_the_naive_twin(seed):
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
-def test_the_same_bits_without_the_compiler():
+def test_the_same_bits_without_the_compiler() -> None:
     """The kernel is plain Python as well: both ways give the same bits."""
     program = (
         "import numpy as np; from hsloc.kernels.raycasting import cast_rays; rng = np.random.default_rng(1);"

@@ -2,18 +2,16 @@ import numpy as np
 import pytest
 from test_point_to_line import room_scan, terms
 
-from hsloc.kernels.registration import RegistrationParameters, ScanArrays, add_pairs, register
+from hsloc.kernels.point_to_line import Term
+from hsloc.kernels.registration import Prior, RegistrationParameters, Scene, add_pairs, register
 from hsloc.model import Pose2, Scan
 from hsloc.slam.keyscans import KeyScan, KeyScans
 
 PARAMETERS = RegistrationParameters((0.3, 0.2, 0.15), 0.33, 100.0, np.inf, 10)
 
 
-def arrays(scans):
-    return ScanArrays(
-        scans.points, scans.normals, scans.centroids, scans.start, scans.hit_of_beam, scans.ranges, scans.table_start,
-        scans.geometry, *scans.chosen(10_000),
-    )  # fmt: skip
+def scene(first_moving, poses, scans):
+    return Scene(first_moving, poses, scans.arrays(10_000))
 
 
 def naive_pairs(pose, first_moving, scan_poses, scans, gate):
@@ -57,7 +55,7 @@ def test_equations_are_those_of_the_pairs(room):
     scans, poses, base = room
     pose = base.to_array() + np.array((0.04, -0.03, 0.01))
     information, gradient, counts = np.zeros((3, 3)), np.zeros(3), np.zeros(5)
-    add_pairs(pose, 2, poses, arrays(scans), 0.3, PARAMETERS, information, gradient, counts)
+    add_pairs(pose, scene(2, poses, scans), 0.3, PARAMETERS, Term(information, gradient), counts)
     wanted = naive_pairs(pose, 2, poses, scans, 0.3)
     np.testing.assert_allclose(information, wanted[0], rtol=1e-5, atol=1e-3)
     np.testing.assert_allclose(gradient, wanted[1], rtol=1e-5, atol=1e-3)
@@ -69,7 +67,7 @@ def test_a_scan_finds_its_pose(room):
     pose = base.to_array() + np.array((0.12, -0.1, 0.05))
     prior = np.eye(3) * 1e-3
     counts = np.zeros(5)
-    register(pose, 2, poses, arrays(scans), pose.copy(), prior, PARAMETERS, np.zeros((3, 3)), counts)
+    register(pose, scene(2, poses, scans), Prior(pose.copy(), prior), PARAMETERS, np.zeros((3, 3)), counts)
     assert np.abs(pose - base.to_array()).max() < 0.005
     assert counts[0] > 300
     assert counts[1] == 0
@@ -90,7 +88,7 @@ def test_along_a_corridor_the_prior_decides():
     predicted, information = np.array((1.0, 0.0, 0.0)), np.zeros((3, 3))
     for start in (predicted, predicted - (0.4, 0.0, 0.0)):
         pose = start.copy()
-        register(pose, 1, poses, arrays(scans), predicted, prior, PARAMETERS, information, np.zeros(5))
+        register(pose, scene(1, poses, scans), Prior(predicted, prior), PARAMETERS, information, np.zeros(5))
         assert np.abs(pose - predicted).max() < 0.01
     assert information[0, 0] < 1e-3 * information[1, 1]
 
@@ -100,10 +98,8 @@ def test_a_refuted_prior_loses_its_weight(room):
     predicted = base.to_array() + np.array((0.0, 0.0, 0.6))
     prior = np.diag((1e6, 1e6, 1e5))
     trusted, doubted = base.to_array(), base.to_array()
-    register(trusted, 2, poses, arrays(scans), predicted, prior, PARAMETERS, np.zeros((3, 3)), np.zeros(5))
-    chi = register(
-        doubted, 2, poses, arrays(scans), predicted, prior, PARAMETERS._replace(prior_scale=3.0), np.zeros((3, 3)),
-        np.zeros(5),
-    )  # fmt: skip
+    fixed, refutable = PARAMETERS, PARAMETERS._replace(prior_scale=3.0)
+    register(trusted, scene(2, poses, scans), Prior(predicted, prior), fixed, np.zeros((3, 3)), np.zeros(5))
+    chi = register(doubted, scene(2, poses, scans), Prior(predicted, prior), refutable, np.zeros((3, 3)), np.zeros(5))
     assert abs(doubted[2] - base.theta) < 0.01 < abs(trusted[2] - base.theta)
     assert chi > 100.0

@@ -1,11 +1,26 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import pytest
 
 from hsloc.kernels.fitness import pack
 from hsloc.kernels.score_field_update import decay_table, splat
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-def drawn(points, *, shape=(24, 30), sigma=2.0, radius=5.0, known=2.0, batches=1):
+
+def drawn(
+    points: NDArray[np.float64],
+    *,
+    shape: Any = (24, 30),
+    sigma: float = 2.0,
+    radius: float = 5.0,
+    known: float = 2.0,
+    batches: int = 1,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], int]:
     scores, packed = np.zeros(shape, np.float32), np.zeros((shape[0] - 1, shape[1] - 1, 4), np.float32)
     table = decay_table(sigma, radius)
     count = sum(
@@ -15,7 +30,9 @@ def drawn(points, *, shape=(24, 30), sigma=2.0, radius=5.0, known=2.0, batches=1
     return scores, packed, count
 
 
-def naive_scores(points, shape, sigma, radius):
+def naive_scores(
+    points: NDArray[np.float64], shape: tuple[int, int], sigma: float, radius: float
+) -> NDArray[np.float64]:
     scores = np.zeros(shape)
     for v in range(shape[0]):
         for u in range(shape[1]):
@@ -25,7 +42,7 @@ def naive_scores(points, shape, sigma, radius):
     return scores
 
 
-def test_scores_are_the_decay_of_the_distance_to_the_nearest_point():
+def test_scores_are_the_decay_of_the_distance_to_the_nearest_point() -> None:
     points = np.random.default_rng(3).uniform((8, 8), (20, 15), (12, 2))
     scores, _, count = drawn(points)
     assert count == 12
@@ -35,7 +52,7 @@ def test_scores_are_the_decay_of_the_distance_to_the_nearest_point():
     np.testing.assert_allclose(scores[far], naive_scores(points, scores.shape, 2.0, 5.0)[far], atol=0.011)
 
 
-def test_the_packed_field_is_that_of_all_scores_however_the_points_came():
+def test_the_packed_field_is_that_of_all_scores_however_the_points_came() -> None:
     points = np.random.default_rng(4).uniform((8, 8), (20, 15), (20, 2))
     scores, packed, _ = drawn(points, batches=5)
     afresh = np.empty_like(packed)
@@ -44,7 +61,7 @@ def test_the_packed_field_is_that_of_all_scores_however_the_points_came():
     np.testing.assert_array_equal(scores, drawn(points)[0])
 
 
-def test_a_point_that_the_map_has_is_spared():
+def test_a_point_that_the_map_has_is_spared() -> None:
     scores, packed, count = drawn(np.array([(12.0, 12.0), (12.1, 12.0), (16.0, 12.0)]), known=0.9)
     assert count == 2
     assert scores[12, 12] == 1.0
@@ -53,7 +70,7 @@ def test_a_point_that_the_map_has_is_spared():
 
 
 @pytest.mark.parametrize("point", [(-3.0, 5.0), (2.0, 12.0), (28.9, 12.0), (12.0, 100.0), (np.nan, 3.0)])
-def test_points_at_the_border_or_outside_are_left_out(point):
+def test_points_at_the_border_or_outside_are_left_out(point: tuple[float, float]) -> None:
     scores, packed, count = drawn(np.array([point]))
     assert count == 0
     assert not scores.any()

@@ -3,19 +3,34 @@
 from __future__ import annotations
 
 from math import exp, log
+from typing import TYPE_CHECKING, Any
 
 import naive
 import numpy as np
 import pytest
 
 from hsloc.kernels.fitness import pack, score_sum
-from hsloc.kernels.search import STOPPED_AGREEMENT, STOPPED_BUDGET, SearchParameters, improve_memory, search
+from hsloc.kernels.search import (
+    STOPPED_AGREEMENT,
+    STOPPED_BUDGET,
+    Box,
+    Found,
+    Memory,
+    SearchParameters,
+    improve_memory,
+    search,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
 
 NONE = np.empty(0)
 
 
-def parameters(**changes):
-    values = {
+def parameters(**changes: bool | int) -> SearchParameters:
+    values: dict[str, Any] = {
         "memory_size": 8, "consideration_rate": 0.88, "par_min": 0.55, "par_max": 0.98,
         "bandwidth_max": (2.0, 2.0, 0.2), "bandwidth_ratio": 0.01, "improvisations_per_pass": 5, "attraction": 0.7,
         "differential_weight": 0.44, "budget": 60, "count_improvisations": False, "restarts": 1, "agreement": 1,
@@ -25,7 +40,7 @@ def parameters(**changes):
 
 
 @pytest.fixture
-def scene():
+def scene() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     rng = np.random.default_rng(5)
     smooth = np.exp(-(((np.arange(40)[:, None] - 20) ** 2) + (np.arange(50)[None, :] - 25) ** 2) / 60.0)
     scores = (0.8 * smooth + 0.2 * rng.random((40, 50))).astype(np.float32)
@@ -35,7 +50,13 @@ def scene():
     return scores, packed, points
 
 
-def naive_hide(score, centre, half, p, rng):
+def naive_hide(
+    score: Callable[..., Any],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    p: SearchParameters,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
     """HS and HIDE as the papers tell them; draws from `rng` in the same order as the kernel."""
     low, high = centre - half, centre + half
     memory = np.empty((p.memory_size, 3))
@@ -45,7 +66,7 @@ def naive_hide(score, centre, half, p, rng):
     fitness = np.array([score(row) for row in memory])
     evaluations, improvisations = p.memory_size, 0
 
-    def spent():
+    def spent() -> Any:
         return improvisations if p.count_improvisations else evaluations
 
     while spent() < p.budget:
@@ -96,16 +117,18 @@ def naive_hide(score, centre, half, p, rng):
         {"budget": 3},
     ],
 )
-def test_hs_and_hide_are_the_plain_reading_of_the_papers(scene, changes):
+def test_hs_and_hide_are_the_plain_reading_of_the_papers(
+    scene: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], changes: dict[str, Any]
+) -> None:
     _, packed, points = scene
     p = parameters(**changes)
     centre, half = np.array([22.0, 17.0, 0.1]), np.array([6.0, 6.0, 0.5])
     memory, sums = np.empty((p.memory_size, 3)), np.empty(p.memory_size)
     best, evaluations = improve_memory(
-        packed, points, centre, half, p, np.random.default_rng(7), memory, sums, NONE, True
+        packed, points, Box(centre, half), p, np.random.default_rng(7), Memory(memory, sums), NONE, True
     )
 
-    def score(pose):
+    def score(pose: Any) -> Any:
         return score_sum(packed, points, pose[0], pose[1], pose[2], -2.0)
 
     expected, fitness, spent = naive_hide(score, centre, half, p, np.random.default_rng(7))
@@ -115,13 +138,15 @@ def test_hs_and_hide_are_the_plain_reading_of_the_papers(scene, changes):
     assert sums[best] == sums.max()
 
 
-def test_the_memory_stays_in_the_box_and_never_gets_worse(scene):
+def test_the_memory_stays_in_the_box_and_never_gets_worse(
+    scene: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+) -> None:
     scores, packed, points = scene
     p = parameters(budget=200)
     centre, half = np.array([20.0, 20.0, 3.0]), np.array([3.0, 5.0, 0.2])
     memory, sums, history = np.empty((8, 3)), np.empty(8), np.full(200, np.nan)
     best, evaluations = improve_memory(
-        packed, points, centre, half, p, np.random.default_rng(0), memory, sums, history, True
+        packed, points, Box(centre, half), p, np.random.default_rng(0), Memory(memory, sums), history, True
     )
     assert evaluations == 200
     assert (np.abs(memory - centre) <= half + 1e-12).all()
@@ -130,16 +155,23 @@ def test_the_memory_stays_in_the_box_and_never_gets_worse(scene):
     assert sums[best] == pytest.approx(naive.score_sum(scores, points, *memory[best]), abs=1e-3)
 
 
-def test_search_is_repeatable_and_tells_why_it_stopped(scene):
+def test_search_is_repeatable_and_tells_why_it_stopped(
+    scene: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
+) -> None:
     _, packed, points = scene
     centre, half = np.array([22.0, 18.0, 0.0]), np.array([5.0, 5.0, 0.4])
 
-    def run(seed, **changes):
+    def run(seed: Any, **changes: Any) -> Any:
         pose, information = np.empty(3), np.zeros((3, 3))
         told = search(
-            packed, points, points[:10], centre, half, parameters(**changes), np.random.default_rng(seed), pose,
-            information, NONE,
-        )  # fmt: skip
+            packed,
+            points,
+            points[:10],
+            Box(centre, half),
+            parameters(**changes),
+            np.random.default_rng(seed),
+            Found(pose, information, NONE),
+        )
         return pose, told
 
     many = {"restarts": 10, "agreement": 2, "polish_iterations": 10}
@@ -150,7 +182,7 @@ def test_search_is_repeatable_and_tells_why_it_stopped(scene):
     assert stopped == STOPPED_AGREEMENT
     assert 2 <= restarts <= 10
     assert evaluations > restarts * 60
-    assert fitness == pytest.approx(score_sum(packed, points, *first[0], -2.0) / 20, abs=1e-6)
+    assert fitness == pytest.approx(score_sum(packed, points, *first[0], -2.0) / 20, abs=1e-6)  # type: ignore[call-arg]
     assert (np.abs(first[0] - centre) <= half).all()
     assert run(1)[1][3] == STOPPED_BUDGET
     assert not np.array_equal(run(1)[0], run(2)[0])

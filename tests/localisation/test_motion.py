@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,7 +16,7 @@ from hsloc.model import Pose2, wrap_angle
 angles = st.floats(-3.0, 3.0)
 
 
-def test_covariance_is_that_of_many_sampled_motions():
+def test_covariance_is_that_of_many_sampled_motions() -> None:
     rng = np.random.default_rng(0)
     noise = OdometryNoise(alpha1=0.01, alpha2=0.002, alpha3=0.01, alpha4=0.001)
     rot1, trans, rot2 = 0.3, 1.2, -0.2
@@ -27,7 +29,7 @@ def test_covariance_is_that_of_many_sampled_motions():
     np.testing.assert_allclose(noise.covariance(motion), np.cov(samples), rtol=0.1, atol=2e-4)
 
 
-def test_prediction_is_that_of_many_sampled_poses():
+def test_prediction_is_that_of_many_sampled_poses() -> None:
     rng = np.random.default_rng(1)
     covariance = np.array([[0.004, 0.001, 0.0005], [0.001, 0.006, 0.0], [0.0005, 0.0, 0.003]])
     pose, motion = Pose2(1.0, 2.0, 0.8), Pose2(0.7, 0.1, 0.2)
@@ -40,17 +42,17 @@ def test_prediction_is_that_of_many_sampled_poses():
     )
 
 
-def test_driving_backwards_is_no_turn():
+def test_driving_backwards_is_no_turn() -> None:
     noise = OdometryNoise(alpha1=0.1, alpha2=0.0, alpha3=0.0, alpha4=0.0)
     assert np.abs(noise.covariance(Pose2(-0.5, 0.0, 0.0))).max() < 1e-20
 
 
-def test_standing_still_is_certain():
+def test_standing_still_is_certain() -> None:
     assert np.abs(OdometryNoise().covariance(Pose2())).max() == 0.0
 
 
 @given(angles, angles)
-def test_fusing_ends_between_prediction_and_measurement(theta, measured):
+def test_fusing_ends_between_prediction_and_measurement(theta: Any, measured: Any) -> None:
     covariance = np.diag((0.04, 0.01, 0.02))
     pose, updated = fuse(Pose2(0.0, 0.0, theta), covariance, Pose2(1.0, 1.0, measured), covariance)
     assert pose.x == pytest.approx(0.5)
@@ -61,12 +63,12 @@ def test_fusing_ends_between_prediction_and_measurement(theta, measured):
     np.testing.assert_allclose(updated, covariance / 2.0, atol=1e-12)
 
 
-def test_a_sure_measurement_wins():
+def test_a_sure_measurement_wins() -> None:
     pose, updated = fuse(Pose2(), np.eye(3), Pose2(1.0, 2.0, 0.3), np.eye(3) * 1e-9)
     assert pose.distance(Pose2(1.0, 2.0, 0.3)) < 1e-6
     assert np.diag(updated).max() < 1e-6
 
 
-def test_negative_noise_is_refused():
+def test_negative_noise_is_refused() -> None:
     with pytest.raises(ConfigError, match="alpha2 is -1"):
         OdometryNoise(alpha2=-1.0)

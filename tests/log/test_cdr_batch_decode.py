@@ -63,7 +63,7 @@ def test_columns_are_the_messages_to_the_last_bit(data: st.DataObject, name: str
             if name == definitions.POSE_STAMPED
             else encode.pose_with_covariance_stamped(START + n, pose, covariance, frame)
         )
-        at = decode.odometry_pose_at(payload) if name == definitions.ODOMETRY else decode.stamped_pose_at(payload)
+        at = decode.odometry_pose_at(payload) if name == definitions.ODOMETRY else decode.stamped_pose_at(payload)  # type: ignore[arg-type]
         numbers(data, payload, at, 7)
         payloads.append(bytes(payload))
     found = columns.BY_HAND[name](payloads, covariances=True)

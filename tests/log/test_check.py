@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from log_builders import DATA, MOUNTING, SECOND, START, chunk_data_at, chunks_of, flipped, make_scan, write_run
+from log_builders import MOUNTING, SECOND, START, chunk_data_at, chunks_of, flipped, make_scan, write_run
+from paths import DATA
 
 from hsloc.cli.main import main
 from hsloc.log.checks.checker import check_log

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from log_builders import DATA, SECOND, START, chunk_data_at, chunks_of, describe, flipped, make_scan, write_run
+from log_builders import SECOND, START, chunk_data_at, chunks_of, describe, flipped, make_scan, write_run
 from mcap.reader import make_reader
+from paths import DATA
 
 from hsloc.errors import LogFormatError
 from hsloc.log.convert import convert_log

@@ -19,6 +19,7 @@ from hsloc.log.container import Channel
 from hsloc.log.messages import decode, definitions, encode
 from hsloc.log.messages import definition_compatibility as schema
 from hsloc.log.messages.decoders import Undecodable, decoder_for, is_decodable
+from hsloc.log.messages.from_objects import FROM_OBJECT
 from hsloc.log.transforms import Transform3
 from hsloc.model import OccupancyGrid, Pose2
 
@@ -39,15 +40,27 @@ def payloads(frame: str, child: str) -> dict[str, bytes]:
         definitions.ODOMETRY: encode.odometry(START, POSE, COVARIANCE, (1, 0, 2), (frame, child)),
         definitions.TF_MESSAGE: encode.transforms(START, [*LINKS, (frame, child, POSE)]),
         definitions.OCCUPANCY_GRID: encode.occupancy_grid(GRID, START, frame),
+        definitions.MULTI_ECHO_LASER_SCAN: multi_echo(frame),
         definitions.POSE_STAMPED: encode.pose_stamped(START, POSE, frame),
         definitions.POSE_WITH_COVARIANCE_STAMPED: encode.pose_with_covariance_stamped(START, POSE, COVARIANCE, frame),
     }
 
 
+def multi_echo(frame: str) -> bytes:
+    """A scan of which some beams have no echo, and some several."""
+    kinds = ROS2.types
+    header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](START // 10**9, 5), frame)
+    echoes = [np.array(values, dtype=np.float32) for values in ([1.5], [], [2.5, 3.5], [4.0])]
+    beams = [kinds["sensor_msgs/msg/LaserEcho"](values) for values in echoes]
+    name = definitions.MULTI_ECHO_LASER_SCAN
+    message = kinds[name](header, -1.0, 1.0, 0.5, 0.0, 0.1, 0.05, 12.0, beams, [])
+    return bytes(ROS2.serialize_cdr(message, name))
+
+
 def plain(value: Any) -> Any:
     """Something that `==` compares by value."""
     if isinstance(value, np.ndarray):
-        return value.dtype.str, value.tolist()
+        return value.dtype.str, repr(value.tolist())
     if isinstance(value, OccupancyGrid):
         return plain(value.cells), value.resolution, value.origin
     if isinstance(value, (tuple, list)):
@@ -60,7 +73,7 @@ def plain(value: Any) -> Any:
 def test_by_hand_and_by_rosbags_give_the_same(frame: str, child: str) -> None:
     for name, data in payloads(frame, child).items():
         by_hand = decode.BY_HAND[name](memoryview(data))
-        by_object = decode.FROM_OBJECT[name](ROS2.deserialize_cdr(data, name))
+        by_object = FROM_OBJECT[name](ROS2.deserialize_cdr(data, name))
         assert plain(by_hand) == plain(by_object), name
 
 
@@ -241,7 +254,8 @@ def test_a_missing_definition_means_the_standard_one() -> None:
 def test_other_encodings_are_not_ours() -> None:
     assert is_decodable(channel(definitions.LASER_SCAN))
     assert not is_decodable(channel("foxglove.LaserScan", "", "protobuf", "protobuf"))
-    assert not is_decodable(channel(definitions.LASER_SCAN, "{}", "jsonschema", "json"))
+    assert is_decodable(channel(definitions.LASER_SCAN, "{}", "jsonschema", "json"))
+    assert not is_decodable(channel(definitions.LASER_SCAN, "", "flatbuffer", "flatbuffer"))
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import json
 import sys
 import time
 from functools import cache, partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import log_formats as formats
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
 from hsloc.errors import LogFormatError
@@ -23,6 +23,7 @@ from hsloc.log.messages import foxglove
 from hsloc.log.messages.decoders import Undecodable, decoder_for
 from hsloc.log.reader import open_log
 from hsloc.log.session.extrinsics import Extrinsics
+from hsloc.log.session.transform_topics import TransformTopics
 from hsloc.log.summary import Losses, ReadOptions
 from hsloc.log.transforms import Mounting, Transform3
 from hsloc.log.writer import LogWriter
@@ -32,10 +33,10 @@ from hsloc.request import RunRequest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from hsloc.model import Event
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 
 FORMATS: dict[str, tuple[str, Callable[[Path, Path], Path]]] = {
     "ros1 in MCAP": ("ros1.mcap", formats.ros1_mcap),
@@ -85,7 +86,7 @@ def test_every_format_gives_the_same_trajectory(source: Path, name: str) -> None
     np.testing.assert_array_equal(found.trajectory.stamps_ns, expected.trajectory.stamps_ns)
     np.testing.assert_array_equal(found.trajectory.poses, expected.trajectory.poses)
     assert found.reference is not None
-    np.testing.assert_array_equal(found.reference.poses, expected.reference.poses)  # type: ignore[union-attr]
+    np.testing.assert_array_equal(found.reference.poses, expected.reference.poses)
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "json", "protobuf"])
@@ -104,7 +105,7 @@ def test_odometry_may_stand_in_transforms_alone(source: Path, tmp_path: Path, en
 def test_ranges_and_stamps_survive_every_encoding(tmp_path: Path) -> None:
     stamp = 1_700_000_000_123_456_789
     ranges = np.array([0.1, np.float32(1) / 3, 7.0000005, np.inf, np.nan, -np.inf, 0.0, 1e-4], dtype=np.float32)
-    scan = Scan(stamp, ranges, -1.1, np.float32(0.1), 0.05, 12.0, intensities=np.arange(8, dtype=np.float32) / 3)
+    scan = Scan(stamp, ranges, -1.1, np.float32(0.1), 0.05, 12.0, intensities=np.arange(8, dtype=np.float32) / 3)  # type: ignore[arg-type]
     with LogWriter(tmp_path / "cdr.mcap") as log:
         log.scan(scan)
         log.odometry(stamp, Pose2(1.0, 2.0, 3.0))
@@ -114,7 +115,7 @@ def test_ranges_and_stamps_survive_every_encoding(tmp_path: Path) -> None:
         assert found.stamp_ns == stamp
         assert found.ranges.tobytes() == ranges.tobytes()
         assert found.intensities is not None
-        assert found.intensities.tobytes() == scan.intensities.tobytes()  # type: ignore[union-attr]
+        assert found.intensities.tobytes() == scan.intensities.tobytes()
         assert found.angle_increment == float(np.float32(0.1))
         # Without limits of range in the message, zero is no hit all the same.
         assert found.hits().tolist() == [True, True, True, False, False, False, False, False]
@@ -126,7 +127,7 @@ def test_the_pose_of_a_foxglove_scan_is_part_of_its_mounting() -> None:
     message.pose.orientation.x = 1.0  # head down
     scan = decoder_for(channel("foxglove.LaserScan"))(message.SerializeToString())
     assert scan.T_frame_laser == Transform3((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-    mountings = Extrinsics([], "base", None)
+    mountings = Extrinsics([], TransformTopics(), "base", None)
     mountings._spatial["laser"] = Transform3.from_pose2(Pose2(0.5, 0.25, np.pi / 2))
     mountings._known["laser"] = (Mounting(Pose2(0.5, 0.25, np.pi / 2)), "/tf_static")
     mounting = mountings.of("laser", scan.T_frame_laser)
@@ -202,7 +203,7 @@ def test_any_protobuf_payload_is_decoded_or_undecodable(data: bytes, name: str) 
 def altered(change: Callable[[Any], None]) -> bytes:
     copy = formats.descriptors()
     change(copy)
-    return copy.SerializeToString()
+    return copy.SerializeToString()  # type: ignore[no-any-return]
 
 
 @pytest.mark.parametrize(
@@ -213,7 +214,7 @@ def altered(change: Callable[[Any], None]) -> bytes:
         altered(lambda files: files.file[1].dependency.append("foxglove.proto")),
         altered(lambda files: files.file[0].message_type.pop(3)),
         altered(lambda files: files.file[0].message_type[3].field[0].__setattr__("type_name", ".foxglove.None")),
-        altered(lambda files: [files.file.add(name=str(n)) for n in range(300)]),
+        altered(lambda files: [files.file.add(name=str(n)) for n in range(300)]),  # type: ignore[arg-type]
     ],
 )
 def test_definitions_that_cannot_be_used_are_one_line(schema: bytes) -> None:
@@ -258,6 +259,10 @@ def test_foxgloves_transforms_are_found_under_any_name(source: Path, tmp_path: P
 
     path = formats.foxglove_mcap(source, tmp_path / "all.mcap", "protobuf")
     log = open_log(formats.write(tmp_path / "renamed.mcap", renamed(), source))
-    assert (log.summary.odom_topic, log.summary.base_frame, log.summary.extrinsics) == ("/tf", "base_link", "/tf")
+    assert (log.summary.odom_topic, log.summary.base_frame, log.summary.extrinsics) == (
+        "/transforms",
+        "base_link",
+        "/transforms",
+    )
     expected = open_log(source, ReadOptions(odom_topic="tf")).events()
     assert [values(event) for event in log.events()] == [values(event) for event in expected]

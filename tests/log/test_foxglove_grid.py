@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import log_formats
 import numpy as np
 import pytest
 from log_builders import START, write_raw
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
 from hsloc.log.container import Channel
@@ -18,9 +18,11 @@ from hsloc.log.messages.decoders import Undecodable, decoder_for
 from hsloc.log.reader import open_log
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hsloc.model import OccupancyGrid
 
-HALL = Path(__file__).parents[2] / "recordings" / "hall.mcap"
+HALL = RECORDINGS / "hall.mcap"
 CELLS = np.array(((-1, 0, 100), (50, 7, 0)), dtype=np.int8)
 
 

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import lz4.frame
 import pytest
 import zstandard
-from log_builders import DATA, SECOND, START, chunk_data_at, chunks_of, flipped, scan_payloads, write_raw, write_run
+from log_builders import SECOND, START, chunk_data_at, chunks_of, flipped, scan_payloads, write_raw, write_run
 from mcap.writer import CompressionType, IndexType
+from paths import DATA
 
 from hsloc.errors import LogFormatError
 from hsloc.log.mcap.container import McapContainer
@@ -180,7 +181,7 @@ def test_out_of_order_and_overlapping_chunks_are_merged_exactly(tmp_path: Path) 
     for number in range(0, COUNT, 2):
         first[number : number + 2] = reversed(first[number : number + 2])
     for options in ({}, {"use_chunking": False}, {"index_types": IndexType.NONE}):
-        path = write_raw(tmp_path / "log.mcap", first + second, **options)  # type: ignore[arg-type]
+        path = write_raw(tmp_path / "log.mcap", first + second, **options)
         times, losses = read(path)
         assert times == sorted(times)
         assert (len(times), losses.late_messages) == (2 * COUNT, 0)

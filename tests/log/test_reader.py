@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from log_builders import (
-    DATA,
     MOUNTING,
     SECOND,
     START,
@@ -22,6 +21,7 @@ from log_builders import (
     write_raw,
     write_run,
 )
+from paths import DATA
 
 from hsloc.errors import LogError, LogFormatError, TopicError
 from hsloc.log.reader import open_log
@@ -433,7 +433,7 @@ def test_split_logs_are_one_log(tmp_path: Path) -> None:
         assert log.losses == Losses()
         assert log.summary.extrinsics == "/tf_static"
         odom = next(topic for topic in log.summary.topics if topic.topic == "/odom")
-        assert (odom.count, odom.largest_gap_s) == (120, pytest.approx(0.05))
+        assert (odom.count, odom.largest_gap_s) == (120, pytest.approx(0.05))  # type: ignore[comparison-overlap]
     assert [p.name for p in open_log(folder).summary.paths][-2:] == ["bag_10.mcap", "bag_11.mcap"]
 
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from hsloc.log.reader import open_log
 from hsloc.log.writer import LogWriter
 from hsloc.model import Pose2, Scan
 
+if TYPE_CHECKING:
+    from pathlib import Path
 
-def test_an_increment_of_zero_is_no_scan(tmp_path):
+
+def test_an_increment_of_zero_is_no_scan(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with LogWriter(path) as writer:
         for k, increment in enumerate((0.0, 0.1, 0.0)):

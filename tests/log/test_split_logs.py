@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import log_formats
@@ -12,6 +11,7 @@ import pytest
 from log_builders import SECOND, START, describe, make_scan, write_run
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
 from hsloc.errors import LogError
@@ -22,8 +22,7 @@ from hsloc.model import Pose2
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-RECORDINGS = Path(__file__).parents[2] / "recordings"
+    from pathlib import Path
 
 
 def copy(
@@ -38,7 +37,7 @@ def copy(
         writer.start(profile="ros2", library="test")
         channels: dict[int, int] = {}
         for schema, channel, message in messages:
-            if not keep(channel.topic, (message.log_time - start) / SECOND):
+            if not keep(channel.topic, (message.log_time - start) / SECOND):  # type: ignore[arg-type]
                 continue
             if channel.id not in channels:
                 assert schema is not None

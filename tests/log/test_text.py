@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_builders import DATA, SECOND
+from log_builders import SECOND
+from paths import DATA
 
 from hsloc.errors import HslocError, LogFormatError, TopicError
 from hsloc.log.reader import open_log

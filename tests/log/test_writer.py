@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 from math import inf, nan, pi
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -91,7 +91,9 @@ def write_everything(path: Path) -> None:
 def test_rosbags_reads_what_was_written(tmp_path: Path) -> None:
     write_everything(tmp_path / "log.mcap")
     with AnyReader([tmp_path / "log.mcap"]) as reader:
-        messages = [(c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
+        messages: list[tuple[str, int, Any]] = [
+            (c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()
+        ]
     assert len(messages) == 2 + 5 * 5 + 1
     odometry = [m for topic, _, m in messages if topic == "/odom"]
     assert [m.pose.pose.position.x for m in odometry] == [0, 1, 2, 3, 4]

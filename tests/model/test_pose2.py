@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import atan2, cos, pi, sin
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,41 +23,41 @@ def close(a: Pose2, b: Pose2) -> bool:
 
 
 @given(poses)
-def test_identity(T):
+def test_identity(T: Any) -> None:
     assert close(T @ IDENTITY, T)
     assert close(IDENTITY @ T, T)
 
 
 @given(poses)
-def test_inverse(T):
+def test_inverse(T: Any) -> None:
     assert close(T @ T.inverse(), IDENTITY)
     assert close(T.inverse() @ T, IDENTITY)
 
 
 @given(poses, poses, poses)
-def test_associativity(A, B, C):
+def test_associativity(A: Any, B: Any, C: Any) -> None:
     assert close((A @ B) @ C, A @ (B @ C))
 
 
 @given(poses, poses)
-def test_between_is_inverse_then_compose(A, B):
+def test_between_is_inverse_then_compose(A: Any, B: Any) -> None:
     assert close(A.between(B), A.inverse() @ B)
 
 
 @given(poses, poses, st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=5))
-def test_acting_on_points_composes(A, B, points):
+def test_acting_on_points_composes(A: Any, B: Any, points: Any) -> None:
     array = np.array(points)
     np.testing.assert_allclose((A @ B) @ array, A @ (B @ array), atol=1e-9)
 
 
-def test_a_quarter_turn_by_hand():
+def test_a_quarter_turn_by_hand() -> None:
     T_map_base = Pose2(1.0, 2.0, pi / 2)
     assert close(T_map_base @ Pose2(1.0, 0.0, 0.0), Pose2(1.0, 3.0, pi / 2))
     np.testing.assert_allclose(T_map_base @ np.array([[1.0, 0.0], [0.0, 1.0]]), [[1.0, 3.0], [0.0, 2.0]], atol=1e-12)
 
 
 @given(angles)
-def test_wrapping_keeps_the_direction(angle):
+def test_wrapping_keeps_the_direction(angle: Any) -> None:
     wrapped = wrap_angle(angle)
     assert -pi < wrapped <= pi
     assert abs(atan2(sin(wrapped - angle), cos(wrapped - angle))) < 1e-9
@@ -64,17 +65,17 @@ def test_wrapping_keeps_the_direction(angle):
 
 
 @pytest.mark.parametrize("angle", [pi, -pi, 3 * pi, -3 * pi])
-def test_half_a_turn_is_plus_pi(angle):
+def test_half_a_turn_is_plus_pi(angle: float) -> None:
     assert wrap_angle(angle) == pytest.approx(pi)
 
 
 @given(poses)
-def test_quaternion_round_trip(T):
+def test_quaternion_round_trip(T: Any) -> None:
     assert close(Pose2.from_quaternion(T.x, T.y, *T.to_quaternion()), T)
 
 
 @given(poses, poses)
-def test_interpolation_ends_at_the_ends_and_goes_the_short_way(A, B):
+def test_interpolation_ends_at_the_ends_and_goes_the_short_way(A: Any, B: Any) -> None:
     assert close(A.interpolate(B, 0.0), A)
     assert close(A.interpolate(B, 1.0), B)
     half = A.interpolate(B, 0.5)
@@ -82,7 +83,7 @@ def test_interpolation_ends_at_the_ends_and_goes_the_short_way(A, B):
 
 
 @given(st.lists(st.tuples(poses, poses), min_size=1, max_size=5))
-def test_rows_are_poses(pairs):
+def test_rows_are_poses(pairs: Any) -> None:
     first = np.array([A.to_array() for A, _ in pairs])
     second = np.array([B.to_array() for _, B in pairs])
     for row, (A, B) in zip(relative_poses(first, second), pairs, strict=True):

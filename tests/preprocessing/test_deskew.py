@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -17,35 +18,38 @@ from hsloc.request import RunRequest
 from hsloc.simulation.presets import preset
 from hsloc.simulation.recorder import record
 
+if TYPE_CHECKING:
+    from pathlib import Path
+
 SECOND = 1_000_000_000
 
 
-def drive(rate=50, seconds=2.0, speed=1.0, turn=0.5):
+def drive(rate: int = 50, seconds: float = 2.0, speed: float = 1.0, turn: float = 0.5) -> list[Odometry]:
     """Odometry on a circle."""
     return [Odometry(round(k * SECOND / rate), at(k / rate, speed, turn)) for k in range(round(seconds * rate) + 1)]
 
 
-def at(seconds, speed=1.0, turn=0.5):
+def at(seconds: float, speed: float = 1.0, turn: float = 0.5) -> Pose2:
     angle = turn * seconds
     return Pose2(speed / turn * np.sin(angle), speed / turn * (1.0 - np.cos(angle)), angle)
 
 
-def scan(stamp_s=1.0, beams=100, sweep_s=0.1, **changes):
-    values = {"T_base_laser": Pose2(0.2, 0.1, 0.3), "time_increment": sweep_s / max(beams, 1)} | changes
+def scan(stamp_s: float = 1.0, beams: int = 100, sweep_s: float = 0.1, **changes: Any) -> Scan:
+    values: dict[str, Any] = {"T_base_laser": Pose2(0.2, 0.1, 0.3), "time_increment": sweep_s / max(beams, 1)} | changes
     return Scan(round(stamp_s * SECOND), np.full(beams, 2.0, np.float32), -1.0, 0.02, 0.1, 10.0, **values)
 
 
-def paired_scan(events):
-    (found,) = (event for event in pair(sorted(events, key=lambda e: e.stamp_ns), deskew=True) if is_scan(event))
-    return found
+def paired_scan(events: list[Any]) -> PairedScan:
+    (found,) = (event for event in pair(sorted(events, key=lambda e: e.stamp_ns), deskew=True) if is_scan(event))  # type: ignore[arg-type]
+    return found  # type: ignore[return-value]
 
 
-def is_scan(event):
+def is_scan(event: Odometry | PairedScan) -> bool:
     return isinstance(event, PairedScan)
 
 
 @pytest.mark.parametrize("increment", [1.0, -1.0])
-def test_every_point_is_where_the_robot_saw_it(increment):
+def test_every_point_is_where_the_robot_saw_it(increment: float) -> None:
     seen = scan(time_increment=increment * 0.1 / 100)
     found = paired_scan([*drive(rate=500), seen])
     assert found.T_odom_base.to_array() == pytest.approx(at(1.0).to_array())
@@ -56,7 +60,7 @@ def test_every_point_is_where_the_robot_saw_it(increment):
         assert points[k] == pytest.approx(expected, abs=1e-5)
 
 
-def test_points_that_hit_nothing_are_left_out():
+def test_points_that_hit_nothing_are_left_out() -> None:
     ranges = np.full(100, 2.0, np.float32)
     ranges[::3] = np.inf
     found = paired_scan([*drive(), scan()])
@@ -67,37 +71,38 @@ def test_points_that_hit_nothing_are_left_out():
 @pytest.mark.parametrize(
     "changes", [{"sweep_s": 0.0}, {"sweep_s": 5.0}, {"beams": 1}, {"beams": 0, "time_increment": 1.0}]
 )
-def test_scans_without_a_usable_time_of_their_beams_stay(changes):
+def test_scans_without_a_usable_time_of_their_beams_stay(changes: dict[str, Any]) -> None:
     found = paired_scan([*drive(), scan(**changes)])
     assert found.scan.T_base_beam is None
 
 
-def test_all_events_come_once_and_scans_keep_their_order():
-    events = sorted([*drive(), *(scan(s / 10, sweep_s=0.15) for s in range(20))], key=lambda e: e.stamp_ns)
+def test_all_events_come_once_and_scans_keep_their_order() -> None:
+    events: list[Any] = [*drive(), *(scan(s / 10, sweep_s=0.15) for s in range(20))]
+    events.sort(key=lambda e: e.stamp_ns)
     found = list(pair(events, deskew=True))
     assert len(found) == len(events)
     stamps = [event.stamp_ns for event in found if isinstance(event, Odometry)]
     assert stamps == sorted(stamps)
-    scans = [event.scan.stamp_ns for event in found if is_scan(event)]
+    scans = [event.scan.stamp_ns for event in found if is_scan(event)]  # type: ignore[arg-type]
     assert scans == sorted(scans)
     assert len(scans) == 20
 
 
-def test_where_odometry_ends_the_robot_is_taken_to_stand():
+def test_where_odometry_ends_the_robot_is_taken_to_stand() -> None:
     odometry = [o for o in drive(rate=100) if o.stamp_ns <= SECOND + SECOND // 20]
     found = paired_scan([*odometry, scan()])
     last = found.scan.T_base_beam[-1]
     assert last == pytest.approx(at(1.0).between(at(1.05)).to_array(), abs=1e-6)
 
 
-def test_without_odometry_nothing_is_moved():
+def test_without_odometry_nothing_is_moved() -> None:
     (found,) = pair([scan()], deskew=True)
     assert found.scan.T_base_beam == pytest.approx(np.zeros((100, 3)))
     with pytest.raises(ConfigError, match="deskewed with odometry"):
         RunRequest(logs=(), no_odometry=True, read=ReadOptions(deskew=True))
 
 
-def test_the_duration_of_a_scan_stands_in_for_the_time_of_its_beams(tmp_path):
+def test_the_duration_of_a_scan_stands_in_for_the_time_of_its_beams(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "log.mcap") as log:
         log.odometry(SECOND, Pose2())
         log.scan(scan(sweep_s=0.0), scan_time=0.2)
@@ -107,9 +112,9 @@ def test_the_duration_of_a_scan_stands_in_for_the_time_of_its_beams(tmp_path):
         assert found.time_increment == pytest.approx(expected)
 
 
-def test_a_turning_lidar_is_localised_three_times_better(tmp_path):
+def test_a_turning_lidar_is_localised_three_times_better(tmp_path: Path) -> None:
     scenario = preset("office")
-    scenario = replace(scenario, seed=8, duration_s=25.0, sensor=replace(scenario.sensor, motion_distortion=True))
+    scenario = replace(scenario, seed=8, duration_s=25.0, sensor=replace(scenario.sensor, motion_distortion=True))  # type: ignore[arg-type]
     record(scenario, tmp_path / "skew.mcap")
     errors = {}
     for deskew in (False, True):

@@ -16,6 +16,7 @@ from hsloc.config import Config
 from hsloc.errors import ConfigError
 from hsloc.localisation.relocaliser import RelocaliserParameters
 from hsloc.matching import Hide
+from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.model import IDENTITY, OccupancyGrid, Scan
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
@@ -59,7 +60,7 @@ def test_a_map_is_extended_with_the_configured_search(tmp_path: Path, monkeypatc
     from hsloc.slam import map_extension
 
     seen: list[tuple[Any, ...]] = []
-    real = map_extension.Relocaliser
+    real = map_extension.Relocaliser  # type: ignore[attr-defined]
 
     def spy(*arguments: Any) -> Any:
         seen.append(arguments)
@@ -86,7 +87,8 @@ def test_the_check_of_the_mounting_uses_the_runs_matcher() -> None:
     cells[[10, 50], 10:51] = 100
     cells[10:51, [10, 50]] = 100
     matcher = Counting()
-    check = ExtrinsicsCheck(OccupancyGrid(cells, 0.1, IDENTITY), None, matcher, 0.2, 100, 2)
+    field = LikelihoodField.from_grid(OccupancyGrid(cells, 0.1, IDENTITY), 0.2)
+    check = ExtrinsicsCheck(field, matcher, 100, 2)
     scan = Scan(0, np.full(90, 2.0, dtype=np.float32), 0.0, 0.07, 0.1, 10.0, frame_id="front")
     check.add(scan, IDENTITY)
     assert matcher.calls == 1

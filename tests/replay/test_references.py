@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from math import pi
-from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
 from hsloc.errors import ConfigError, EvaluationError, TopicError
@@ -15,20 +16,24 @@ from hsloc.log import LogWriter, ReadOptions
 from hsloc.model import Pose2, Trajectory
 from hsloc.replay.references import read_reference
 from hsloc.request import RunRequest
-from hsloc.trajectory_io.tum import read_tum, write_tum
+from hsloc.trajectory_io.reader import read_tum
+from hsloc.trajectory_io.tum import write_tum
 
-HALL = Path(__file__).parents[2] / "recordings" / "hall.mcap"
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HALL = RECORDINGS / "hall.mcap"
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 
 
 @pytest.fixture(scope="module")
-def truth():
+def truth() -> Trajectory:
     return read_reference(f"{HALL}:/ground_truth")
 
 
 @pytest.fixture
-def moving(tmp_path):
+def moving(tmp_path: Path) -> Path:
     """A robot that drives 1 m/s along the odometry frame, which a localiser places; its stamps are a second ahead."""
     path = tmp_path / "moving.mcap"
     with LogWriter(path) as log:
@@ -42,14 +47,14 @@ def moving(tmp_path):
     return path
 
 
-def replay(tmp_path, capsys, *options, code=0):
+def replay(tmp_path: Path, capsys: pytest.CaptureFixture[str], *options: Path | str, code: int = 0) -> Any:
     out = str(tmp_path / "out")
     assert main(["replay", str(HALL), "--end", "6", *map(str, options), "--out", out, "--overwrite", "--json"]) == code
     captured = capsys.readouterr()
     return json.loads(captured.out) if code == 0 else captured.err
 
 
-def test_a_log_tells_its_truth_and_any_topic(truth):
+def test_a_log_tells_its_truth_and_any_topic(truth: Trajectory) -> None:
     assert len(truth) > 1000
     named = read_reference(str(HALL))
     assert np.array_equal(named.poses, truth.poses)
@@ -60,7 +65,7 @@ def test_a_log_tells_its_truth_and_any_topic(truth):
     np.testing.assert_allclose(read_reference(f"{HALL}:/tf:odom.base_link").poses, odometry.poses, atol=1e-9)
 
 
-def test_transforms_between_two_frames(moving):
+def test_transforms_between_two_frames(moving: Path) -> None:
     found = read_reference(f"{moving}:/tf:map.tip")
     assert found.stamps_ns.tolist() == [START + number * SECOND // 10 for number in range(20)]
     # The tip is half a metre ahead; the odometry frame looks along y of the map, and is a metre further on later.
@@ -80,19 +85,23 @@ def test_transforms_between_two_frames(moving):
         ("{log}:/tf:map.base_link", EvaluationError, "no transforms lead from map to base_link; name a topic, as in"),
     ],
 )
-def test_what_cannot_be_found_is_told_with_what_can(name, error, match):
+def test_what_cannot_be_found_is_told_with_what_can(name: str, error: type[Any], match: str) -> None:
     with pytest.raises(error, match=match) as caught:
         read_reference(name.format(log=HALL))
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", ["tum", "csv", "log", "topic"])
-def test_replay_compares_with_any_reference(tmp_path, capsys, truth, kind):
+def test_replay_compares_with_any_reference(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], truth: Trajectory, kind: str
+) -> None:
     write_tum(tmp_path / "truth.tum", truth)
     rows = "".join(f"{stamp / 1e9:.9f},{x!r},{y!r},{theta!r}\n" for stamp, (x, y, theta) in
                    zip(truth.stamps_ns.tolist(), truth.poses.tolist(), strict=True))  # fmt: skip
     (tmp_path / "truth.csv").write_text(f'"t","x","y","theta"\n{rows}')
-    named = {"tum": tmp_path / "truth.tum", "csv": tmp_path / "truth.csv", "log": HALL, "topic": "/ground_truth"}[kind]
+    named: Any = {"tum": tmp_path / "truth.tum", "csv": tmp_path / "truth.csv", "log": HALL, "topic": "/ground_truth"}[
+        kind
+    ]
     expected = replay(tmp_path, capsys)
     found = replay(tmp_path, capsys, "--reference", named)
     assert found["matched"] == expected["matched"]
@@ -101,7 +110,9 @@ def test_replay_compares_with_any_reference(tmp_path, capsys, truth, kind):
     assert "--reference=" in (tmp_path / "out" / "config.yaml").read_text().splitlines()[0]
 
 
-def test_a_sparse_reference_between_the_beats_is_met_by_interpolation(tmp_path, capsys, truth):
+def test_a_sparse_reference_between_the_beats_is_met_by_interpolation(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], truth: Trajectory
+) -> None:
     """At 1 Hz, 11 ms from the estimate's stamps: no pose of it is within 10 ms."""
     stamps = np.arange(truth.stamps_ns[0], truth.stamps_ns[0] + 6 * SECOND, SECOND) + 11_000_000
     write_tum(tmp_path / "sparse.tum", Trajectory(stamps, truth.interpolated(stamps)))
@@ -110,7 +121,9 @@ def test_a_sparse_reference_between_the_beats_is_met_by_interpolation(tmp_path, 
     assert found["ape"]["trans_part"]["rmse"] < 0.02
 
 
-def test_a_reference_of_another_time_is_told(tmp_path, capsys, truth):
+def test_a_reference_of_another_time_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], truth: Trajectory
+) -> None:
     write_tum(tmp_path / "late.tum", Trajectory(truth.stamps_ns + 3600 * SECOND, truth.poses))
     found = replay(tmp_path, capsys, "--reference", tmp_path / "late.tum")
     assert "overlap by 0.000 s" in found["evaluation_error"]
@@ -118,13 +131,13 @@ def test_a_reference_of_another_time_is_told(tmp_path, capsys, truth):
     assert "ape" not in found
 
 
-def test_a_reference_that_is_missing_costs_no_replay(tmp_path, capsys):
+def test_a_reference_that_is_missing_costs_no_replay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "no such file" in replay(tmp_path, capsys, "--reference", "none.tum", code=1)
     with pytest.raises(ConfigError, match="leave out one of them"):
         RunRequest(logs=(HALL,), reference="x.tum", read=ReadOptions(truth_topic="/ground_truth"))
 
 
-def test_eval_takes_logs(tmp_path, capsys, truth):
+def test_eval_takes_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str], truth: Trajectory) -> None:
     write_tum(tmp_path / "truth.tum", truth)
     assert main(["eval", str(HALL), str(tmp_path / "truth.tum"), f"{HALL}:/odom", "--json"]) == 0
     same, odometry = json.loads(capsys.readouterr().out)["estimates"]
@@ -132,7 +145,7 @@ def test_eval_takes_logs(tmp_path, capsys, truth):
     assert odometry["ape"]["trans_part"]["max"] > 0.1
 
 
-def test_a_csv_whose_quaternions_begin_with_w_is_refused(tmp_path):
+def test_a_csv_whose_quaternions_begin_with_w_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "euroc.csv"
     path.write_text("t,x,y,z,qw,qx,qy,qz\n1,0,0,0,1,0,0,0\n")
     with pytest.raises(EvaluationError, match="must be t x y z qx qy qz qw"):

@@ -8,6 +8,7 @@ import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -24,12 +25,15 @@ from hsloc.report.html import Provenance, time_charts, write_report_html
 from hsloc.report.svg import MOST_MARKS, Chart, chart_svg, map_svg, runs, ticks
 from hsloc.warnings import RunWarning
 
+if TYPE_CHECKING:
+    from pathlib import Path
+
 NASTY = "<script>alert('x')</script> & \"quoted\" {{data}} {{nothing}} ]]> <b>"
 VOID = {"meta", "input", "br", "link"}
 
 
 @pytest.fixture(scope="module")
-def run():
+def run() -> dict[str, Any]:
     rng = np.random.default_rng(3)
     truth = drive([(-10, -4), (-10, 0), (0, 0), (0, 4), (0, 0), (8, 0)], rate_hz=20.0)
     estimate = estimate_of(rng, truth)
@@ -50,41 +54,43 @@ def run():
 class Page(HTMLParser):
     """Elements, their text and attributes; fails where tags do not close each other."""
 
-    def __init__(self, text):
+    def __init__(self, text: str) -> None:
         super().__init__()
-        self.open, self.elements, self.text = [], [], []
+        self.open: list[str] = []
+        self.elements: list[tuple[str, dict[str, Any]]] = []
+        self.text: list[tuple[str, str]] = []
         self.feed(text)
         self.close()
         assert self.open == []
 
-    def handle_starttag(self, tag, attrs):
+    def handle_starttag(self, tag: str, attrs: list[Any]) -> None:
         self.elements.append((tag, dict(attrs)))
         if tag not in VOID:
             self.open.append(tag)
 
-    def handle_startendtag(self, tag, attrs):
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.elements.append((tag, dict(attrs)))
 
-    def handle_endtag(self, tag):
+    def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
 
-    def handle_data(self, data):
+    def handle_data(self, data: str) -> None:
         self.text.append((self.open[-1] if self.open else "", data))
 
-    def all(self, tag):
+    def all(self, tag: str) -> list[Any]:
         return [attributes for name, attributes in self.elements if name == tag]
 
-    def within(self, tag):
+    def within(self, tag: str) -> str:
         return "".join(data for name, data in self.text if name == tag)
 
 
-def write(tmp_path, **arguments):
+def write(tmp_path: Path, **arguments: Any) -> tuple[str, Page]:
     write_report_html(tmp_path / "report.html", **{"title": "office.mcap", **arguments})
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     return text, Page(text)
 
 
-def test_it_is_whole_the_same_and_loads_nothing(run, tmp_path):
+def test_it_is_whole_the_same_and_loads_nothing(run: dict[str, Any], tmp_path: Path) -> None:
     text, page = write(tmp_path, **run)
     assert write(tmp_path, **run)[0] == text
     own = re.sub(r"base64,[^\"]+", "", text)
@@ -101,7 +107,7 @@ def test_it_is_whole_the_same_and_loads_nothing(run, tmp_path):
     assert f"{run['metrics'].errors.ape.trans_part.rmse:.4f}" in page.within("td")
 
 
-def nasty_metrics(run):
+def nasty_metrics(run: Any) -> Any:
     metrics = run["metrics"]
     warning, reason = RunWarning(NASTY, NASTY, NASTY), VerdictReason(Verdict.CHECK, NASTY, NASTY + "!", NASTY)
     return replace(
@@ -117,7 +123,7 @@ def nasty_metrics(run):
     )
 
 
-def test_text_is_text(run, tmp_path):
+def test_text_is_text(run: dict[str, Any], tmp_path: Path) -> None:
     diagnostics = diagnostics_of(np.random.default_rng(1), run["reference"], rejected=0.5)
     reasons = tuple(NASTY if reason else "" for reason in diagnostics.reason)
     object.__setattr__(diagnostics, "reason", reasons)
@@ -135,7 +141,7 @@ def test_text_is_text(run, tmp_path):
     assert page.all("b") == []
 
 
-def test_the_script_finds_its_data(run, tmp_path):
+def test_the_script_finds_its_data(run: dict[str, Any], tmp_path: Path) -> None:
     text, page = write(tmp_path, **run)
     (source,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, flags=re.S)
     data = json.loads(source)
@@ -152,7 +158,7 @@ def test_the_script_finds_its_data(run, tmp_path):
 @pytest.mark.parametrize(
     "kept", [(), ("grid",), ("diagnostics",), ("reference",), ("odometry", "metrics"), ("reference", "comparison")]
 )
-def test_any_part_may_be_missing(run, tmp_path, kept):
+def test_any_part_may_be_missing(run: Any, tmp_path: Path, kept: Any) -> None:
     write(tmp_path, trajectory=run["trajectory"], **{name: run[name] for name in kept})
     nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
     write(tmp_path, trajectory=nothing, **{name: run[name] for name in kept})
@@ -160,14 +166,14 @@ def test_any_part_may_be_missing(run, tmp_path, kept):
     write(tmp_path, trajectory=still, **{name: run[name] for name in kept})
 
 
-def test_a_map_of_points(run, tmp_path):
+def test_a_map_of_points(run: dict[str, Any], tmp_path: Path) -> None:
     _, page = write(tmp_path, trajectory=run["trajectory"], points=np.array([[1.0, 2.0], [3.0, 4.0]]))
     (dots,) = [attributes["d"] for attributes in page.all("path") if attributes.get("class") == "points"]
     assert dots.count("h0") == 2
     assert "points" in {attributes["data-toggle"] for attributes in page.all("input")}
 
 
-def test_why_scans_were_not_used(run, tmp_path):
+def test_why_scans_were_not_used(run: dict[str, Any], tmp_path: Path) -> None:
     _, page = write(tmp_path, **run)
     count = sum(status == "rejected" for status in run["diagnostics"].status)
     assert "fitness 0.41 below 0.55" in page.within("td")
@@ -179,7 +185,7 @@ def test_why_scans_were_not_used(run, tmp_path):
     assert "Every scan was used." in page.within("p")
 
 
-def test_the_embedded_map_is_the_map():
+def test_the_embedded_map_is_the_map() -> None:
     cells = np.full((6, 8), -1, dtype=np.int8)
     cells[1:5, 2:7] = 0
     cells[1, 3] = 100
@@ -200,7 +206,7 @@ def test_the_embedded_map_is_the_map():
     assert "translate(-1.25 1)" in svg
 
 
-def test_a_path_is_drawn_true_and_thin():
+def test_a_path_is_drawn_true_and_thin() -> None:
     rng = np.random.default_rng(0)
     n = 200_000
     poses = np.column_stack((np.cumsum(rng.normal(0, 0.01, (n, 2)), axis=0) + 5e5, np.zeros(n)))
@@ -219,7 +225,7 @@ def test_a_path_is_drawn_true_and_thin():
     assert cKDTree(back).query(poses[::50, :2])[0].max() < 0.1
 
 
-def test_many_marks_are_thinned(run):
+def test_many_marks_are_thinned(run: dict[str, Any]) -> None:
     n = 3 * MOST_MARKS
     rng = np.random.default_rng(0)
     path = Trajectory(np.arange(n, dtype=np.int64) * 10**8, np.cumsum(rng.normal(0, 1, (n, 3)), axis=0))
@@ -228,12 +234,12 @@ def test_many_marks_are_thinned(run):
     assert svg.count("rejected at") <= MOST_MARKS
 
 
-def test_where_it_cannot_be_written(run, tmp_path):
+def test_where_it_cannot_be_written(run: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot be written"):
         write_report_html(tmp_path / "no" / "report.html", title="a", trajectory=run["trajectory"])
 
 
-def test_charts_by_hand():
+def test_charts_by_hand() -> None:
     assert ticks(0.0, 2.3, 4) == pytest.approx([0, 1, 2])
     assert ticks(0.0, 139.0, 8) == pytest.approx([0, 20, 40, 60, 80, 100, 120])
     assert ticks(3.0, 3.0, 4) == [3.0]
@@ -241,7 +247,7 @@ def test_charts_by_hand():
     assert runs(np.array([]), 1.0) == []
 
 
-def test_a_chart_breaks_where_the_pose_was_lost(run):
+def test_a_chart_breaks_where_the_pose_was_lost(run: Any) -> None:
     data = prepare(run["trajectory"], None, None, run["diagnostics"])
     (fitness,) = [chart for chart in time_charts(data) if chart.name == "fitness"]
     svg = chart_svg(fitness, 30.0)
@@ -250,7 +256,7 @@ def test_a_chart_breaks_where_the_pose_was_lost(run):
     assert svg.count('class="lost"') == 1
 
 
-def test_a_wide_range_is_drawn_on_powers_of_ten(run):
+def test_a_wide_range_is_drawn_on_powers_of_ten(run: Any) -> None:
     data = prepare(run["trajectory"], None, run["reference"], None, run["comparison"])
     (chart,) = [chart for chart in time_charts(data) if chart.name == "error_cm"]
     chart.curve.values[10] = 5000.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
@@ -24,11 +25,14 @@ from hsloc.report.png_panels import format_round_length, round_length, time_pane
 from hsloc.report.table import format_angle, format_duration, format_length, table_rows
 from hsloc.run_metrics import MapMetrics, ResidualMetrics
 
+if TYPE_CHECKING:
+    from pathlib import Path
+
 NOTHING = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
 
 
 @pytest.fixture(scope="module")
-def run():
+def run() -> Any:
     rng = np.random.default_rng(3)
     truth = drive([(-10, -4), (-10, 0), (0, 0), (0, 4), (0, 0), (8, 0)], rate_hz=20.0)
     estimate = estimate_of(rng, truth)
@@ -46,13 +50,13 @@ def run():
     }
 
 
-def pixels(path):
+def pixels(path: Any) -> Any:
     with Image.open(path) as image:
         assert image.format == "PNG"
         return np.asarray(image.convert("RGB")), dict(image.info)
 
 
-def test_the_same_run_gives_the_same_bytes(run, tmp_path):
+def test_the_same_run_gives_the_same_bytes(run: Any, tmp_path: Path) -> None:
     draw_report(tmp_path / "a.png", title="office.mcap", **run)
     with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "red", "lines.linewidth": 9}):
         draw_report(tmp_path / "b.png", title="office.mcap", **run)
@@ -74,21 +78,21 @@ def test_the_same_run_gives_the_same_bytes(run, tmp_path):
         ("odometry", "reference", "grid", "diagnostics", "metrics", "comparison"),
     ],
 )
-def test_any_part_may_be_missing(run, tmp_path, without):
+def test_any_part_may_be_missing(run: Any, tmp_path: Path, without: Any) -> None:
     draw_report(tmp_path / "a.png", title="a", **{key: value for key, value in run.items() if key not in without})
     assert pixels(tmp_path / "a.png")[0].std() > 1.0
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-6, 1e-3, 1e3, 1e6])
 @pytest.mark.parametrize("stretch", [(1.0, 1.0), (1.0, 0.0), (0.0, 1.0)])
-def test_paths_of_any_size_and_shape(run, tmp_path, scale, stretch):
+def test_paths_of_any_size_and_shape(run: Any, tmp_path: Path, scale: Any, stretch: Any) -> None:
     path = run["reference"]
     odd = Trajectory(path.stamps_ns[::20], path.poses[::20] * (scale * stretch[0], scale * stretch[1], 1.0))
     draw_report(tmp_path / "a.png", title="odd", trajectory=odd, reference=odd, odometry=odd)
     assert pixels(tmp_path / "a.png")[0].shape == (1000, 1600, 3)
 
 
-def test_a_jump_of_metres_and_a_map_of_points(run, tmp_path):
+def test_a_jump_of_metres_and_a_map_of_points(run: Any, tmp_path: Path) -> None:
     jumped = Trajectory(run["trajectory"].stamps_ns, run["trajectory"].poses.copy())
     jumped.poses[200:260, :2] += 40.0
     points = np.random.default_rng(0).uniform(-10, 10, (300, 2))
@@ -98,7 +102,7 @@ def test_a_jump_of_metres_and_a_map_of_points(run, tmp_path):
     assert (with_points != without).any(axis=2).sum() > 1000
 
 
-def test_no_pose_one_pose_and_a_reference_of_another_time(run, tmp_path):
+def test_no_pose_one_pose_and_a_reference_of_another_time(run: Any, tmp_path: Path) -> None:
     one = Trajectory(run["trajectory"].stamps_ns[:1], run["trajectory"].poses[:1])
     draw_report(tmp_path / "a.png", title="", trajectory=NOTHING)
     draw_report(
@@ -110,12 +114,12 @@ def test_no_pose_one_pose_and_a_reference_of_another_time(run, tmp_path):
     draw_report(tmp_path / "a.png", title="other", trajectory=run["trajectory"], reference=other)
 
 
-def test_titles_that_would_upset_a_renderer(run, tmp_path):
+def test_titles_that_would_upset_a_renderer(run: Any, tmp_path: Path) -> None:
     for title in ("$x$ $\\frac{1}{ _broken", "<b>&amp;", "a" * 400, "näme_文件.mcap"):
         draw_report(tmp_path / "a.png", title=title, trajectory=run["trajectory"])
 
 
-def test_an_unknown_map_and_a_turned_one(run, tmp_path):
+def test_an_unknown_map_and_a_turned_one(run: Any, tmp_path: Path) -> None:
     grid = run["grid"]
     unknown = OccupancyGrid(np.full((10, 10), -1, dtype=np.int8), 0.05)
     draw_report(tmp_path / "a.png", title="unknown", trajectory=run["trajectory"], grid=unknown)
@@ -126,7 +130,7 @@ def test_an_unknown_map_and_a_turned_one(run, tmp_path):
     assert extent.y1 > known[:, 1].max()
 
 
-def test_only_the_surroundings_of_a_short_path_are_shown(run):
+def test_only_the_surroundings_of_a_short_path_are_shown(run: Any) -> None:
     grid = office(np.random.default_rng(0), width_m=300.0, height_m=60.0, resolution=0.2, noise=False)
     short = Trajectory(run["trajectory"].stamps_ns[:2], np.array([[100.0, 0.0, 0.0], [104.0, 0.0, 0.0]]))
     extent = shown_extent(prepare(short, None, None, None), grid, None)
@@ -140,13 +144,13 @@ def test_only_the_surroundings_of_a_short_path_are_shown(run):
     assert line_width(prepare(many_laps, None, None, None), extent) == pytest.approx(1.6)
 
 
-def test_where_it_cannot_be_written(run, tmp_path):
+def test_where_it_cannot_be_written(run: Any, tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot be written"):
         draw_report(tmp_path / "no" / "a.png", title="a", trajectory=run["trajectory"])
     assert list(tmp_path.iterdir()) == []
 
 
-def test_poses_are_known_where_the_result_says_so_else_where_no_scan_was_lost(run):
+def test_poses_are_known_where_the_result_says_so_else_where_no_scan_was_lost(run: Any) -> None:
     known = np.arange(len(run["trajectory"])) > 7
     assert prepare(run["trajectory"], None, None, run["diagnostics"], localised=known).localised is known
     lost = diagnostics_of(np.random.default_rng(1), run["reference"], lost=((0.0, 5.0),))
@@ -154,45 +158,45 @@ def test_poses_are_known_where_the_result_says_so_else_where_no_scan_was_lost(ru
     assert data.seconds[int(np.argmax(data.localised))] == pytest.approx(5.0, abs=0.3)
 
 
-def test_an_aligned_reference_is_drawn_over_the_trajectory(run):
+def test_an_aligned_reference_is_drawn_over_the_trajectory(run: Any) -> None:
     away = Trajectory(
         run["reference"].stamps_ns, compose_poses(Pose2(30.0, 5.0, 1.0).to_array(), run["reference"].poses)
     )
     data = prepare(run["trajectory"], None, away, None, compare(run["trajectory"], away, alignment="se2"))
-    assert np.abs(data.reference - data.path).max() < 0.1
+    assert np.abs(data.reference - data.path).max() < 0.1  # type: ignore[operator]
     assert data.errors.translation_m.values.max() < 0.1
     unaligned = compare(run["trajectory"], away)
     assert prepare(run["trajectory"], None, away, None, unaligned).errors.translation_m.values.max() > 10.0
 
 
-def test_lost_spans_and_counts(run):
+def test_lost_spans_and_counts(run: Any) -> None:
     scans = prepare(run["trajectory"], None, None, run["diagnostics"]).scans
     ((begin, until),) = scans.lost
     assert (begin, until) == pytest.approx((10.0, 15.0), abs=0.3)
-    counts = status_counts(scans)
+    counts = status_counts(scans)  # type: ignore[arg-type]
     assert sum(counts.values()) == len(run["diagnostics"])
     assert counts["searching"] == scans.where("searching").sum() > 0
-    assert ("rejected", "fitness 0.41 below 0.55", counts["rejected"]) in reason_counts(scans)
+    assert ("rejected", "fitness 0.41 below 0.55", counts["rejected"]) in reason_counts(scans)  # type: ignore[arg-type]
 
 
-def test_reasons_that_differ_in_figures_are_one(run):
+def test_reasons_that_differ_in_figures_are_one(run: Any) -> None:
     diagnostics = diagnostics_of(np.random.default_rng(0), run["reference"], rejected=0.2)
     reasons = [f"fitness {0.3 + i / 1e4:.4f} below 0.55" if r else "" for i, r in enumerate(diagnostics.reason)]
     object.__setattr__(diagnostics, "reason", tuple(reasons))
     scans = prepare(run["trajectory"], None, None, diagnostics).scans
-    counted = {status: (reason, count) for status, reason, count in reason_counts(scans)}
+    counted = {status: (reason, count) for status, reason, count in reason_counts(scans)}  # type: ignore[arg-type]
     first = next(reason for reason, status in zip(reasons, diagnostics.status, strict=True) if status == "rejected")
     assert counted["rejected"] == (f"fitness … below … (first: {first})", diagnostics.status.count("rejected"))
 
 
-def test_the_curves_are_the_errors(run):
+def test_the_curves_are_the_errors(run: Any) -> None:
     data = prepare(run["trajectory"], None, run["reference"], None, run["comparison"])
     rmse = float(np.sqrt(np.mean(data.errors.translation_m.values**2)))
     assert rmse == pytest.approx(run["metrics"].errors.ape.trans_part.rmse)
     assert [panel.title for panel in time_panels(data)] == ["translation error [cm]", "rotation error [deg]"]
 
 
-def test_thinning_keeps_every_peak():
+def test_thinning_keeps_every_peak() -> None:
     values = np.zeros(100_000)
     values[[5, 77_777]] = 3.0, -2.0
     thin = Curve(np.arange(100_000.0), values).thinned(1000)
@@ -203,7 +207,7 @@ def test_thinning_keeps_every_peak():
     assert np.isnan(gaps.values).all()
 
 
-def test_walls_survive_a_smaller_picture():
+def test_walls_survive_a_smaller_picture() -> None:
     cells = np.full((7, 9), -1, dtype=np.int8)
     cells[:, 2:] = 0
     cells[3, 6] = 100
@@ -218,18 +222,18 @@ def test_walls_survive_a_smaller_picture():
     [(0.0, "0 m"), (0.00041, "0.41 mm"), (0.0123, "1.23 cm"), (0.5, "50.0 cm"), (0.9999, "1.00 m"), (123.4, "123 m"),
      (12345.0, "12.35 km"), (None, "–"), (np.nan, "–")],
 )  # fmt: skip
-def test_lengths(length, expected):
+def test_lengths(length: Any, expected: Any) -> None:
     assert format_length(length) == expected.replace("12.35 km", "12.3 km")
 
 
-def test_other_formats():
+def test_other_formats() -> None:
     assert [format_duration(seconds) for seconds in (3.21, 245.0, 7380.0)] == ["3.2 s", "4 min 05 s", "2 h 03 min"]
     assert [format_angle(angle) for angle in (0.123, 45.67, 123.4, None)] == ["0.12°", "45.7°", "123°", "–"]
     assert [round_length(metres) for metres in (4.4, 5.0, 0.19, 1.0, 999.0)] == pytest.approx([2, 5, 0.1, 1, 500])
     assert [format_round_length(x) for x in (0.005, 0.2, 5.0, 2000.0)] == ["5 mm", "20 cm", "5 m", "2 km"]
 
 
-def test_the_table_shows_what_metrics_hold(run):
+def test_the_table_shows_what_metrics_hold(run: Any) -> None:
     errors = PoseStatistics(Statistics.of(np.array([0.03, 0.05])), Statistics.of(np.array([1.0, 1.6])))
     map_metrics = MapMetrics(
         residuals=ResidualMetrics(points=10, median=0.01, p95=0.06, within_15_cm=0.985),
@@ -248,7 +252,7 @@ def test_the_table_shows_what_metrics_hold(run):
     assert "APE rmse" not in {row.label for row in table_rows(alone)}
 
 
-def test_pyplot_stays_out():
+def test_pyplot_stays_out() -> None:
     import subprocess
     import sys
 

@@ -1,16 +1,19 @@
 from __future__ import annotations
 
-import os
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from paths import DATA
 
 from hsloc.errors import ConfigError
 from hsloc.reproduction import own_material, report_material
 from hsloc.reproduction.scan_match import run_scan_match
 
-REPORT = Path(os.environ.get("HSLOC_DATA", "../shared/data")) / "paper"
+if TYPE_CHECKING:
+    from pathlib import Path
+
+REPORT = DATA / "paper"
 
 
 def test_report_material_reads_its_three_files(tmp_path: Path) -> None:

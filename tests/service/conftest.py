@@ -1,4 +1,4 @@
-"""A service on a temporary folder, with a fake worker, in this process or in one of its own."""
+"""Services on a temporary folder, in this process or in one of their own."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from fastapi.testclient import TestClient
+from live_service import Live, settings
 
 from hsloc_service.http.app import create_app
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
-
-from live_service import Live, settings
 
 
 @pytest.fixture

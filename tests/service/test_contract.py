@@ -117,24 +117,36 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     assert live.end() == 0
 
 
-@schema.parametrize()
-@hypothesis.settings(
-    max_examples=12,
-    deadline=None,
-    derandomize=True,
-    database=None,
-    phases=[Phase.explicit, Phase.generate],  # to shrink takes minutes, and a request is readable as it is
-    suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow, HealthCheck.data_too_large],
-)
-def test_answers_are_as_described(case: Any, world: World) -> None:
-    world.settle(case)
-    headers = {"Authorization": f"Bearer {TOKEN}"}
-    # What is wrong about a part of a multipart body (null, a number) is gone once it is bytes, and the bytes are right.
-    excluded = [negative_data_rejection] if case.path == "/v1/run" else []
-    answer = case.call_and_validate(
-        base_url=world.live.url, session=world.session, headers=headers, excluded_checks=excluded
+def answers_are_as_described(operation: Any) -> Any:
+    """A test of one operation."""
+
+    @schema.include(method=operation.method.upper(), path=operation.path).parametrize()
+    @hypothesis.settings(
+        max_examples=12,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        phases=[Phase.explicit, Phase.generate],  # to shrink takes minutes, and a request is readable as it is
+        suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow, HealthCheck.data_too_large],
     )
-    world.statuses.add(answer.status_code)
+    def test(case: Any, world: World) -> None:
+        world.settle(case)
+        headers = {"Authorization": f"Bearer {TOKEN}"}
+        # What is wrong about a part of a multipart body (null, a number) is gone once it is bytes, and those are right.
+        excluded = [negative_data_rejection] if case.path == "/v1/run" else []
+        answer = case.call_and_validate(
+            base_url=world.live.url, session=world.session, headers=headers, excluded_checks=excluded
+        )
+        world.statuses.add(answer.status_code)
+
+    return test
+
+
+# A name for each operation: `schema.parametrize()` gives all the same id, and pytest-xdist runs one test for each id.
+for found in schema.get_all_operations():
+    described_operation = found.ok()  # type: ignore[union-attr]
+    name = re.sub(r"\W+", "_", f"{described_operation.method}{described_operation.path}".lower()).strip("_")
+    globals()[f"test_answers_are_as_described_{name}"] = answers_are_as_described(described_operation)
 
 
 def test_the_requests_got_beyond_the_door(world: World) -> None:

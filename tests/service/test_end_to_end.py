@@ -8,11 +8,11 @@ import struct
 import subprocess
 import sys
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 from live_service import upload, wait
+from paths import RECORDINGS
 
 from hsloc.errors import MapError
 from hsloc_service.execution.worker import linked_map
@@ -20,10 +20,10 @@ from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from fastapi.testclient import TestClient
 
-RECORDINGS = Path(__file__).parents[2] / "recordings"
 REAL = Settings().worker_command
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-class Faulty(MemoryFileSystem):
+class Faulty(MemoryFileSystem):  # type: ignore[misc]
     """Memory, with a fault that a test sets."""
 
     protocol = "faulty"

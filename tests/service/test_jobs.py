@@ -113,6 +113,10 @@ def test_pages_of_the_list(client: TestClient) -> None:
         ({"config": {"hide": {"memory": 3}}}, "config.hide.memory"),
         ({"config": {"hide": {"memory_size": "3"}}}, "config.hide.memory_size"),
         ({"config": {"matcher": "magic"}}, "config.matcher"),
+        ({"config": {"graph_mapper": {"passes": 0}}}, "config.graph_mapper.passes must be from 1 to 1e+09"),
+        ({"config": {"localiser": {"window_min": -1}}}, "config.localiser.window_min must be from 1e-09 to"),
+        ({"config": {"graph_mapper": {"occupancy": {"hit_probability": 0.5}}}}, "both excluded"),
+        ({"config": {"graph_mapper": {"joint_registration": {"gates": []}}}}, "gates must be a list of 1 to"),
     ],
 )
 def test_a_request_that_does_not_fit_is_refused_with_its_place(

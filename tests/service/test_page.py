@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from live_service import upload
+from paths import RECORDINGS
 
 from hsloc_service.settings import Settings
 
@@ -28,7 +29,6 @@ pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="THE PAGE IS NOT TESTED: no chromium (apt-get install chromium)"
 )
 
-RECORDINGS = Path(__file__).parents[2] / "recordings"
 REAL = ",".join(Settings().worker_command)
 NASTY = "<img src=x onerror=alert(1)>.mcap"
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
@@ -50,7 +50,7 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
     def make(url: str, **options: Any) -> Any:
         contexts.append(browser.new_context(accept_downloads=True, **options))
         page = contexts[-1].new_page()
-        page.on("dialog", lambda dialog: (complaints.append(f"dialog: {dialog.message}"), dialog.dismiss()))
+        page.on("dialog", lambda dialog: (complaints.append(f"dialog: {dialog.message}"), dialog.dismiss()))  # type: ignore[func-returns-value]
         page.on("pageerror", lambda error: complaints.append(f"error: {error}"))
         page.on(
             "console",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,17 +23,17 @@ RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 
 
 @pytest.fixture(scope="module")
-def hall():
+def hall() -> Any:
     return run(RunRequest(logs=(RECORDINGS / "hall.mcap",), read=ReadOptions(end_s=8.0)))
 
 
-def viewer(result, folder):
+def viewer(result: Any, folder: Any) -> Any:
     analysis = analyse(result)
     write_viewer(result, analysis, folder)
     return json.loads((folder / "viewer.json").read_text()), analysis.metrics
 
 
-def test_no_error_is_made_up_where_the_reference_has_a_gap(hall, tmp_path):
+def test_no_error_is_made_up_where_the_reference_has_a_gap(hall: Any, tmp_path: Path) -> None:
     """A robot that turns about while its reference is lost for 3 s was shown an error of metres in between."""
     seconds = (hall.reference.stamps_ns - hall.reference.stamps_ns[0]) / 1e9
     seen = (seconds < 2.0) | (seconds > 5.0)
@@ -45,7 +46,7 @@ def test_no_error_is_made_up_where_the_reference_has_a_gap(hall, tmp_path):
     assert max(shown["errors"]["heading"]) == pytest.approx(metrics.errors.ape.angle_deg.max, abs=1e-4)
 
 
-def test_no_peak_is_left_out_of_a_long_run(hall, tmp_path):
+def test_no_peak_is_left_out_of_a_long_run(hall: Any, tmp_path: Path) -> None:
     reference = Trajectory(np.arange(40_000, dtype=np.int64) * 20_000_000, np.zeros((40_000, 3)))
     poses = np.zeros((40_000, 3))
     poses[12_345, 0], poses[34_567, 2] = 7.0, 1.0
@@ -57,7 +58,7 @@ def test_no_peak_is_left_out_of_a_long_run(hall, tmp_path):
     assert max(shown["heading"]) == pytest.approx(np.degrees(1.0), abs=1e-3)
 
 
-def test_odometry_and_reference_are_those_of_the_report(hall, tmp_path):
+def test_odometry_and_reference_are_those_of_the_report(hall: Any, tmp_path: Path) -> None:
     """The odometry begins at the first localised pose, which need not be the first."""
     localised = hall.localised.copy()
     localised[:40] = False
@@ -71,7 +72,7 @@ def test_odometry_and_reference_are_those_of_the_report(hall, tmp_path):
     assert (shown["odometry"]["x"][at], shown["odometry"]["y"][at]) == pytest.approx(tuple(start[:2]), abs=1e-3)
 
 
-def test_a_job_whose_poses_are_all_guesses_says_so(tmp_path):
+def test_a_job_whose_poses_are_all_guesses_says_so(tmp_path: Path) -> None:
     """The warnings of the analysis are in the job's summary, not those of the replay alone."""
     (tmp_path / "input").mkdir()
     (tmp_path / "input" / "office.mcap").symlink_to(RECORDINGS / "office.mcap")

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from live_service import submit, upload, wait
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from paths import RECORDINGS
 
 from hsloc_service.auth import Tokens
 from hsloc_service.db.tables import AssetRow
@@ -25,10 +26,11 @@ from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from fastapi.testclient import TestClient
 
-OFFICE = Path(__file__).parents[2] / "recordings" / "office.mcap"
+OFFICE = RECORDINGS / "office.mcap"
 REAL = Settings().worker_command
 
 
@@ -54,7 +56,7 @@ def cut(path: Path, at_s: float, end_s: float, folder: Path) -> list[Path]:
                         channel.topic, channel.message_encoding, ident, channel.metadata
                     )
                 writer.add_message(known[channel.id], message.log_time, message.data, message.publish_time)
-            writer.finish()
+            writer.finish()  # type: ignore[no-untyped-call]
     return paths
 
 

@@ -10,7 +10,7 @@ from hsloc.simulation.rasterise import crossed_cells, outline, rasterise
 SQUARE = np.array([(0.5, 0.5, 5.5, 0.5), (5.5, 0.5, 5.5, 4.5), (5.5, 4.5, 0.5, 4.5), (0.5, 4.5, 0.5, 0.5)])
 
 
-def cells_of(*segment):
+def cells_of(*segment: float) -> set[tuple[int, int]]:
     return {tuple(cell) for cell in crossed_cells(np.array(segment, dtype=float)).tolist()}
 
 
@@ -25,20 +25,22 @@ def cells_of(*segment):
         ((-0.5, -0.5, 0.5, -0.5), {(-1, -1), (0, -1)}),
     ],
 )
-def test_cells_a_segment_passes_through(segment, cells):
+def test_cells_a_segment_passes_through(
+    segment: tuple[float, float, float, float], cells: set[tuple[int, int]]
+) -> None:
     assert cells_of(*segment) == cells
 
 
-def test_a_wall_on_a_border_occupies_both_sides():
+def test_a_wall_on_a_border_occupies_both_sides() -> None:
     assert cells_of(1.0, 0.2, 1.0, 1.8) == {(0, 0), (1, 0), (0, 1), (1, 1)}
 
 
-def test_a_diagonal_through_corners_touches_its_neighbours_only_in_a_point():
+def test_a_diagonal_through_corners_touches_its_neighbours_only_in_a_point() -> None:
     assert cells_of(0.5, 0.5, 1.5, 1.5) == {(0, 0), (1, 1)}
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_cells_equal_those_of_fine_sampling(seed):
+def test_cells_equal_those_of_fine_sampling(seed: int) -> None:
     start, end = np.random.default_rng(seed).uniform(-6, 6, (2, 2))
     fractions = np.linspace(0, 1, 200_001)[:, None]
     sampled = {
@@ -49,7 +51,7 @@ def test_cells_equal_those_of_fine_sampling(seed):
     assert len(found - sampled) <= 1  # a corner cut by less than the sampling sees
 
 
-def test_map_of_a_room():
+def test_map_of_a_room() -> None:
     grid = rasterise(SQUARE, np.array([(3.0, 2.0)]), 1.0, margin=1.0)
     expected = np.array(
         [
@@ -66,7 +68,7 @@ def test_map_of_a_room():
     assert (grid.origin.x, grid.origin.y) == (-1.0, -1.0)
 
 
-def test_walls_through_cell_centres_leave_no_bias():
+def test_walls_through_cell_centres_leave_no_bias() -> None:
     """A wall at the centre of a cell is drawn by that cell alone: its centre is the wall."""
     wall = np.array([(0.025, 0.0, 0.025, 2.0), (0.025, 0.0, 2.0, 0.0)])
     grid = rasterise(wall, np.array([(1.0, 1.0)]), 0.05)
@@ -75,13 +77,13 @@ def test_walls_through_cell_centres_leave_no_bias():
     np.testing.assert_allclose(upper[:, 0], 0.025, atol=1e-9)
 
 
-def test_walls_on_borders_leave_no_bias():
+def test_walls_on_borders_leave_no_bias() -> None:
     grid = rasterise(np.array([(1.0, 0.0, 1.0, 2.0)]), np.array([(0.5, 1.0)]), 0.05)
     centres = grid.centres(grid.occupied())
     assert centres[:, 0].mean() == pytest.approx(1.0, abs=1e-9)
 
 
-def test_outline_joins_straight_runs_and_is_closed():
+def test_outline_joins_straight_runs_and_is_closed() -> None:
     solid = np.ones((5, 6), dtype=bool)
     solid[1:4, 1:5] = False
     solid[2, 2] = True

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from math import pi
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -13,18 +14,21 @@ from hsloc.errors import HslocError
 from hsloc.log import open_log
 from hsloc.simulation.scenario import Scenario
 
+if TYPE_CHECKING:
+    from pathlib import Path
 
-def run(*words):
+
+def run(*words: Path | float | str) -> int:
     parser = argparse.ArgumentParser(prog="hsloc record")
     command.add_arguments(parser)
     return command.run(parser.parse_args([str(word) for word in words]))
 
 
-def scenario_of(path):
+def scenario_of(path: Path) -> Scenario:
     return Scenario.from_dict(json.loads(open_log(path).metadata()["hsloc.scenario"]["scenario"]))
 
 
-def test_records_and_says_what(tmp_path, capsys):
+def test_records_and_says_what(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run.mcap"
     assert run(out, "--world", "office", "--seed", 7, "--duration", 2) == 0
     said = capsys.readouterr()
@@ -34,7 +38,7 @@ def test_records_and_says_what(tmp_path, capsys):
     assert scenario_of(out).seed == 7
 
 
-def test_summary_as_json(tmp_path, capsys):
+def test_summary_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(tmp_path / "x.mcap", "--world", "corridor_loop", "--duration", 1, "--json") == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["world"] == "corridor-loop"
@@ -43,12 +47,12 @@ def test_summary_as_json(tmp_path, capsys):
     assert Scenario.from_dict(summary["scenario"]) == scenario_of(tmp_path / "x.mcap")
 
 
-def test_quiet_says_nothing(tmp_path, capsys):
+def test_quiet_says_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(tmp_path / "x.mcap", "--world", "hall", "--duration", 0.5, "-q") == 0
     assert capsys.readouterr() == ("", "")
 
 
-def test_every_option_reaches_the_scenario(tmp_path):
+def test_every_option_reaches_the_scenario(tmp_path: Path) -> None:
     out = tmp_path / "x.mcap"
     words = "--world office --duration 1 --speed 0.5 --people 2 --map-resolution 0.1 --beams 90 --fov 180 --range-max 9"
     words += " --range-noise 0.02 --dropout 0.1 --mounting=-0.1,0.2,1.5 --upside-down --motion-distortion --scan-rate 5"
@@ -68,7 +72,7 @@ def test_every_option_reaches_the_scenario(tmp_path):
     assert [(k.at_s, k.skip_s) for k in scenario.kidnaps] == [(4, 20), (5, 6)]
 
 
-def test_a_world_of_points_is_driven_and_seen_as_in_the_report(tmp_path):
+def test_a_world_of_points_is_driven_and_seen_as_in_the_report(tmp_path: Path) -> None:
     (tmp_path / "site.csv").write_text("x_m,y_m\n10,2\n3,14\n-5,6\n")
     (tmp_path / "way.csv").write_text("x_m,y_m\n0,0\n30,0\n")
     words = ("--world", tmp_path / "site.csv", "--waypoints", tmp_path / "way.csv")
@@ -78,7 +82,7 @@ def test_a_world_of_points_is_driven_and_seen_as_in_the_report(tmp_path):
     assert (scenario.sensor.beams, scenario.robot.speed, scenario.scan_rate_hz) == (14_400, 3.0, 5.0)
 
 
-def test_list_names_worlds_and_scenarios(capsys):
+def test_list_names_worlds_and_scenarios(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--list") == 0
     listed = capsys.readouterr().out
     assert "corridor-loop" in listed
@@ -101,7 +105,7 @@ def test_list_names_worlds_and_scenarios(capsys):
         (["--world", "office", "--waypoints", "nowhere.csv"], "nowhere.csv: cannot be read"),
     ],
 )
-def test_mistakes_are_one_line_and_leave_nothing(tmp_path, words, message):
+def test_mistakes_are_one_line_and_leave_nothing(tmp_path: Path, words: list[str], message: str) -> None:
     with pytest.raises(HslocError) as caught:
         run(tmp_path / "x.mcap", *words)
     assert message in str(caught.value)
@@ -119,7 +123,9 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, words, message):
         ["--seed", "x"],
     ],
 )
-def test_words_that_are_no_numbers_are_wrong_use(tmp_path, words, capsys):
+def test_words_that_are_no_numbers_are_wrong_use(
+    tmp_path: Path, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as caught:
         run(tmp_path / "x.mcap", "--world", "office", *words)
     assert caught.value.code == 2
@@ -127,12 +133,12 @@ def test_words_that_are_no_numbers_are_wrong_use(tmp_path, words, capsys):
 
 
 @pytest.mark.parametrize("words", [[], ["x.mcap"], ["x.mcap", "--world", "office", "--scenario", "slip"]])
-def test_what_is_missing_is_said(words, capsys):
+def test_what_is_missing_is_said(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*words) == 2
     assert capsys.readouterr().err.startswith("hsloc record: error: give ")
 
 
-def test_existing_files_are_kept_but_for_force(tmp_path):
+def test_existing_files_are_kept_but_for_force(tmp_path: Path) -> None:
     out = tmp_path / "x.mcap"
     out.write_text("precious")
     with pytest.raises(HslocError, match="exists already; name another file, or overwrite it with --force"):
@@ -141,6 +147,6 @@ def test_existing_files_are_kept_but_for_force(tmp_path):
     assert run(out, "--world", "office", "--duration", 1, "--force", "-q") == 0
 
 
-def test_a_folder_that_is_not_there(tmp_path):
+def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(HslocError, match="cannot be written"):
         run(tmp_path / "nowhere" / "x.mcap", "--world", "office", "--duration", 1)

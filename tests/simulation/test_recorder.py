@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -17,22 +18,25 @@ from hsloc.log import open_log
 from hsloc.model import Odometry, Pose2, Scan, Truth
 from hsloc.simulation.built_in import built_in
 from hsloc.simulation.presets import SCENARIOS
-from hsloc.simulation.recorder import record
+from hsloc.simulation.recorder import Recording, record
 from hsloc.simulation.scenario import Kidnap, Scenario
 from hsloc.simulation.sensors import Lidar
 from hsloc.simulation.simulator import Tick, simulate
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 SHORT = replace(SCENARIOS["kidnapped"], duration_s=4.0, kidnaps=(Kidnap(at_s=2.0, skip_s=10.0),))
 """Laser upside down and not straight, 25 Hz odometry, and a jump."""
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Recording]:
     path = tmp_path_factory.mktemp("recorded") / "run.mcap"
     return path, record(SHORT, path)
 
 
-def test_topics_types_and_counts(recorded):
+def test_topics_types_and_counts(recorded: tuple[Path, Recording]) -> None:
     path, recording = recorded
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
@@ -50,11 +54,11 @@ def test_topics_types_and_counts(recorded):
         "/ground_truth": ("nav_msgs/msg/Odometry", 101),
         "/scan": ("sensor_msgs/msg/LaserScan", 41),
     }
-    assert (recording.odometry, recording.scans, recording.seconds) == (101, 41, pytest.approx(4.0))
+    assert (recording.odometry, recording.scans, recording.seconds) == (101, 41, pytest.approx(4.0))  # type: ignore[comparison-overlap]
     assert recording.size == path.stat().st_size
 
 
-def test_what_is_read_is_what_was_simulated(recorded):
+def test_what_is_read_is_what_was_simulated(recorded: tuple[Path, Recording]) -> None:
     """Also through an upside-down mounting: the reader turns back what the recorder wrote as the laser sees it."""
     path, _ = recorded
     simulated = list(simulate(SHORT, built_in("office")))
@@ -74,7 +78,7 @@ def test_what_is_read_is_what_was_simulated(recorded):
         np.testing.assert_allclose(written.points_base(), read.points_base(), atol=1e-9)
 
 
-def test_the_log_knows_its_map_its_start_and_its_scenario(recorded):
+def test_the_log_knows_its_map_its_start_and_its_scenario(recorded: tuple[Path, Recording]) -> None:
     path, recording = recorded
     log = open_log(path)
     grid, world = log.map(), built_in("office")
@@ -87,11 +91,11 @@ def test_the_log_knows_its_map_its_start_and_its_scenario(recorded):
     assert metadata["world_sha256"] == world.fingerprint()
 
 
-def test_the_jump_of_a_kidnapping_is_not_driven(recorded):
+def test_the_jump_of_a_kidnapping_is_not_driven(recorded: tuple[Path, Recording]) -> None:
     assert recorded[1].metres < 3.0
 
 
-def test_points_travel_with_the_log(tmp_path):
+def test_points_travel_with_the_log(tmp_path: Path) -> None:
     path = tmp_path / "paper.mcap"
     record(replace(SCENARIOS["paper"], duration_s=0.5), path)
     with path.open("rb") as stream:
@@ -100,7 +104,9 @@ def test_points_travel_with_the_log(tmp_path):
     np.testing.assert_array_equal(rows, built_in("paper").points)
 
 
-def test_same_seed_same_bytes_whatever_the_threads_and_the_day(recorded, tmp_path):
+def test_same_seed_same_bytes_whatever_the_threads_and_the_day(
+    recorded: tuple[Path, Recording], tmp_path: Path
+) -> None:
     path, recording = recorded
     program = (
         "import json, sys; from hsloc.simulation.recorder import record;"
@@ -120,11 +126,11 @@ def test_same_seed_same_bytes_whatever_the_threads_and_the_day(recorded, tmp_pat
         assert again.read_bytes() == path.read_bytes()
 
 
-def test_another_seed_gives_other_bytes(recorded, tmp_path):
+def test_another_seed_gives_other_bytes(recorded: tuple[Path, Recording], tmp_path: Path) -> None:
     assert record(replace(SHORT, seed=1), tmp_path / "x.mcap").sha256 != recorded[1].sha256
 
 
-def test_an_existing_file_is_only_replaced_when_asked(tmp_path):
+def test_an_existing_file_is_only_replaced_when_asked(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(b"precious")
     with pytest.raises(OutputError, match="exists already"):
@@ -134,7 +140,7 @@ def test_an_existing_file_is_only_replaced_when_asked(tmp_path):
     assert path.stat().st_size > 1000
 
 
-def test_an_interrupted_recording_leaves_nothing(tmp_path):
+def test_an_interrupted_recording_leaves_nothing(tmp_path: Path) -> None:
     def interrupt(seconds: float, metres: float) -> None:
         raise KeyboardInterrupt
 
@@ -143,7 +149,7 @@ def test_an_interrupted_recording_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_memory_does_not_grow_with_the_drive():
+def test_memory_does_not_grow_with_the_drive() -> None:
     """Ten times as long, the simulation holds no more: it is a stream."""
     import tracemalloc
 
@@ -159,7 +165,7 @@ def test_memory_does_not_grow_with_the_drive():
     assert peaks[1] < 1.1 * peaks[0] + 20_000
 
 
-def test_progress_is_told_seconds_and_metres(tmp_path):
+def test_progress_is_told_seconds_and_metres(tmp_path: Path) -> None:
     told = []
     record(SHORT, tmp_path / "x.mcap", progress=lambda seconds, metres: told.append((seconds, metres)))
     assert [round(seconds) for seconds, _ in told] == [1, 2, 3, 4]

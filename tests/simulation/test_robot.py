@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from itertools import pairwise
 from math import hypot, pi, radians
-from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from paths import DATA
 
 from hsloc.model import Pose2
 from hsloc.model.pose2 import wrap_angles
@@ -16,14 +16,22 @@ from hsloc.simulation.built_in import built_in
 from hsloc.simulation.robot import DifferentialDrive, SteeredVehicle
 from hsloc.simulation.world_files import load_world
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 STEP_S = 0.02
 
 
-def drive(robot, start, path, step_s=STEP_S):
+def drive(
+    robot: DifferentialDrive | SteeredVehicle,
+    start: Pose2,
+    path: NDArray[np.float64] | list[Any],
+    step_s: float = STEP_S,
+) -> NDArray[np.float64]:
     return np.array([pose.to_array() for pose in robot.drive(start, np.array(path, dtype=float), step_s)])
 
 
-def rates(poses, step_s=STEP_S):
+def rates(poses: NDArray[np.float64], step_s: Any = STEP_S) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     delta = np.diff(poses, axis=0)
     return np.hypot(delta[:, 0], delta[:, 1]) / step_s, wrap_angles(delta[:, 2]) / step_s
 
@@ -40,7 +48,7 @@ PATHS = {
 
 
 @pytest.mark.parametrize("path", PATHS.values(), ids=PATHS)
-def test_differential_drive_follows_the_path_within_its_limits(path):
+def test_differential_drive_follows_the_path_within_its_limits(path: list[Any]) -> None:
     robot = DifferentialDrive()
     poses = drive(robot, Pose2(), path)
     speed, turn = rates(poses)
@@ -56,13 +64,13 @@ def test_differential_drive_follows_the_path_within_its_limits(path):
     assert max(off) < 0.35
 
 
-def test_the_robot_stands_still_before_it_starts():
+def test_the_robot_stands_still_before_it_starts() -> None:
     poses = drive(DifferentialDrive(pause_s=1.0), Pose2(0.5, 0.25, 0.125), [(0.5, 0.25), (4, 0)])
     assert (poses[: round(1.0 / STEP_S) + 1] == poses[0]).all()
     assert (poses[round(1.0 / STEP_S) + 5] != poses[0]).any()
 
 
-def test_steered_vehicle_is_the_reports_motion_model():
+def test_steered_vehicle_is_the_reports_motion_model() -> None:
     """x += v dt cos(g + theta), y += v dt sin(g + theta), theta += g, |g| <= 20 deg/s dt [P V]."""
     dt, v = 0.025, 3.0
     poses = drive(SteeredVehicle(), Pose2(), [(0, 0), (10, 5), (-20, 30)], dt)
@@ -72,23 +80,23 @@ def test_steered_vehicle_is_the_reports_motion_model():
     np.testing.assert_allclose(np.diff(poses[:, 1]), v * dt * np.sin(g + poses[:-1, 2]), atol=3e-6)
 
 
-def test_a_u_turn_takes_the_time_that_the_turn_rate_gives():
+def test_a_u_turn_takes_the_time_that_the_turn_rate_gives() -> None:
     """Radius v / rate: a U-turn of 180 degrees takes pi / rate seconds, whatever the speed."""
     poses = drive(SteeredVehicle(), Pose2(), [(0, 0), (-60, 0)], 0.025)
     turning = np.abs(wrap_angles(np.diff(poses[:, 2]))) > radians(19.9) * 0.025
     assert turning.sum() * 0.025 == pytest.approx(pi / radians(20.0), rel=0.15)
 
 
-def test_paper_world_is_driven_like_the_reports():
+def test_paper_world_is_driven_like_the_reports() -> None:
     world = built_in("paper")
     poses = drive(SteeredVehicle(), world.start(), world.path(), 0.025)
     assert len(poses) * 0.025 == pytest.approx(120.0, rel=0.1)
 
 
 @pytest.mark.data
-def test_the_reports_way_takes_the_published_time():
+def test_the_reports_way_takes_the_published_time() -> None:
     """[P]: 119.8 s and 359 m; scans come every 0.2 s, of which 599 fit."""
-    folder = Path(os.environ.get("HSLOC_DATA", Path(__file__).parents[3] / "shared" / "data")) / "paper"
+    folder = DATA / "paper"
     if not (folder / "waypoints.csv").exists():
         pytest.skip(f"{folder} is not there; set HSLOC_DATA")
     world = load_world(folder / "localisation_map.csv", folder / "waypoints.csv")
@@ -98,7 +106,7 @@ def test_the_reports_way_takes_the_published_time():
     assert 3.0 * seconds == pytest.approx(359.0, abs=0.3)
 
 
-def test_a_drive_is_the_same_every_time():
+def test_a_drive_is_the_same_every_time() -> None:
     world = built_in("office")
     first, second = (drive(DifferentialDrive(), world.start(), world.path(0.2)) for _ in range(2))
     np.testing.assert_array_equal(first, second)

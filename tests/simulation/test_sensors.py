@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from math import inf, pi, radians, tau
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
-from hsloc.model import Pose2
+from hsloc.model import Pose2, Scan
 from hsloc.simulation.floor_plan import polygon
 from hsloc.simulation.sensors import RANGE_STEP, Lidar, PointSensor, SensorNoise, within_reach
 from hsloc.simulation.simulator import LEG_RADIUS, PERSONAL_SPACE, Walkers
 from hsloc.simulation.world import World
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
 
 WAY = np.array([(1.0, 1.0), (2.0, 1.0)])
 ROOM = World("room", polygon([(0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (0.0, 4.0)]), WAY)
@@ -19,21 +25,27 @@ NOBODY = np.empty((0, 3))
 IDEAL = Lidar(range_noise=0.0, range_step=1e-9)
 
 
-def measure(sensor, pose, world=ROOM, legs=NOBODY, seed=0):
+def measure(
+    sensor: Lidar | PointSensor,
+    pose: NDArray[np.float64] | Pose2,
+    world: World = ROOM,
+    legs: NDArray[np.float64] = NOBODY,
+    seed: int = 0,
+) -> Scan:
     noise = SensorNoise(*(np.random.default_rng((seed, i)) for i in range(2)))
     poses = np.atleast_2d(pose.to_array() if isinstance(pose, Pose2) else pose)
     return sensor.measure(world, 42, 0.1, poses, legs, noise)
 
 
-def distance_in_room(pose, angle):
+def distance_in_room(pose: Pose2, angle: float) -> float:
     """From inside the room, to whichever wall line is met first."""
     c, s = np.cos(pose.theta + angle), np.sin(pose.theta + angle)
     ways = ((6.0 if c > 0 else 0.0) - pose.x) / c, ((4.0 if s > 0 else 0.0) - pose.y) / s
-    return min(ways)
+    return float(min(ways))
 
 
 @pytest.mark.parametrize("pose", [Pose2(2.5, 1.2, 0.4), Pose2(5.9, 3.9, -2.0), Pose2(0.3, 2.0, 3.1)])
-def test_every_beam_measures_the_room(pose):
+def test_every_beam_measures_the_room(pose: Pose2) -> None:
     scan = measure(IDEAL, pose)
     expected = [distance_in_room(pose, angle) for angle in scan.angles()]
     np.testing.assert_allclose(scan.ranges, expected, rtol=3e-7)
@@ -42,7 +54,7 @@ def test_every_beam_measures_the_room(pose):
 
 @pytest.mark.parametrize("upside_down", [False, True])
 @pytest.mark.parametrize("mounting", [Pose2(), Pose2(0.3, -0.1, 0.5), Pose2(-0.2, 0.0, pi / 2)])
-def test_hits_lie_on_the_walls_whatever_the_mounting(mounting, upside_down):
+def test_hits_lie_on_the_walls_whatever_the_mounting(mounting: Pose2, upside_down: bool) -> None:
     lidar = Lidar(
         range_noise=0.0, range_step=1e-9, mounting=mounting, upside_down=upside_down, field_of_view=radians(200)
     )
@@ -54,13 +66,13 @@ def test_hits_lie_on_the_walls_whatever_the_mounting(mounting, upside_down):
     assert (scan.angle_increment < 0) == upside_down
 
 
-def test_a_full_turn_does_not_measure_a_direction_twice_but_a_fan_has_both_ends():
+def test_a_full_turn_does_not_measure_a_direction_twice_but_a_fan_has_both_ends() -> None:
     full, fan = measure(IDEAL, Pose2(2, 2, 0)), measure(Lidar(beams=181, field_of_view=pi), Pose2(2, 2, 0))
     assert full.angle_increment * 360 == pytest.approx(tau)
     assert (fan.angles()[0], fan.angles()[-1]) == pytest.approx((-pi / 2, pi / 2), abs=1e-6)
 
 
-def test_range_noise_is_gaussian_with_the_asked_deviation():
+def test_range_noise_is_gaussian_with_the_asked_deviation() -> None:
     lidar = Lidar(range_noise=0.02)
     pose = Pose2(2.5, 1.2, 0.4)
     truth = measure(IDEAL, pose).ranges
@@ -70,18 +82,18 @@ def test_range_noise_is_gaussian_with_the_asked_deviation():
     assert (np.abs(off) > 0.04).mean() == pytest.approx(0.0455, abs=0.008)
 
 
-def test_ranges_are_whole_steps():
+def test_ranges_are_whole_steps() -> None:
     ranges = measure(Lidar(), Pose2(2.5, 1.2, 0.4)).ranges.astype(float)
     np.testing.assert_array_equal(np.round(ranges / RANGE_STEP) * RANGE_STEP, ranges)
 
 
 @pytest.mark.parametrize(("as_inf", "lost"), [(False, np.isnan), (True, np.isposinf)])
-def test_dropouts_are_as_frequent_as_asked(as_inf, lost):
+def test_dropouts_are_as_frequent_as_asked(as_inf: bool, lost: Callable[..., Any]) -> None:
     lidar = Lidar(beams=10_000, dropout=0.2, dropout_as_inf=as_inf)
     assert lost(measure(lidar, Pose2(2, 2, 0)).ranges).mean() == pytest.approx(0.2, abs=0.016)
 
 
-def test_out_of_range_is_inf_and_too_near_is_minus_inf():
+def test_out_of_range_is_inf_and_too_near_is_minus_inf() -> None:
     scan = measure(Lidar(range_max=3.0, range_min=0.5, range_noise=0.0), Pose2(0.3, 2.0, 0.0))
     ahead, behind = scan.ranges[180], scan.ranges[0]
     assert ahead == inf
@@ -90,7 +102,7 @@ def test_out_of_range_is_inf_and_too_near_is_minus_inf():
     assert scan.ranges[scan.hits()].max() <= 3.0
 
 
-def test_noise_never_brings_back_what_is_out_of_range():
+def test_noise_never_brings_back_what_is_out_of_range() -> None:
     scans = [measure(Lidar(range_max=3.0, range_noise=0.2), Pose2(1.0, 2.0, 0.0), seed=seed) for seed in range(20)]
     truth = measure(IDEAL, Pose2(1.0, 2.0, 0.0)).ranges
     for scan in scans:
@@ -98,13 +110,13 @@ def test_noise_never_brings_back_what_is_out_of_range():
         assert not (scan.ranges[np.isfinite(scan.ranges)] > 3.0).any()
 
 
-def test_noise_sources_do_not_disturb_each_other():
+def test_noise_sources_do_not_disturb_each_other() -> None:
     plain, dropping = (measure(Lidar(dropout=p), Pose2(2, 2, 0)).ranges for p in (0.0, 0.3))
     kept = np.isfinite(dropping)
     np.testing.assert_array_equal(plain[kept], dropping[kept])
 
 
-def test_motion_distortion_measures_each_beam_from_where_it_was():
+def test_motion_distortion_measures_each_beam_from_where_it_was() -> None:
     lidar = Lidar(range_noise=0.0, range_step=1e-9, motion_distortion=True)
     turn = np.linspace(0.0, 0.2, 360, endpoint=False)
     poses = np.column_stack((np.full(360, 2.0), np.full(360, 2.0), turn))
@@ -114,14 +126,14 @@ def test_motion_distortion_measures_each_beam_from_where_it_was():
     assert scan.time_increment == pytest.approx(0.1 / 360)
 
 
-def test_legs_hide_the_wall_behind_them():
+def test_legs_hide_the_wall_behind_them() -> None:
     legs = np.array([(4.0, 2.0, LEG_RADIUS)])
     scan = measure(IDEAL, Pose2(2.0, 2.0, 0.0), legs=legs)
     assert scan.ranges[180] == pytest.approx(2.0 - LEG_RADIUS)
     assert np.count_nonzero(scan.ranges != measure(IDEAL, Pose2(2.0, 2.0, 0.0)).ranges) == 5  # +-2.0 degrees
 
 
-def test_walkers_move_along_the_way_and_keep_their_distance():
+def test_walkers_move_along_the_way_and_keep_their_distance() -> None:
     path = np.array([(0.0, 0.0), (20.0, 0.0)])
     walkers = Walkers(path, 5, np.random.default_rng(3))
     now, later = (walkers.legs(t, np.array((50.0, 50.0))) for t in (0.0, 0.5))
@@ -135,7 +147,7 @@ def test_walkers_move_along_the_way_and_keep_their_distance():
     assert np.hypot(*(near[:, :2] - now[0, :2]).T).min() > PERSONAL_SPACE
 
 
-def test_points_are_seen_through_walls_up_to_the_range():
+def test_points_are_seen_through_walls_up_to_the_range() -> None:
     points = np.array([(10.0, 0.0), (20.0, 0.0), (0.0, -30.0), (49.9, 0.0), (0.0, 51.0)])
     world = World("points", np.empty((0, 4)), WAY, points=points)
     scan = measure(PointSensor(), Pose2(0.0, 0.0, pi / 2), world)
@@ -145,7 +157,7 @@ def test_points_are_seen_through_walls_up_to_the_range():
     )  # the nearer of a direction
 
 
-def test_points_are_put_into_the_nearest_direction():
+def test_points_are_put_into_the_nearest_direction() -> None:
     points = np.random.default_rng(1).uniform(-35, 35, (300, 2))
     world = World("points", np.empty((0, 4)), WAY, points=points)
     pose = Pose2(1.0, -2.0, 0.7)
@@ -155,7 +167,7 @@ def test_points_are_put_into_the_nearest_direction():
     assert off.max() < 50.0 * tau / 14_400 / 2 + RANGE_STEP
 
 
-def test_segments_out_of_reach_are_left_out():
+def test_segments_out_of_reach_are_left_out() -> None:
     segments = np.array([(0, 0, 1, 0), (9, 9, 10, 10), (-50, 1, 50, 1), (0, 3.1, 1, 3.1)], dtype=float)
     near = within_reach(segments, np.zeros(2), 3.0)
     np.testing.assert_array_equal(near, segments[[0, 2]])

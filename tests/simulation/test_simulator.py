@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,18 +17,18 @@ from hsloc.simulation.odometer import OdometryNoise, Slip
 from hsloc.simulation.presets import SCENARIOS, preset
 from hsloc.simulation.scenario import Kidnap, Scenario
 from hsloc.simulation.sensors import Lidar
-from hsloc.simulation.simulator import events, simulate
+from hsloc.simulation.simulator import Tick, events, simulate
 
 SHORT = replace(SCENARIOS["office"], duration_s=6.0, sensor=replace(SCENARIOS["office"].sensor, beams=72))
 OFFICE = built_in("office")
 
 
-def split(scenario, world=OFFICE):
+def split(scenario: Scenario, world: Any = OFFICE) -> tuple[list[Tick], list[Scan]]:
     items = list(simulate(scenario, world))
     return [item for item in items if not isinstance(item, Scan)], [item for item in items if isinstance(item, Scan)]
 
 
-def test_ticks_and_scans_come_at_their_rates_in_order_of_stamps():
+def test_ticks_and_scans_come_at_their_rates_in_order_of_stamps() -> None:
     scenario = replace(SHORT, scan_offset_s=0.013)
     ticks, scans = split(scenario)
     start = scenario.start_stamp_ns
@@ -37,21 +38,21 @@ def test_ticks_and_scans_come_at_their_rates_in_order_of_stamps():
     assert stamps == sorted(stamps)
 
 
-def test_odometry_without_noise_is_the_truth_seen_from_the_start():
+def test_odometry_without_noise_is_the_truth_seen_from_the_start() -> None:
     ticks, _ = split(replace(SHORT, odometry=OdometryNoise(0, 0, 0, 0)))
     for tick in ticks:
         assert (OFFICE.start() @ tick.T_odom_base).distance(tick.T_map_base) < 1e-4
 
 
-def test_hits_lie_on_the_walls_seen_from_the_truth():
-    ticks, scans = split(replace(SHORT, sensor=replace(SHORT.sensor, range_noise=0.0)))
+def test_hits_lie_on_the_walls_seen_from_the_truth() -> None:
+    ticks, scans = split(replace(SHORT, sensor=replace(SHORT.sensor, range_noise=0.0)))  # type: ignore[arg-type]
     truth = {tick.stamp_ns: tick.T_map_base for tick in ticks}
     for scan in scans:
         assert OFFICE.distance_to_walls(truth[scan.stamp_ns] @ scan.points_base()).max() < 1.5e-3
 
 
-def test_distorted_scans_straighten_when_each_beam_is_put_where_it_was_measured():
-    sensor = replace(SHORT.sensor, range_noise=0.0, motion_distortion=True, range_max=30.0)
+def test_distorted_scans_straighten_when_each_beam_is_put_where_it_was_measured() -> None:
+    sensor = replace(SHORT.sensor, range_noise=0.0, motion_distortion=True, range_max=30.0)  # type: ignore[arg-type]
     ticks, scans = split(replace(SHORT, sensor=sensor, duration_s=12.0))
     stamps = np.array([tick.stamp_ns for tick in ticks])
     straight, bent = [], []
@@ -70,7 +71,7 @@ def test_distorted_scans_straighten_when_each_beam_is_put_where_it_was_measured(
     assert max(bent) > 0.05
 
 
-def test_kidnapped_robot_jumps_in_the_world_and_its_odometry_does_not_notice():
+def test_kidnapped_robot_jumps_in_the_world_and_its_odometry_does_not_notice() -> None:
     scenario = replace(SHORT, odometry=OdometryNoise(0, 0, 0, 0), kidnaps=(Kidnap(at_s=3.0, skip_s=4.0),))
     ticks, _ = split(scenario)
     plain, _ = split(replace(SHORT, odometry=OdometryNoise(0, 0, 0, 0), duration_s=12.0))
@@ -85,7 +86,7 @@ def test_kidnapped_robot_jumps_in_the_world_and_its_odometry_does_not_notice():
     assert ticks[149].T_map_base == plain[149].T_map_base
 
 
-def test_slip_bends_the_odometry_alone():
+def test_slip_bends_the_odometry_alone() -> None:
     slipping, _ = split(replace(SHORT, slips=(Slip(at_s=3.0, duration_s=1.0, factor=2.0),)))
     plain, _ = split(SHORT)
     assert [t.T_map_base for t in slipping] == [t.T_map_base for t in plain]
@@ -93,7 +94,7 @@ def test_slip_bends_the_odometry_alone():
     assert slipping[-1].T_odom_base.distance(plain[-1].T_odom_base) > 0.5
 
 
-def test_same_seed_same_numbers_and_another_seed_others():
+def test_same_seed_same_numbers_and_another_seed_others() -> None:
     (ticks, scans), (again, scans_again) = split(SHORT), split(SHORT)
     other, other_scans = split(replace(SHORT, seed=1))
     assert [t.T_odom_base for t in ticks] == [t.T_odom_base for t in again]
@@ -103,7 +104,7 @@ def test_same_seed_same_numbers_and_another_seed_others():
     assert [t.T_map_base for t in ticks] == [t.T_map_base for t in other]  # the drive itself is not noisy
 
 
-def test_one_noise_does_not_shift_another():
+def test_one_noise_does_not_shift_another() -> None:
     ticks, scans = split(SHORT)
     more_people, crowded = split(replace(SHORT, people=3))
     louder, noisy = split(replace(SHORT, odometry=OdometryNoise(alpha3=0.1)))
@@ -114,12 +115,12 @@ def test_one_noise_does_not_shift_another():
     assert 0.0 < changed < 0.2
 
 
-def test_events_are_what_a_log_would_give():
+def test_events_are_what_a_log_would_give() -> None:
     kinds = [type(event) for event in events(replace(SHORT, duration_s=0.1), OFFICE)]
     assert kinds == [Truth, Odometry, Scan] + [Truth, Odometry] * 5 + [Scan]
 
 
-def test_the_recording_ends_with_the_way_or_with_the_duration():
+def test_the_recording_ends_with_the_way_or_with_the_duration() -> None:
     ticks, _ = split(replace(SHORT, duration_s=None, laps=0.1))
     path = OFFICE.path(0.1)
     assert np.hypot(ticks[-1].T_map_base.x - path[-1, 0], ticks[-1].T_map_base.y - path[-1, 1]) < 0.05
@@ -128,7 +129,7 @@ def test_the_recording_ends_with_the_way_or_with_the_duration():
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_scenarios_survive_json(name):
+def test_scenarios_survive_json(name: str) -> None:
     scenario = preset(name)
     assert Scenario.from_dict(json.loads(json.dumps(scenario.to_dict()))) == scenario
 
@@ -147,11 +148,11 @@ def test_scenarios_survive_json(name):
         ({"world": "office", "odometry": {"kind": "OdometryNoise", "alpha1": -1}}, r"odometry\.alpha1 is -1"),
     ],
 )
-def test_scenarios_that_make_no_sense_are_refused(values, message):
+def test_scenarios_that_make_no_sense_are_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         Scenario.from_dict(values)
 
 
-def test_an_unknown_preset_names_the_choice():
+def test_an_unknown_preset_names_the_choice() -> None:
     with pytest.raises(ConfigError, match=r"'x' is unknown; choose from office"):
         preset("x")

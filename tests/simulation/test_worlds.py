@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -16,12 +17,15 @@ from hsloc.simulation.presets import SCENARIOS
 from hsloc.simulation.world import World
 from hsloc.simulation.world_files import load_world, read_rows
 
+if TYPE_CHECKING:
+    from pathlib import Path
+
 ROBOT_RADIUS = 0.25
 ROOM = "# a room with a wall in it\n0 0 10 0\n10,0,10,8\n10 8 0 8\n0 8 0 0\n5 0 5 5\n"
 
 
 @pytest.mark.parametrize("name", [name for name in SCENARIOS if name != "paper"])
-def test_the_robot_never_comes_near_a_wall(name):
+def test_the_robot_never_comes_near_a_wall(name: str) -> None:
     scenario = SCENARIOS[name]
     world = built_in(scenario.world)
     path = world.path(scenario.laps_needed(world.lap_length()))
@@ -30,7 +34,7 @@ def test_the_robot_never_comes_near_a_wall(name):
 
 
 @pytest.mark.parametrize("name", ["office", "corridor-loop", "hall", "figure-of-eight", "symmetric-corridor"])
-def test_the_map_has_free_space_along_the_way_and_walls_around_it(name):
+def test_the_map_has_free_space_along_the_way_and_walls_around_it(name: str) -> None:
     world = built_in(name)
     grid = world.occupancy_grid()
     assert grid.cells[0].max() == grid.cells[-1].max() == -1  # the rim is unknown: nothing leaks out
@@ -39,7 +43,7 @@ def test_the_map_has_free_space_along_the_way_and_walls_around_it(name):
     assert (grid.cells[cells[:, 1], cells[:, 0]] == 0).all()
 
 
-def test_the_corridor_loop_is_long_and_nothing_in_it_repeats():
+def test_the_corridor_loop_is_long_and_nothing_in_it_repeats() -> None:
     world = built_in("corridor-loop")
     assert world.lap_length() > 100.0
     lengths = np.round(np.hypot(*(world.segments[:, 2:] - world.segments[:, :2]).T), 4)
@@ -48,7 +52,7 @@ def test_the_corridor_loop_is_long_and_nothing_in_it_repeats():
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_no_long_wall_falls_on_the_grid(name):
+def test_no_long_wall_falls_on_the_grid(name: str) -> None:
     """Axis-parallel walls at multiples of the map's 5 cm would flatter whoever matches against it."""
     segments = built_in(name).segments
     vertical = segments[(segments[:, 0] == segments[:, 2]) & (np.abs(segments[:, 1] - segments[:, 3]) > 2.0)]
@@ -56,17 +60,17 @@ def test_no_long_wall_falls_on_the_grid(name):
     assert (offsets > 1e-6).sum() >= 0.9 * len(offsets)
 
 
-def test_a_floor_plan_shows_the_faces_of_what_is_not_room():
+def test_a_floor_plan_shows_the_faces_of_what_is_not_room() -> None:
     two_rooms_and_a_door = floor_plan([(0, 0, 4, 4), (4.2, 0, 8, 4), (4, 1, 4.2, 2)])
     total = np.hypot(*(two_rooms_and_a_door[:, 2:] - two_rooms_and_a_door[:, :2]).T).sum()
     assert total == pytest.approx(16 + 15.6 - 2 * 1 + 2 * 0.2)
 
 
-def test_inset_moves_the_sides_of_a_polygon():
+def test_inset_moves_the_sides_of_a_polygon() -> None:
     assert np.allclose(inset([(0, 0), (4, 0), (4, 3), (0, 3)], 1.0), [(1, 1), (3, 1), (3, 2), (1, 2)])
 
 
-def test_path_of_laps():
+def test_path_of_laps() -> None:
     triangle = World(
         "t", polygon([(0, 0), (9, 0), (0, 9)]), np.array([(1.0, 1.0), (4.0, 1.0), (4.0, 5.0)]), closed=True
     )
@@ -79,7 +83,7 @@ def test_path_of_laps():
     assert there_and_back.start() == Pose2(0.0, 0.0, 0.0)
 
 
-def test_a_world_of_segments_gets_a_way_that_keeps_clear(tmp_path):
+def test_a_world_of_segments_gets_a_way_that_keeps_clear(tmp_path: Path) -> None:
     file = tmp_path / "room.txt"
     file.write_text(ROOM)
     world = load_world(file)
@@ -92,7 +96,7 @@ def test_a_world_of_segments_gets_a_way_that_keeps_clear(tmp_path):
     assert path[:, 0].max() > 7.0
 
 
-def test_a_world_from_a_map_has_the_borders_of_its_cells_for_walls(tmp_path):
+def test_a_world_from_a_map_has_the_borders_of_its_cells_for_walls(tmp_path: Path) -> None:
     cells = np.full((80, 120), 0, dtype=np.int8)
     cells[0, :] = cells[-1, :] = cells[:, 0] = cells[:, -1] = 100
     cells[0:40, 60] = 100
@@ -108,22 +112,22 @@ def test_a_world_from_a_map_has_the_borders_of_its_cells_for_walls(tmp_path):
     assert world.distance_to_walls(dense).min() > 0.3
 
 
-def test_a_map_that_says_free_where_it_means_unknown_is_noted(tmp_path):
+def test_a_map_that_says_free_where_it_means_unknown_is_noted(tmp_path: Path) -> None:
     grid = OccupancyGrid(np.pad(np.zeros((40, 40), dtype=np.int8), 10, constant_values=-1), 0.1)
     grid.cells[10, 10:50] = 100
     yaml = save_map(grid, tmp_path / "m")
-    assert load_world(yaml).notes == ()
+    assert load_world(yaml).notes == ()  # type: ignore[attr-defined]
     yaml.write_text(yaml.read_text().replace("0.196", "0.25"))
-    assert "free_thresh" in load_world(yaml).notes[0]
+    assert "free_thresh" in load_world(yaml).notes[0]  # type: ignore[attr-defined]
 
 
-def test_a_map_without_room_for_the_robot_is_refused(tmp_path):
+def test_a_map_without_room_for_the_robot_is_refused(tmp_path: Path) -> None:
     yaml = save_map(OccupancyGrid(np.full((5, 5), 100, dtype=np.int8), 0.1), tmp_path / "m")
     with pytest.raises(ConfigError, match="no free place is"):
         load_world(yaml)
 
 
-def test_waypoints_replace_the_way(tmp_path):
+def test_waypoints_replace_the_way(tmp_path: Path) -> None:
     (tmp_path / "room.txt").write_text(ROOM)
     (tmp_path / "way.csv").write_text("x_m,y_m\n1,1\n1,7\n9,7\n1,1\n")
     with pytest.raises(ConfigError, match=r"way\.csv: the way from waypoint 3 to the next runs into a wall"):
@@ -134,7 +138,7 @@ def test_waypoints_replace_the_way(tmp_path):
     np.testing.assert_array_equal(world.waypoints, [(1, 1), (1, 7), (4, 7)])
 
 
-def test_a_world_of_points_is_seen_through_walls(tmp_path):
+def test_a_world_of_points_is_seen_through_walls(tmp_path: Path) -> None:
     (tmp_path / "map.csv").write_text("x_m,y_m\n1,2\n3,4\n5,6\n")
     with pytest.raises(ConfigError, match="give --waypoints FILE"):
         load_world(tmp_path / "map.csv")
@@ -154,7 +158,7 @@ def test_a_world_of_points_is_seen_through_walls(tmp_path):
         ("0 0 nan 1\n", r"line 1: .* not finite"),
     ],
 )
-def test_a_text_that_is_no_world_says_where(tmp_path, text, message):
+def test_a_text_that_is_no_world_says_where(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / "w.txt"
     file.write_text(text)
     with pytest.raises(ConfigError, match=message) as caught:
@@ -163,12 +167,12 @@ def test_a_text_that_is_no_world_says_where(tmp_path, text, message):
     assert str(file) in str(caught.value)
 
 
-def test_unknown_worlds_are_named_with_the_choice():
+def test_unknown_worlds_are_named_with_the_choice() -> None:
     with pytest.raises(ConfigError, match=r"'moon' is neither built in .*office"):
         load_world("moon")
 
 
-def test_a_binary_file_is_no_world(tmp_path):
+def test_a_binary_file_is_no_world(tmp_path: Path) -> None:
     (tmp_path / "x.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="cannot be read as text"):
         load_world(tmp_path / "x.txt")

@@ -73,5 +73,5 @@ def test_of_a_crowd_some_stand_for_all_and_everybody_has_partners() -> None:
 
 
 def test_a_crowd_of_nobody_is_refused() -> None:
-    with pytest.raises(ConfigError, match="max_scans_per_view must be at least 1"):
+    with pytest.raises(ConfigError, match="max_scans_per_view is 0; it must be from 1"):
         JointRegistrationParameters(max_scans_per_view=0)

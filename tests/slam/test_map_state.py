@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
 from hsloc.errors import MapError
-from hsloc.slam.map_state import read_state, write_state
+from hsloc.slam.map_state import MapState, read_state, write_state
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.parameters import GraphMapperParameters
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from hsloc.model import Odometry, PairedScan, Trajectory
+
 
 @pytest.fixture(scope="module")
-def state(office):
+def state(office: tuple[list[Odometry | PairedScan], Trajectory]) -> MapState:
     mapper = Mapper(GraphMapperParameters(), np.random.default_rng(0))
     for event in office[0][: len(office[0]) // 2]:
         mapper.update(event)
-    return mapper.finish().state
+    return mapper.finish().state  # type: ignore[return-value]
 
 
-def test_what_is_read_is_what_was_written(state, tmp_path):
+def test_what_is_read_is_what_was_written(state: MapState, tmp_path: Path) -> None:
     write_state(state, tmp_path / "map.npz")
     read = read_state(tmp_path / "map.npz")
     for part in ("points", "normals", "centroids", "start", "hit_of_beam", "ranges", "table_start", "geometry"):
@@ -38,7 +47,7 @@ def test_what_is_read_is_what_was_written(state, tmp_path):
     assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "map.npz").read_bytes()
 
 
-def changed(path, **arrays):
+def changed(path: Path, **arrays: NDArray[Any] | np.int64) -> None:
     with np.load(path) as archive:
         kept = dict(archive)
     np.savez(path, **{**kept, **arrays})
@@ -59,7 +68,9 @@ def changed(path, **arrays):
         (lambda path: changed(path, points=np.zeros((3, 2))), "points"),
     ],
 )
-def test_files_that_are_no_saved_map_are_told_in_one_line(state, tmp_path, spoil, said):
+def test_files_that_are_no_saved_map_are_told_in_one_line(
+    state: MapState, tmp_path: Path, spoil: Callable[..., Any], said: str
+) -> None:
     path = tmp_path / "map.npz"
     write_state(state, path)
     spoil(path)
@@ -69,7 +80,7 @@ def test_files_that_are_no_saved_map_are_told_in_one_line(state, tmp_path, spoil
     assert "\n" not in str(error.value)
 
 
-def test_indices_that_would_lead_out_of_an_array_are_refused(state, tmp_path):
+def test_indices_that_would_lead_out_of_an_array_are_refused(state: MapState, tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
     rows = state.scans.hit_of_beam.copy()
     rows[np.argmax(rows)] += 1000

@@ -1,38 +1,44 @@
+from __future__ import annotations
+
 import weakref
 from dataclasses import replace
 from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from drives import ape_rmse, drive
 
 from hsloc.dataclass_json import to_json
-from hsloc.model import IDENTITY, Odometry, PairedScan, Pose2, Scan, Status
+from hsloc.model import IDENTITY, Estimate, Odometry, PairedScan, Pose2, Scan, Status
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.parameters import GraphMapperParameters
 
+if TYPE_CHECKING:
+    from hsloc.slam.result import MappingResult
 
-def mapped(events, parameters=None, seed=0):
+
+def mapped(events: Any, parameters: Any = None, seed: int = 0) -> Any:
     mapper = Mapper(parameters or GraphMapperParameters(), np.random.default_rng(seed))
     said = [mapper.update(event) for event in events]
     return mapper.finish(), said
 
 
-def scans_of(events):
+def scans_of(events: Any) -> Any:
     return [event for event in events if isinstance(event, PairedScan)]
 
 
 @pytest.fixture(scope="module")
-def office_map(office):
+def office_map(office: Any) -> Any:
     return mapped(office[0])
 
 
 @pytest.fixture(scope="module")
-def loop_map(loop):
+def loop_map(loop: Any) -> Any:
     return mapped(loop[0])
 
 
-def test_the_office_is_mapped_to_the_centimetre(office, office_map):
+def test_the_office_is_mapped_to_the_centimetre(office: Any, office_map: Any) -> None:
     events, truth = office
     result, said = office_map
     assert ape_rmse(events, result.scan_poses, truth) < 0.02
@@ -43,7 +49,7 @@ def test_the_office_is_mapped_to_the_centimetre(office, office_map):
     assert result.quality.conflict < 0.01
 
 
-def test_every_event_has_its_pose_in_the_order_of_the_log(office, office_map):
+def test_every_event_has_its_pose_in_the_order_of_the_log(office: Any, office_map: Any) -> None:
     events, _ = office
     result, said = office_map
     messages = [event for event in events if isinstance(event, Odometry)]
@@ -57,7 +63,7 @@ def test_every_event_has_its_pose_in_the_order_of_the_log(office, office_map):
     assert max(steps) < 0.1, "no jumps"
 
 
-def test_the_grid_shows_walls_free_and_unknown(office_map):
+def test_the_grid_shows_walls_free_and_unknown(office_map: Any) -> None:
     result, _ = office_map
     grid = result.grid
     assert grid.occupied().sum() > 500
@@ -68,7 +74,7 @@ def test_the_grid_shows_walls_free_and_unknown(office_map):
         assert grid.cells[row, column] < 20, "the robot drives through free space"
 
 
-def test_a_long_loop_is_closed_without_a_wrong_one(loop, loop_map):
+def test_a_long_loop_is_closed_without_a_wrong_one(loop: Any, loop_map: tuple[MappingResult, list[Estimate]]) -> None:
     events, truth = loop
     result, said = loop_map
     assert result.quality.loops >= 1
@@ -79,14 +85,14 @@ def test_a_long_loop_is_closed_without_a_wrong_one(loop, loop_map):
     assert ape_rmse(events, online, truth) > ape_rmse(events, result.scan_poses, truth)
 
 
-def test_loops_say_why_they_were_refused(loop_map):
+def test_loops_say_why_they_were_refused(loop_map: Any) -> None:
     result, _ = loop_map
     for loop in result.loops:
         assert loop.accepted == (loop.reason == "")
         assert loop.first < loop.second - 3
 
 
-def test_the_same_seed_gives_the_same_bytes(office, office_map):
+def test_the_same_seed_gives_the_same_bytes(office: Any, office_map: Any) -> None:
     result, _ = office_map
     again, _ = mapped(office[0])
     assert again.scan_poses.tobytes() == result.scan_poses.tobytes()
@@ -95,7 +101,7 @@ def test_the_same_seed_gives_the_same_bytes(office, office_map):
     assert np.abs(other.scan_poses - result.scan_poses)[:, :2].max() < 0.02, "another seed changes little"
 
 
-def test_without_odometry_a_constant_velocity_predicts(office):
+def test_without_odometry_a_constant_velocity_predicts(office: Any) -> None:
     events, truth = office
     scans = [PairedScan(event.scan, IDENTITY) for event in scans_of(events)]
     result, said = mapped(scans, GraphMapperParameters(use_odometry=False))
@@ -104,7 +110,7 @@ def test_without_odometry_a_constant_velocity_predicts(office):
     assert sum(estimate.status is Status.MATCHED for estimate in said) > 0.9 * len(said)
 
 
-def test_odometry_that_is_not_to_be_used_is_not_used(office):
+def test_odometry_that_is_not_to_be_used_is_not_used(office: Any) -> None:
     events, truth = office
     spoilt = [
         Odometry(event.stamp_ns, Pose2(99.0, -5.0, 2.0)) if isinstance(event, Odometry) else event for event in events
@@ -114,7 +120,7 @@ def test_odometry_that_is_not_to_be_used_is_not_used(office):
     assert np.abs(result.odometry_poses[:, 0]).max() < 40.0
 
 
-def test_a_stretch_without_returns_is_bridged(office):
+def test_a_stretch_without_returns_is_bridged(office: Any) -> None:
     events, truth = office
     blind = [
         PairedScan(replace(event.scan, ranges=np.full_like(event.scan.ranges, np.inf)), event.T_odom_base)
@@ -129,14 +135,14 @@ def test_a_stretch_without_returns_is_bridged(office):
     assert ape_rmse(events, result.scan_poses, truth) < 0.1
 
 
-def test_slipping_wheels_and_people_do_no_harm():
+def test_slipping_wheels_and_people_do_no_harm() -> None:
     events, truth = drive("slip", seed=2, duration_s=40.0)
     result, _ = mapped(events)
     assert ape_rmse(events, result.scan_poses, truth) < 0.03
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_in_a_corridor_of_twins_no_wrong_loop_is_closed(seed):
+def test_in_a_corridor_of_twins_no_wrong_loop_is_closed(seed: Any) -> None:
     events, truth = drive("symmetric-corridor", seed=seed)
     result, _ = mapped(events, seed=seed)
     assert ape_rmse(events, result.scan_poses, truth) < 0.3, "a wrong loop is 5 m off or more"
@@ -144,7 +150,7 @@ def test_in_a_corridor_of_twins_no_wrong_loop_is_closed(seed):
 
 
 @pytest.mark.parametrize("what", ["nothing", "odometry", "no returns", "one scan", "standing"])
-def test_next_to_nothing_is_no_error(office, what):
+def test_next_to_nothing_is_no_error(office: Any, what: Any) -> None:
     events, _ = office
     scan = scans_of(events)[0]
     told = {
@@ -158,13 +164,13 @@ def test_next_to_nothing_is_no_error(office, what):
         "standing": [scan] * 5,
     }[what]
     result, said = mapped(told)
-    assert len(said) == len(told)
-    assert len(result.scan_poses) + len(result.odometry_poses) == len(told)
+    assert len(said) == len(told)  # type: ignore[arg-type]
+    assert len(result.scan_poses) + len(result.odometry_poses) == len(told)  # type: ignore[arg-type]
     assert result.quality.keyscans == (1 if what in ("one scan", "standing") else 0)
     assert to_json(result.quality)["loop_max"] is None
 
 
-def test_a_robot_that_waits_keeps_no_scan_of_its_lasers():
+def test_a_robot_that_waits_keeps_no_scan_of_its_lasers() -> None:
     """Scans that are held for the next laser's are let go when that has come, keyscan or not."""
     mapper = Mapper(GraphMapperParameters(), np.random.default_rng(0))
     angles = np.linspace(-np.pi / 2, np.pi / 2, 181)

@@ -1,4 +1,7 @@
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -11,8 +14,11 @@ from hsloc.simulation.odometer import SteeringNoise
 from hsloc.simulation.presets import preset
 from hsloc.slam.point_mapper import PointMapper, PointMapperParameters
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-def scan_of(points, stamp=0):
+
+def scan_of(points: NDArray[np.float64], stamp: int = 0) -> Scan:
     ranges, angles = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
     beams = np.full(720, np.inf, np.float32)
     beams[np.round((angles + np.pi) / (np.pi / 360)).astype(int) % 720] = ranges
@@ -20,11 +26,11 @@ def scan_of(points, stamp=0):
 
 
 @pytest.fixture
-def mapper():
+def mapper() -> PointMapper:
     return PointMapper(Hide(), PointMapperParameters(), np.random.default_rng(0), Pose2(10.0, 5.0, 0.2))
 
 
-def test_the_first_scan_is_the_map(mapper):
+def test_the_first_scan_is_the_map(mapper: PointMapper) -> None:
     points = np.array([(5.0, 0.0), (0.0, 8.0), (-3.0, -3.0), (7.0, 7.0)])
     said = mapper.update(PairedScan(scan_of(points), Pose2()))
     assert said.T_map_base == Pose2(10.0, 5.0, 0.2)
@@ -33,7 +39,7 @@ def test_the_first_scan_is_the_map(mapper):
     np.testing.assert_allclose(np.sort(mapper.points, axis=0), np.sort(Pose2(10, 5, 0.2) @ points, axis=0), atol=0.1)
 
 
-def test_only_points_far_from_the_map_are_added(mapper):
+def test_only_points_far_from_the_map_are_added(mapper: PointMapper) -> None:
     points = np.array([(5.0, 0.0), (0.0, 8.0), (-3.0, -3.0), (7.0, 7.0), (-9.0, 2.0), (4.0, -8.0)])
     mapper.update(PairedScan(scan_of(points), Pose2()))
     more = np.concatenate((points, [(20.0, 6.0), (5.9, 0.3)]))
@@ -44,7 +50,7 @@ def test_only_points_far_from_the_map_are_added(mapper):
     np.testing.assert_allclose(mapper.points[-1], Pose2(10, 5, 0.2) @ np.array((20.0, 6.0)), atol=0.4)
 
 
-def test_a_scan_that_does_not_fit_adds_nothing(mapper):
+def test_a_scan_that_does_not_fit_adds_nothing(mapper: PointMapper) -> None:
     random = np.random.default_rng(2)
     mapper.update(PairedScan(scan_of(random.uniform(5, 9, (30, 2))), Pose2()))
     before = len(mapper.points)
@@ -53,7 +59,7 @@ def test_a_scan_that_does_not_fit_adds_nothing(mapper):
     assert "nothing added" in said.reason
 
 
-def test_too_few_points_leave_the_prediction(mapper):
+def test_too_few_points_leave_the_prediction(mapper: PointMapper) -> None:
     mapper.update(PairedScan(scan_of(np.array([(5.0, 0.0), (0.0, 8.0), (-3.0, -3.0)])), Pose2()))
     said = mapper.update(PairedScan(scan_of(np.array([(5.0, 0.0), (0.0, 8.0)])), Pose2(1.0, 0.0, 0.0)))
     assert said.status is Status.NO_RETURNS
@@ -61,7 +67,7 @@ def test_too_few_points_leave_the_prediction(mapper):
     assert mapper.grid().occupied().sum() == 3
 
 
-def test_the_reports_experiment_is_bettered():
+def test_the_reports_experiment_is_bettered() -> None:
     """E4: range 60 m, 0.2 m/s and 1 deg of noise; [P]: 0.223 m, 0.333 m, 0.0356 rad with Harmony Search."""
     sensor = replace(preset("paper").sensor, range_max=60.0)
     events, truth = drive("paper", seed=1, sensor=sensor, odometry=SteeringNoise(0.2, np.radians(1.0)))
@@ -80,6 +86,6 @@ def test_the_reports_experiment_is_bettered():
 
 
 @pytest.mark.parametrize("wrong", [{"sigma": 0.0}, {"max_distance": 1.0}, {"min_points": 0}])
-def test_parameters_out_of_range_are_named(wrong):
+def test_parameters_out_of_range_are_named(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         PointMapperParameters(**wrong)

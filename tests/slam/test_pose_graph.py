@@ -1,3 +1,7 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
@@ -6,28 +10,33 @@ from hsloc.model.pose2 import compose_poses, relative_poses
 from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
 from hsloc.slam.sparse_solver import BlockSystem
 
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
 TIGHT = np.diag((1e4, 1e4, 1e5))
 
 
-def circle(n=40, radius=5.0):
+def circle(n: int = 40, radius: float = 5.0) -> NDArray[np.float64]:
     angle = 2 * np.pi * np.arange(n) / n
     return np.column_stack((radius * np.cos(angle), radius * np.sin(angle), angle + np.pi / 2))
 
 
-def edges_of(poses, pairs, scale=np.inf):
-    pairs = np.array(pairs)
+def edges_of(poses: NDArray[np.float64], links: list[tuple[int, int]], scale: float = np.inf) -> Edges:
+    pairs = np.array(links, dtype=np.int64)
     measured = relative_poses(poses[pairs[:, 0]], poses[pairs[:, 1]])
     return Edges(pairs, measured, np.broadcast_to(TIGHT, (len(pairs), 3, 3)).copy(), np.full(len(pairs), scale))
 
 
-def dead_reckoned(true, edges):
+def dead_reckoned(true: NDArray[np.float64], edges: Edges) -> NDArray[np.float64]:
     poses = [true[0]]
     for step in edges.measured:
         poses.append(compose_poses(poses[-1], step)[0])
     return np.array(poses)
 
 
-def test_a_sparse_system_is_that_of_its_dense_matrix():
+def test_a_sparse_system_is_that_of_its_dense_matrix() -> None:
     random = np.random.default_rng(0)
     rows, columns = np.array([0, 1, 3, 0, 0]), np.array([1, 2, 0, 3, 1])
     off = random.normal(size=(5, 3, 3))
@@ -43,7 +52,7 @@ def test_a_sparse_system_is_that_of_its_dense_matrix():
     np.testing.assert_allclose(got.reshape(-1), np.linalg.solve(dense, right.reshape(-1)), rtol=1e-9)
 
 
-def test_a_loop_takes_the_drift_out():
+def test_a_loop_takes_the_drift_out() -> None:
     true = circle()
     steps = edges_of(true, [(k, k + 1) for k in range(39)])
     steps.measured[:] += np.random.default_rng(1).normal(0, (0.02, 0.02, 0.01), steps.measured.shape)
@@ -55,7 +64,7 @@ def test_a_loop_takes_the_drift_out():
     np.testing.assert_allclose(closed[0], true[0], atol=1e-6)
 
 
-def test_a_wrong_loop_with_a_robust_weight_is_harmless():
+def test_a_wrong_loop_with_a_robust_weight_is_harmless() -> None:
     true = circle()
     steps = edges_of(true, [(k, k + 1) for k in range(39)])
     right = edges_of(true, [(39, 0), (30, 1)], scale=1.0)
@@ -67,12 +76,12 @@ def test_a_wrong_loop_with_a_robust_weight_is_harmless():
     assert chi[0] > 50.0
 
 
-def test_without_edges_nothing_moves():
+def test_without_edges_nothing_moves() -> None:
     poses = circle(5)
     np.testing.assert_array_equal(solve_edges(poses, Edges.none()), poses)
 
 
-def test_g2o_is_read_as_it_was_written(tmp_path):
+def test_g2o_is_read_as_it_was_written(tmp_path: Path) -> None:
     true = circle(7)
     graph = PoseGraph(np.arange(7), true, edges_of(true, [(k, k + 1) for k in range(6)] + [(6, 0)]))
     graph.write_g2o(tmp_path / "graph.g2o")
@@ -93,14 +102,14 @@ def test_g2o_is_read_as_it_was_written(tmp_path):
         ("hello\n", "no VERTEX_SE2"),
     ],
 )
-def test_a_damaged_g2o_is_named(tmp_path, text, message):
+def test_a_damaged_g2o_is_named(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "bad.g2o"
     path.write_text(text)
     with pytest.raises(LogFormatError, match=message):
         PoseGraph.read_g2o(path)
 
 
-def test_g2o_that_cannot_be_read_or_written(tmp_path):
+def test_g2o_that_cannot_be_read_or_written(tmp_path: Path) -> None:
     with pytest.raises(LogFormatError, match=r"none\.g2o"):
         PoseGraph.read_g2o(tmp_path / "none.g2o")
     with pytest.raises(OutputError, match=r"x\.g2o"):

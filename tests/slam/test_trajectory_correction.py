@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import numpy as np
 
 from hsloc.model import Pose2
@@ -5,7 +7,7 @@ from hsloc.model.pose2 import compose_poses
 from hsloc.slam.trajectory_correction import EventLog
 
 
-def test_a_shift_of_all_keyscans_shifts_everything():
+def test_a_shift_of_all_keyscans_shifts_everything() -> None:
     track = EventLog(0.3)
     for k in range(10):
         track.add(Pose2(0.1 * k, 0.0, 0.0), is_scan=False)
@@ -17,7 +19,7 @@ def test_a_shift_of_all_keyscans_shifts_everything():
     np.testing.assert_allclose(scans, moved, atol=1e-12)
 
 
-def test_what_two_keyscans_disagree_in_is_shared_along_the_way():
+def test_what_two_keyscans_disagree_in_is_shared_along_the_way() -> None:
     track = EventLog(0.3)
     track.add(Pose2(), is_scan=True, is_key=True)
     for x in (0.25, 0.5, 0.5, 1.0):
@@ -27,7 +29,7 @@ def test_what_two_keyscans_disagree_in_is_shared_along_the_way():
     np.testing.assert_allclose(odometry[:, 0], (0.3, 0.6, 0.6, 1.2), atol=1e-9)
 
 
-def test_before_the_first_and_after_the_last_keyscan_odometry_goes_on():
+def test_before_the_first_and_after_the_last_keyscan_odometry_goes_on() -> None:
     track = EventLog(0.3)
     track.add(Pose2(-1.0), is_scan=False)
     track.add(Pose2(0.0), is_scan=True, is_key=True)
@@ -37,7 +39,7 @@ def test_before_the_first_and_after_the_last_keyscan_odometry_goes_on():
     assert scans.shape == (1, 3)
 
 
-def test_without_keyscans_there_is_only_odometry():
+def test_without_keyscans_there_is_only_odometry() -> None:
     track = EventLog(0.3)
     track.add(Pose2(1.0), is_scan=False)
     track.add(Pose2(2.0), is_scan=True)

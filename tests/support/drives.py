@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hsloc.model import PairedScan, Trajectory, Truth
+from hsloc.model import Odometry, PairedScan, Trajectory, Truth
 from hsloc.replay.engine import pair
 from hsloc.simulation.presets import preset
 from hsloc.simulation.simulator import events
 from hsloc.simulation.world_files import load_world
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-def drive(scenario, **changes):
+
+def drive(scenario: str, **changes: Any) -> tuple[list[Odometry | PairedScan], Trajectory]:
     """Events of a drive as the mapper gets them, and the truth."""
     setting = replace(preset(scenario), **changes)
     told = list(pair(events(setting, load_world(setting.world, None))))
@@ -21,7 +25,7 @@ def drive(scenario, **changes):
     return [event for event in told if not isinstance(event, Truth)], truth
 
 
-def ape_rmse(events, poses, truth):
+def ape_rmse(events: list[Odometry | PairedScan], poses: NDArray[np.float64], truth: Trajectory) -> float:
     """RMSE (m) of the poses at the scans, after rotation and translation."""
     stamps = np.array([event.scan.stamp_ns for event in events if isinstance(event, PairedScan)])
     known = (stamps >= truth.stamps_ns[0]) & (stamps <= truth.stamps_ns[-1])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from hsloc.model import OccupancyGrid, Pose2, ScanDiagnostics, Trajectory, wrap_angles
@@ -10,7 +12,9 @@ from hsloc.model.pose2 import relative_poses
 START_NS = 1_700_000_000_123_456_789
 
 
-def make_path(rng, n, *, period_ns=20_000_000, start_ns=START_NS, step=0.05, jitter_ns=0):
+def make_path(
+    rng: Any, n: Any, *, period_ns: int = 20_000_000, start_ns: Any = START_NS, step: float = 0.05, jitter_ns: int = 0
+) -> Any:
     """A wandering robot: n poses, a smooth path with turns through +-pi."""
     turns = np.cumsum(rng.normal(0.0, 0.02, n)) * 0.3
     theta = rng.uniform(-3.0, 3.0) + np.cumsum(turns)
@@ -22,7 +26,9 @@ def make_path(rng, n, *, period_ns=20_000_000, start_ns=START_NS, step=0.05, jit
     return Trajectory(stamps, np.column_stack((xy + rng.uniform(-5, 5, 2), wrap_angles(theta))))
 
 
-def disturb(rng, path, *, sigma=0.03, sigma_theta=0.01, every=1, shift_ns=0):
+def disturb(
+    rng: Any, path: Any, *, sigma: float = 0.03, sigma_theta: float = 0.01, every: int = 1, shift_ns: int = 0
+) -> Any:
     """The same path with noise, seen every so many poses and a little later."""
     poses = path.poses[::every].copy()
     poses[:, :2] += rng.normal(0.0, sigma, (len(poses), 2))
@@ -30,7 +36,9 @@ def disturb(rng, path, *, sigma=0.03, sigma_theta=0.01, every=1, shift_ns=0):
     return Trajectory(path.stamps_ns[::every] + shift_ns, poses)
 
 
-def office(rng, *, width_m=24.0, height_m=14.0, resolution=0.05, noise=True):
+def office(
+    rng: Any, *, width_m: float = 24.0, height_m: float = 14.0, resolution: float = 0.05, noise: bool = True
+) -> Any:
     """A map of rooms along a corridor, as a mapper would leave it: unknown outside, frayed where it saw little."""
     rows, columns = round(height_m / resolution), round(width_m / resolution)
     cells = np.full((rows + 40, columns + 40), -1, dtype=np.int8)
@@ -38,11 +46,13 @@ def office(rng, *, width_m=24.0, height_m=14.0, resolution=0.05, noise=True):
     inside[:] = 0
     low, high = round(rows * 0.4), round(rows * 0.6)
 
-    def wall(r0, r1, c0, c1):
+    def wall(r0: int, r1: int, c0: int, c1: int) -> None:
         inside[max(r0, 0) : r1 + 1, max(c0, 0) : c1 + 1] = 100
 
-    wall(0, 1, 0, columns), wall(rows - 2, rows, 0, columns), wall(0, rows, 0, 1), wall(0, rows, columns - 2, columns)
-    wall(low, low + 1, 0, columns), wall(high, high + 1, 0, columns)
+    for r0, r1 in ((0, 1), (rows - 2, rows), (low, low + 1), (high, high + 1)):
+        wall(r0, r1, 0, columns)
+    wall(0, rows, 0, 1)
+    wall(0, rows, columns - 2, columns)
     rooms = max(round(width_m / 5.0), 1)
     door = round(1.0 / resolution)
     for room in range(rooms):
@@ -62,7 +72,7 @@ def office(rng, *, width_m=24.0, height_m=14.0, resolution=0.05, noise=True):
     return OccupancyGrid(cells, resolution, Pose2(-width_m / 2 - 1.0, -height_m / 2 - 1.0, 0.0))
 
 
-def drive(waypoints, *, speed=0.6, rate_hz=50.0, start_ns=START_NS):
+def drive(waypoints: Any, *, speed: float = 0.6, rate_hz: float = 50.0, start_ns: Any = START_NS) -> Any:
     """A path through waypoints with rounded corners."""
     corners = np.array(waypoints, dtype=float)
     ways = np.concatenate(((0.0,), np.cumsum(np.hypot(*np.diff(corners, axis=0).T))))
@@ -78,7 +88,7 @@ def drive(waypoints, *, speed=0.6, rate_hz=50.0, start_ns=START_NS):
     return Trajectory(stamps, np.column_stack((xy, wrap_angles(theta))))
 
 
-def odometry_of(rng, path, *, drift=0.02):
+def odometry_of(rng: Any, path: Any, *, drift: float = 0.02) -> Any:
     """What the wheels say: each step with a noise and a bias, from the origin."""
     deltas = relative_poses(path.poses[:-1], path.poses[1:])
     deltas[:, 0] *= 1.0 + drift * 0.5
@@ -90,7 +100,7 @@ def odometry_of(rng, path, *, drift=0.02):
     return Trajectory(path.stamps_ns, np.array([pose.to_array() for pose in poses]))
 
 
-def estimate_of(rng, path, *, sigma=0.008):
+def estimate_of(rng: Any, path: Any, *, sigma: float = 0.008) -> Any:
     """An estimate whose error wanders smoothly, as that of a localiser does."""
     n = len(path)
     knots = max(n // 40, 4)
@@ -102,7 +112,7 @@ def estimate_of(rng, path, *, sigma=0.008):
     return Trajectory(path.stamps_ns, poses)
 
 
-def diagnostics_of(rng, path, *, every=5, rejected=0.01, lost=()):
+def diagnostics_of(rng: Any, path: Any, *, every: int = 5, rejected: float = 0.01, lost: Any = ()) -> Any:
     """Scans along a path: mostly matched, some refused, some passed over, and lost in the given spans (s)."""
     stamps = path.stamps_ns[::every]
     n = len(stamps)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import struct
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,10 +14,10 @@ from hsloc.model import Odometry, Pose2, Scan, Truth
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from pathlib import Path
 
     from hsloc.model import Event
 
-DATA = Path(os.environ.get("HSLOC_DATA", Path(__file__).parents[3] / "shared" / "data"))
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 MOUNTING = Pose2(0.2, 0.0, 0.5)

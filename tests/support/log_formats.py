@@ -268,7 +268,7 @@ def descriptors() -> descriptor_pb2.FileDescriptorSet:
         message = file.message_type.add(name=name)
         for field, number, kind, repeated in fields:
             item = message.field.add(name=field, number=number, label=3 if repeated else 1)
-            item.type = MESSAGE if isinstance(kind, str) else kind  # type: ignore[assignment]
+            item.type = MESSAGE if isinstance(kind, str) else kind
             if isinstance(kind, str):
                 item.type_name = f".{kind}"
     timestamp = descriptor_pb2.FileDescriptorProto.FromString(timestamp_pb2.DESCRIPTOR.serialized_pb)

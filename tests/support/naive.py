@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from math import cos, floor, sin
+from typing import Any
 
 import numpy as np
 
 from hsloc.model import OccupancyGrid, Pose2
 
 
-def bilinear(scores, u, v):
+def bilinear(scores: Any, u: Any, v: Any) -> Any:
     """Score at (u, v) in cells, bilinear between the nodes of `scores` (h, w); 0 outside."""
     height, width = scores.shape
     if not (0 <= u < width - 1 and 0 <= v < height - 1):
@@ -24,7 +25,7 @@ def bilinear(scores, u, v):
     )
 
 
-def score_sum(scores, points, x, y, theta):
+def score_sum(scores: Any, points: Any, x: Any, y: Any, theta: Any) -> Any:
     """Sum of the bilinear scores of points (n, 2) moved by a pose, all in cells."""
     total = 0.0
     scores = np.asarray(scores, dtype=np.float64)
@@ -33,13 +34,13 @@ def score_sum(scores, points, x, y, theta):
     return total
 
 
-def distance_to_nearest(cells, row, column):
+def distance_to_nearest(cells: Any, row: Any, column: Any) -> Any:
     """Distance in cells from a cell's centre to the nearest occupied cell's centre, by looking at all of them."""
     rows, columns = np.nonzero(cells)
     return float(np.hypot(rows - row, columns - column).min())
 
 
-def room(resolution=0.05, width=160, height=120):
+def room(resolution: float = 0.05, width: int = 160, height: int = 120) -> Any:
     """A room with one inner wall; the walls run through the centres of cells. Returns (grid, wall segments (n, 4))."""
     cells = np.zeros((height, width), dtype=np.int8)
     cells[5, 5:-5] = cells[-6, 5:-5] = 100
@@ -53,7 +54,7 @@ def room(resolution=0.05, width=160, height=120):
     return grid, np.array(walls)
 
 
-def cast(walls, x, y, angle):
+def cast(walls: Any, x: Any, y: Any, angle: Any) -> Any:
     """Distance along a ray to the nearest wall segment; inf if it meets none."""
     best = np.inf
     dx, dy = cos(angle), sin(angle)
@@ -69,7 +70,7 @@ def cast(walls, x, y, angle):
     return best
 
 
-def scan_points(walls, pose, beams=180):
+def scan_points(walls: Any, pose: Any, beams: int = 180) -> Any:
     """End points, seen from the pose, of beams all around; shape (n, 2)."""
     angles = np.linspace(-np.pi, np.pi, beams, endpoint=False)
     ranges = np.array([cast(walls, pose.x, pose.y, pose.theta + angle) for angle in angles])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 
-def cast_rays(origins, directions, segments, circles):
+def cast_rays(origins: Any, directions: Any, segments: Any, circles: Any) -> Any:
     distances = np.full(len(origins), np.inf)
     for i, (origin, direction) in enumerate(zip(origins, directions, strict=True)):
         hits = [np.inf]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hsloc.evaluation.error_metrics import ErrorMetrics
 from hsloc.model.verdict import Verdict
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def sample_metrics(
-    comparison: Comparison | None = None, diagnostics: ScanDiagnostics | None = None, **changes: object
+    comparison: Comparison | None = None, diagnostics: ScanDiagnostics | None = None, **changes: Any
 ) -> RunMetrics:
     """On the map of a log; `changes` are fields of RunMetrics."""
     status = Counter(() if diagnostics is None else (str(each) for each in diagnostics.status))

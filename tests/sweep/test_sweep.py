@@ -12,9 +12,10 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from paths import RECORDINGS
 
 import hsloc.sweep.runs as sweeping
 from hsloc.cli.main import main
@@ -22,10 +23,13 @@ from hsloc.config import Config
 from hsloc.log import ReadOptions
 from hsloc.run_metrics import RunMetrics
 from hsloc.sweep.process_pool import sweep_in_processes
-from hsloc.sweep.runs import DONE, FAILED, SKIPPED, plan, run_key, sweep
+from hsloc.sweep.runs import DONE, FAILED, SKIPPED, Outcome, SweepRun, plan, run_key, sweep
 from hsloc.sweep.table import COLUMNS, as_csv, as_json, as_text
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
 OFFICE, HALL = RECORDINGS / "office.mcap", RECORDINGS / "hall.mcap"
 SHORT = ReadOptions(end_s=3.0)
 DEFAULT = {"default": Config()}
@@ -34,20 +38,20 @@ DEFAULT = {"default": Config()}
 class Bomb:
     """Ends the process that unpickles it, as a defect in compiled code does."""
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[int]]:
         return os._exit, (3,)
 
 
-def sweep_in_threads(runs, folder, **options):
+def sweep_in_threads(runs: list[SweepRun], folder: Path, **options: Callable[..., Any]) -> list[Outcome]:
     with ThreadPoolExecutor(2) as executor:
         return sweep(runs, folder, executor, **options)
 
 
-def states(outcomes):
+def states(outcomes: list[Outcome]) -> list[str]:
     return [outcome.state for outcome in outcomes]
 
 
-def test_a_plan_is_all_combinations_with_names_of_their_own():
+def test_a_plan_is_all_combinations_with_names_of_their_own() -> None:
     configs = {"default": Config(), "icp": Config(matcher="icp")}
     runs = plan([OFFICE, [OFFICE, HALL], HALL], configs, range(2), read=SHORT)
     names = [item.name for item in runs]
@@ -59,9 +63,9 @@ def test_a_plan_is_all_combinations_with_names_of_their_own():
     assert runs[3].spec.config.matcher == "icp"
 
 
-def test_finished_runs_are_known_again_and_others_are_not(tmp_path):
+def test_finished_runs_are_known_again_and_others_are_not(tmp_path: Path) -> None:
     runs = plan([OFFICE, HALL], DEFAULT, read=SHORT)
-    seen = []
+    seen: list[Any] = []
     first = sweep_in_threads(runs, tmp_path, progress=seen.append)
     assert states(first) == [DONE, DONE]
     assert {outcome.run.name for outcome in seen} == {item.name for item in runs}
@@ -89,13 +93,13 @@ def test_finished_runs_are_known_again_and_others_are_not(tmp_path):
     ],
     ids=lambda changes: next(iter(changes)),
 )
-def test_whatever_decides_a_run_is_in_its_key(changes):
+def test_whatever_decides_a_run_is_in_its_key(changes: dict[str, Any]) -> None:
     (item,) = plan([OFFICE], DEFAULT, read=SHORT)
     assert run_key(item.spec) == run_key(replace(item.spec))
     assert run_key(replace(item.spec, **changes)) != run_key(item.spec)
 
 
-def test_the_bytes_of_log_and_map_are_in_the_key(tmp_path):
+def test_the_bytes_of_log_and_map_are_in_the_key(tmp_path: Path) -> None:
     log, image, yaml = tmp_path / "run.mcap", tmp_path / "map.pgm", tmp_path / "map.yaml"
     log.write_bytes(b"one")
     image.write_bytes(b"P5")
@@ -108,7 +112,7 @@ def test_the_bytes_of_log_and_map_are_in_the_key(tmp_path):
     assert len(set(keys)) == 4
 
 
-def test_what_goes_wrong_is_a_row(tmp_path, monkeypatch):
+def test_what_goes_wrong_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "broken.mcap").write_bytes(b"garbage" * 99)
     (tmp_path / "out" / "hall-default-seed0").mkdir(parents=True)
     (tmp_path / "out" / "hall-default-seed0" / "thesis.tex").write_text("do not lose me")
@@ -120,7 +124,7 @@ def test_what_goes_wrong_is_a_row(tmp_path, monkeypatch):
     assert "exists already" in outcomes[2].error
     assert (tmp_path / "out" / "hall-default-seed0" / "thesis.tex").exists()
 
-    def defect(spec, progress=None):
+    def defect(spec: Any, progress: Any = None) -> None:
         raise ZeroDivisionError("a defect of ours")
 
     monkeypatch.setattr(sweeping, "run", defect)
@@ -130,10 +134,10 @@ def test_what_goes_wrong_is_a_row(tmp_path, monkeypatch):
     assert "defect" in (tmp_path / "out" / "office-default-seed7.error.txt").read_text()
 
 
-def test_a_run_that_ends_its_process_ends_no_other(tmp_path):
+def test_a_run_that_ends_its_process_ends_no_other(tmp_path: Path) -> None:
     runs = plan([OFFICE], DEFAULT, range(3), read=SHORT)
-    runs[1] = replace(runs[1], spec=replace(runs[1].spec, labels=(Bomb(),)))
-    told = []
+    runs[1] = replace(runs[1], spec=replace(runs[1].spec, labels=(Bomb(),)))  # type: ignore[arg-type]
+    told: list[Any] = []
     outcomes = sweep_in_processes(runs, tmp_path, 2, told.append)
     assert states(outcomes) == [DONE, FAILED, DONE]
     assert outcomes[1].error.startswith("the process ended: ")
@@ -141,7 +145,7 @@ def test_a_run_that_ends_its_process_ends_no_other(tmp_path):
     assert "NUMBA_NUM_THREADS" not in os.environ
 
 
-def test_the_table_in_three_forms(tmp_path):
+def test_the_table_in_three_forms(tmp_path: Path) -> None:
     outcomes = sweep_in_threads(plan([OFFICE, tmp_path / "missing.mcap"], DEFAULT, read=SHORT), tmp_path)
     good, bad = json.loads(as_json(outcomes))
     assert tuple(good) == COLUMNS
@@ -159,21 +163,21 @@ def test_the_table_in_three_forms(tmp_path):
     assert lines[-1].startswith("missing-default-seed0: ")
 
 
-def command(capsys, *argv):
+def command(capsys: pytest.CaptureFixture[str], *argv: Path | str) -> tuple[int, str, str]:
     code = main(["sweep", *(str(word) for word in argv)])
     printed = capsys.readouterr()
     return code, printed.out, printed.err
 
 
-def test_the_command_varies_what_it_is_told_to(tmp_path, capsys):
+def test_the_command_varies_what_it_is_told_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = [OFFICE, "--out", tmp_path, "--end", "1.5", "--seeds", "5", "--vary", "hide.budget=100,200", "--json"]
-    code, out, err = command(capsys, *arguments)
+    code, out, err = command(capsys, *arguments)  # type: ignore[arg-type]
     assert (code, err) == (0, "")
     names = [row["run"] for row in json.loads(out)]
     assert names == [f"office-hide.budget={n}-seed5" for n in (100, 200)]
     assert "budget: 200" in (tmp_path / names[1] / "config.yaml").read_text()
     assert json.loads((tmp_path / "sweep.json").read_text()) == json.loads(out)
-    code, out, _ = command(capsys, *arguments[:-1], "--csv")
+    code, out, _ = command(capsys, *arguments[:-1], "--csv")  # type: ignore[arg-type]
     assert (code, out) == (0, (tmp_path / "sweep.csv").read_text())
     assert {row["state"] for row in csv.DictReader(io.StringIO(out))} == {"skipped"}
     code, out, err = command(capsys, OFFICE, tmp_path / "missing.mcap", "--out", tmp_path, "--end", "3")
@@ -193,9 +197,11 @@ def test_the_command_varies_what_it_is_told_to(tmp_path, capsys):
         (["--config", "nowhere.yaml"], 1, "nowhere.yaml: cannot be read"),
     ],
 )
-def test_mistakes_are_one_line(tmp_path, capsys, words, code, expected):
+def test_mistakes_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, expected: str
+) -> None:
     try:
-        status = main(["sweep", str(OFFICE), "--out", str(tmp_path / "out"), *words])
+        status: object = main(["sweep", str(OFFICE), "--out", str(tmp_path / "out"), *words])
     except SystemExit as stop:
         status = stop.code
     assert status == code
@@ -203,7 +209,7 @@ def test_mistakes_are_one_line(tmp_path, capsys, words, code, expected):
     assert not (tmp_path / "out").exists()
 
 
-def test_interrupted_sweeps_keep_what_is_finished(tmp_path, capsys):
+def test_interrupted_sweeps_keep_what_is_finished(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = [OFFICE, "--out", tmp_path / "out", "--seeds", "0-30", "--end", "3"]
     process = subprocess.Popen(
         [sys.executable, "-m", "hsloc.cli.main", "sweep", *map(str, words)],
@@ -227,7 +233,7 @@ def test_interrupted_sweeps_keep_what_is_finished(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("after_s", [1.2, 2.2, 3.5])
-def test_an_interrupt_ends_a_sweep_with_one_line(tmp_path, after_s):
+def test_an_interrupt_ends_a_sweep_with_one_line(tmp_path: Path, after_s: Any) -> None:
     """Workers that were still importing ended in tracebacks of 60 to 97 lines."""
     command = [sys.executable, "-m", "hsloc.cli.main", "sweep", str(OFFICE), str(HALL), "--seeds", "0-9", "--jobs", "2"]
     process = subprocess.Popen(

@@ -10,10 +10,11 @@ import os
 import subprocess
 import sys
 from functools import cache
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from paths import RECORDINGS
 
 from hsloc.evaluation import evaluate, read_tum
 from hsloc.export.results_folder import write_results
@@ -21,7 +22,8 @@ from hsloc.model import Status, wrap_angles
 from hsloc.replay.run import Result, run
 from hsloc.request import RunRequest
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 @cache
@@ -39,7 +41,7 @@ def errors(found: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("name", ["office", "corridor_loop", "hall"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_with_a_given_start_every_pose_is_right(name, seed):
+def test_with_a_given_start_every_pose_is_right(name: str, seed: int) -> None:
     found = result(name, seed)
     seconds, metres, radians = errors(found)
     assert len(seconds) > 1000
@@ -52,7 +54,7 @@ def test_with_a_given_start_every_pose_is_right(name, seed):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_with_an_unknown_start_the_robot_is_found_and_the_way_until_then_is_told(seed):
+def test_with_an_unknown_start_the_robot_is_found_and_the_way_until_then_is_told(seed: int) -> None:
     found = result("office", seed, unknown_start=True)
     status = found.diagnostics.status
     assert status.count(Status.RELOCALISED) == 1
@@ -62,7 +64,7 @@ def test_with_an_unknown_start_the_robot_is_found_and_the_way_until_then_is_told
     assert found.localised.all()
 
 
-def test_nobody_is_sure_before_there_is_reason_to_be():
+def test_nobody_is_sure_before_there_is_reason_to_be() -> None:
     """What was said while searching is not believed: no pose counts as known before the search ended."""
     found = result("corridor_loop", 0, unknown_start=True)
     status = found.diagnostics.status
@@ -73,7 +75,7 @@ def test_nobody_is_sure_before_there_is_reason_to_be():
     assert metres.max() < 0.06
 
 
-def test_a_kidnapped_robot_notices_and_is_found_again():
+def test_a_kidnapped_robot_notices_and_is_found_again() -> None:
     found = result("kidnapped")
     seconds, metres, _ = errors(found)
     assert metres[seconds < 29.9].max() < 0.06
@@ -87,22 +89,22 @@ def test_a_kidnapped_robot_notices_and_is_found_again():
     assert status.count(Status.RELOCALISED) == 1
 
 
-def test_slipping_wheels_and_lost_readings_are_survived():
+def test_slipping_wheels_and_lost_readings_are_survived() -> None:
     seconds, metres, _ = errors(result("slip"))
     slipping = ((seconds > 12) & (seconds < 15)) | ((seconds > 31) & (seconds < 34)) | ((seconds > 48) & (seconds < 51))
     assert metres[~slipping].max() < 0.1
     assert metres.max() < 0.8
 
 
-def test_the_reports_own_set_up_is_localised_better_than_published():
+def test_the_reports_own_set_up_is_localised_better_than_published() -> None:
     found = result("paper")
-    x, y, theta = evaluate(found.trajectory, found.reference).axis_rmse
+    x, y, theta = evaluate(found.trajectory, found.reference).axis_rmse  # type: ignore[arg-type]
     assert x < 0.0447
     assert y < 0.0623
     assert theta < 0.0351
 
 
-def test_the_files_say_what_the_result_says(tmp_path):
+def test_the_files_say_what_the_result_says(tmp_path: Path) -> None:
     found = result("office")
     metrics = write_results(found, tmp_path / "out").metrics
     names = {path.name for path in (tmp_path / "out").iterdir()}
@@ -115,11 +117,11 @@ def test_the_files_say_what_the_result_says(tmp_path):
     assert np.array_equal(written.stamps_ns, found.trajectory.stamps_ns)
     np.testing.assert_allclose(written.poses[:, :2], found.trajectory.poses[:, :2], atol=1e-8)
     assert len(written) == len(found.odometry)
-    assert metrics.errors.ape.trans_part.rmse == evaluate(found.trajectory, found.reference).ape.trans_part.rmse
-    assert metrics.map.residuals.within_15_cm > 0.99
+    assert metrics.errors.ape.trans_part.rmse == evaluate(found.trajectory, found.reference).ape.trans_part.rmse  # type: ignore[arg-type]
+    assert metrics.map.residuals.within_15_cm > 0.99  # type: ignore[operator]
 
 
-def test_the_recording_of_a_run_is_itself_a_log(tmp_path):
+def test_the_recording_of_a_run_is_itself_a_log(tmp_path: Path) -> None:
     """run.mcap reads back: the map, the scans and the odometry are those of the log, map -> base is the trajectory."""
     from hsloc.log import ReadOptions, open_log
     from hsloc.model import Scan, Truth
@@ -135,7 +137,7 @@ def test_the_recording_of_a_run_is_itself_a_log(tmp_path):
 
 
 @pytest.mark.parametrize("threads", ["1", "2"])
-def test_the_same_command_writes_the_same_bytes(tmp_path, threads):
+def test_the_same_command_writes_the_same_bytes(tmp_path: Path, threads: str) -> None:
     found = write_results(result("slip"), tmp_path / "here")
     environment = {**os.environ, "NUMBA_NUM_THREADS": threads}
     command = [sys.executable, "-m", "hsloc.cli.main", "replay", str(RECORDINGS / "slip.mcap"), "-q"]

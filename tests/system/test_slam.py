@@ -2,41 +2,43 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
-from hsloc.evaluation import evaluate, evaluate_relations, read_relations
+from hsloc.evaluation import Statistics, evaluate, evaluate_relations, read_relations
 from hsloc.evaluation.alignment import umeyama
 from hsloc.export.results_folder import write_results
 from hsloc.log import LogWriter, ReadOptions, open_log
 from hsloc.maps import load_map
 from hsloc.model import Scan
-from hsloc.replay.run import run
+from hsloc.replay.run import Result, run
 from hsloc.request import RunRequest
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
-def ape(found):
-    return evaluate(found.trajectory, found.reference, alignment="se2").ape.trans_part
+def ape(found: Result) -> Statistics:
+    return evaluate(found.trajectory, found.reference, alignment="se2").ape.trans_part  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", ["office", "corridor_loop"])
-def test_a_map_is_drawn_and_the_way_is_right(tmp_path, name):
+def test_a_map_is_drawn_and_the_way_is_right(tmp_path: Path, name: str) -> None:
     found = run(RunRequest(logs=(RECORDINGS / f"{name}.mcap",), mode="slam"))
     assert ape(found).rmse < 0.03
     metrics = write_results(found, tmp_path / "out").metrics
     assert metrics.run.mode == "slam"
     assert metrics.map.comparison.precision > 0.95
-    assert metrics.map.residuals.within_15_cm > 0.95
+    assert metrics.map.residuals.within_15_cm > 0.95  # type: ignore[operator]
     assert np.array_equal(load_map(tmp_path / "out" / "map.yaml").cells == 100, found.grid.occupied())
     assert (tmp_path / "out" / "graph.g2o").stat().st_size > 1000
 
 
-def test_a_drawn_map_is_a_map_to_localise_in(tmp_path):
+def test_a_drawn_map_is_a_map_to_localise_in(tmp_path: Path) -> None:
     drawn = run(RunRequest(logs=(RECORDINGS / "office.mcap",), mode="slam"))
     write_results(drawn, tmp_path / "out")
     spec = RunRequest(logs=(RECORDINGS / "office.mcap",), map_path=tmp_path / "out" / "map.yaml", unknown_start=True)
@@ -45,14 +47,16 @@ def test_a_drawn_map_is_a_map_to_localise_in(tmp_path):
     assert found.localised.all()
 
 
-def test_without_odometry_the_scans_alone_must_do():
+def test_without_odometry_the_scans_alone_must_do() -> None:
     found = run(RunRequest(logs=(RECORDINGS / "office.mcap",), mode="slam", no_odometry=True))
     assert len(found.odometry) == 0
     assert len(found.trajectory) == len(found.diagnostics)
     assert ape(found).rmse < 0.03
 
 
-def test_a_log_that_has_no_odometry_at_all_is_mapped_and_written(tmp_path, capsys):
+def test_a_log_that_has_no_odometry_at_all_is_mapped_and_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     bare = tmp_path / "bare.mcap"
     with LogWriter(bare) as writer:
         for event in open_log(RECORDINGS / "office.mcap", ReadOptions(end_s=5.0)).events():
@@ -68,17 +72,18 @@ def test_a_log_that_has_no_odometry_at_all_is_mapped_and_written(tmp_path, capsy
 
 
 @pytest.mark.data
-def test_intel_is_mapped_as_well_as_by_the_best(data: Path):
+def test_intel_is_mapped_better_than_published(data: Path) -> None:
     folder = data / "intel"
     found = run(RunRequest(logs=(folder / "intel.clf.gz",)))
     result = evaluate_relations(found.trajectory, read_relations(folder / "intel.relations"))
     assert result.matched == 2984
-    assert result.statistics.trans_part.mean <= 0.033
-    assert result.statistics.angle_deg.mean <= 0.8
+    # iris_lama: 0.0331 m, 0.83 deg; Cartographer, with all of the scans: 0.0229 m, 0.45 deg.
+    assert result.statistics.trans_part.mean < 0.0229
+    assert result.statistics.angle_deg.mean < 0.65
 
 
 @pytest.mark.data
-def test_aces_closes_its_loop(data: Path):
+def test_aces_closes_its_loop(data: Path) -> None:
     folder = data / "aces"
     found = run(RunRequest(logs=(folder / "aces.clf.gz",)))
     reference = np.loadtxt(folder / "aces.rbpf.txt")

@@ -13,7 +13,7 @@ from hsloc.log.checks.findings import NANOSECONDS, Finding, Findings, Intervals,
 from hsloc.log.checks.topics import OdometryCheck, ScanCheck, TopicCheck
 from hsloc.log.checks.transforms import TransformCheck
 from hsloc.log.messages.decode import OdometryMessage, ScanMessage
-from hsloc.log.session.event_builders import MAP_FRAME
+from hsloc.log.session.transform_topics import MAP_FRAME
 from hsloc.warnings import WarningCode
 
 if TYPE_CHECKING:

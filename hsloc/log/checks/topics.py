@@ -15,17 +15,21 @@ if TYPE_CHECKING:
     from hsloc.log.messages.decode import ScanMessage
 
 LATE_WARNING_NS, LATE_ERROR_NS = NANOSECONDS // 10, NANOSECONDS // 2
+"""Delay of a message that is a warning, and an error. Internal, like all limits here: checks of two logs compare."""
 OTHER_CLOCK_NS = 3600 * NANOSECONDS
+"""Difference between stamps and log time above which they are of different clocks."""
 GAP_NS = NANOSECONDS // 10
-"""A gap is longer than this, and than 2.5 usual intervals (lidars turn at 5 to 15 Hz)."""
+"""Minimum duration of a gap, as lidars turn at 5 to 15 Hz."""
 GAP_FACTOR = 2.5
+"""Minimum duration of a gap in usual intervals."""
 LONGEST_SWEEP_S = 2.0
-"""Seconds; a lidar that turns more slowly is an error of the log."""
+"""Maximum duration of a sweep (s); no lidar turns more slowly."""
 MAX_SPEED = 15.0
-"""m/s; odometry that moves faster has jumped."""
+"""Maximum speed (m/s) of a robot; odometry that moves faster has jumped."""
 LEAST_JUMP, LONGEST_JUMP_S = 0.5, 1.0
-"""If it is farther than this (m), within less than this (s)."""
+"""Minimum length (m) and maximum duration (s) of a jump of the odometry."""
 _BEAMS_TOLERATED = 0.1
+"""Ratio by which the number of beams may vary from scan to scan."""
 
 
 class TopicCheck:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from hsloc.log.checks.findings import Findings, Place, Severity
-from hsloc.log.session.event_builders import MAP_FRAME
+from hsloc.log.session.transform_topics import MAP_FRAME
 
 if TYPE_CHECKING:
     from hsloc.log.messages.decode import LinkMessage

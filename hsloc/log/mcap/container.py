@@ -38,21 +38,25 @@ _FEW = 4096
 
 
 class McapContainer:
-    """One MCAP file. Raises LogFormatError where the file cannot be opened, or is no MCAP at all."""
+    """One MCAP file. Raises LogFormatError where the file cannot be opened, or is no MCAP at all.
+
+    `shown` is the name for messages to people, where the file is a copy of another.
+    """
 
     format = "mcap"
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, shown: Path | None = None) -> None:
+        self.path = shown or path
+        self._file = path
         self.warnings: list[RunWarning] = []
         self._unpacked = 0
         try:
             self._size = path.stat().st_size
             with path.open("rb") as stream:
-                self._directory = IndexScan(path, stream, self._size).run()
+                self._directory = IndexScan(self.path, stream, self._size).run()
             self._read_what_the_index_does_not_tell()
         except OSError as error:
-            raise LogFormatError(f"{path}: cannot be read ({error.strerror or error})") from error
+            raise LogFormatError(f"{self.path}: cannot be read ({error.strerror or error})") from error
         self.profile = self._directory.profile
         self.statistics = self._directory.statistics
         self.metadata = self._directory.metadata
@@ -60,12 +64,8 @@ class McapContainer:
         self.channels = {number: self._channel(record) for number, record in sorted(self._directory.channels.items())}
         unknown = self._indexed() - self.channels.keys()
         if unknown:
-            self.warnings.append(
-                RunWarning(
-                    WarningCode.CHANNELS_UNDEFINED,
-                    f"{path}: messages on {len(unknown)} channels without definition are ignored",
-                )
-            )
+            text = f"{self.path}: messages on {len(unknown)} channels without definition are ignored"
+            self.warnings.append(RunWarning(WarningCode.CHANNELS_UNDEFINED, text))
 
     def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
         """As `Container.messages`."""
@@ -80,7 +80,7 @@ class McapContainer:
         last = 0
         self._unpacked = 0
         try:
-            with self.path.open("rb") as stream:
+            with self._file.open("rb") as stream:
                 for index, segment in enumerate(segments):
                     horizon = segments[index + 1].start_ns if index + 1 < len(segments) else 1 << 64
                     found = self._load(stream, segment, chosen, losses)
@@ -175,6 +175,9 @@ class McapContainer:
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and not self._directory.knows(opcode, data, at):
                 self._directory.define(opcode, view[at + prefix_size : following], segment.at, losses)
             at = following
+        low, high = self._directory.plausible_ns
+        if found and not (low <= min(found)[0] and max(found)[0] <= high):
+            found = _with_plausible_times(found, low, high, segment.start_ns, losses)
         if at < end:
             losses.damaged_chunks += 1
             losses.bytes_lost += end - at
@@ -189,7 +192,7 @@ class McapContainer:
         everything = not (self._indexed() <= directory.channels.keys() and schemas <= directory.schemas.keys())
         # What is damaged is counted when it is read for its own sake.
         ignored = Losses()
-        with self.path.open("rb") as stream:
+        with self._file.open("rb") as stream:
             for number, segment in enumerate(directory.segments):
                 if segment.channels is not None and not everything:
                     continue
@@ -215,3 +218,19 @@ class McapContainer:
         for channel, values in times.items():
             self._directory.count_times(channel, np.array(values, dtype=np.uint64))
         return frozenset(times) if times else None
+
+
+def _with_plausible_times(
+    found: list[RawMessage], low: int, high: int, start_ns: int, losses: Losses
+) -> list[RawMessage]:
+    """Messages in the order of the file, those with impossible log times at the time of the one before."""
+    last = next((message[0] for message in found if low <= message[0] <= high), start_ns)
+    repaired = []
+    for message in found:
+        if low <= message[0] <= high:
+            last = message[0]
+        else:
+            losses.log_times_repaired += 1
+            message = (last, *message[1:])
+        repaired.append(message)
+    return repaired

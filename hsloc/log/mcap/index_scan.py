@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 import numpy as np
 
 from hsloc.errors import LogFormatError
+from hsloc.log.container import plausible_times
 from hsloc.log.mcap import records
 from hsloc.log.mcap.records import ChunkHead, Damage, Opcode
 from hsloc.log.summary import Losses, TopicStatistics
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_METADATA = 1000
+"""Maximum number of metadata records that are read. Internal: guards the memory against a hostile file."""
 _LOOSE_BYTES = 1 << 20
 """Messages outside of chunks are taken together up to this size."""
 
@@ -56,6 +58,8 @@ class ChunkIndex:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     segments: list[Segment] = field(default_factory=list)
     losses: Losses = field(default_factory=Losses)
+    plausible_ns: tuple[int, int] = (0, (1 << 63) - 1)
+    """Between which log times messages are believed."""
 
     def knows(self, opcode: int, data: bytes, at: int) -> bool:
         """Whether a schema or channel was defined before: recorders repeat them in every chunk."""
@@ -103,6 +107,7 @@ class IndexScan:
         self.index: dict[int, NDArray[np.uint64]] = {}
         self.index_is_whole = True
         self.chunks_of_summary: list[int] | None = None
+        self._samples: list[int] = []
 
     def run(self) -> ChunkIndex:
         """From the magic to the footer, or as far as it goes."""
@@ -142,8 +147,43 @@ class IndexScan:
             self.losses.truncated_files += 1
             self.losses.bytes_lost += max(self.size - at, 0)
             self.losses.note(f"{path}: ends at byte {self.size} without its footer")
+        self._settle_times()
         self.directory.segments.sort(key=itemgetter(0, 1))
         return self.directory
+
+    def _count(self, by_channel: dict[int, NDArray[np.uint64]]) -> None:
+        """Add the log times of a segment to the statistics, without those that its other messages contradict."""
+        ordered = np.sort(np.concatenate(list(by_channel.values())))
+        if not len(ordered):
+            return
+        # Quartiles, which a few wrong times do not move; of very few messages the one in the middle.
+        quarter = len(ordered) // 4 if len(ordered) > 7 else (len(ordered) - 1) // 2
+        inner = int(ordered[quarter]), int(ordered[-1 - quarter])
+        self._samples += inner
+        low, high = plausible_times(inner)
+        for channel, times in by_channel.items():
+            wrong = (times < max(low, 0)) | (times > high)
+            self.directory.count_times(channel, times[~wrong] if wrong.any() else times)
+            if wrong.any():
+                self.directory.statistics.setdefault(channel, TopicStatistics()).count += int(wrong.sum())
+
+    def _settle_times(self) -> None:
+        """Find out which log times can be believed; start segments by these, and count messages by them."""
+        directory = self.directory
+        if self._samples:
+            low, high = plausible_times(sorted(self._samples))
+            directory.plausible_ns = max(low, 0), high
+        low, high = directory.plausible_ns
+        last = next((s.start_ns for s in directory.segments if low <= s.start_ns <= high), 0)
+        for number, segment in enumerate(directory.segments):
+            if low <= segment.start_ns <= high:
+                last = segment.start_ns
+            else:
+                directory.segments[number] = segment._replace(start_ns=last)
+        for statistics in directory.statistics.values():
+            if statistics.first_ns is not None and statistics.last_ns is not None:
+                statistics.first_ns = min(max(statistics.first_ns, low), high)
+                statistics.last_ns = min(max(statistics.last_ns, low), high)
 
     def _content(self, at: int, length: int, limit: int = records.MAX_RECORD_BYTES) -> bytes:
         if length > limit:
@@ -195,8 +235,7 @@ class IndexScan:
         by_channel: dict[int, list[int]] = {}
         for *_, channel, log_time in self.loose:
             by_channel.setdefault(channel, []).append(log_time)
-        for channel, times in by_channel.items():
-            self.directory.count_times(channel, np.array(times, dtype=np.uint64))
+        self._count({channel: np.array(times, dtype=np.uint64) for channel, times in by_channel.items()})
         self.directory.segments.append(Segment(start, first, last + size - first, None, frozenset(by_channel)))
         self.loose = []
 
@@ -223,8 +262,8 @@ class IndexScan:
         """The chunk's indexes are complete when something else follows."""
         if self.chunk is not None:
             channels = frozenset(self.index) if self.index and self.index_is_whole else None
-            for channel in channels or ():
-                self.directory.count_times(channel, self.index[channel])
+            if channels:
+                self._count({channel: self.index[channel] for channel in channels})
             self.directory.segments.append(self.chunk._replace(channels=channels))
         self.chunk = None
         self.index = {}

@@ -201,6 +201,7 @@ def decompress(head: ChunkHead, data: bytes) -> bytes:
 
 
 _MAX_WINDOW = 1 << 27
+"""Maximum window of zstd (bytes). Internal: guards the memory against a hostile file."""
 
 
 def _unzstd(data: bytes, size: int) -> bytes:

@@ -46,6 +46,8 @@ class PoseColumns(NamedTuple):
     y: NDArray[np.float64]
     theta: list[float]
     covariances: Sequence[NDArray[np.float64] | None]
+    has_headings: bool = True
+    """Whether no quaternion consists of zeros."""
 
 
 def odometry(payloads: Sequence[Payload], *, covariances: bool = True) -> PoseColumns | None:
@@ -94,7 +96,8 @@ def _poses(rows: NDArray[np.void], covariances: Sequence[NDArray[np.float64] | N
     # Not numpy's arctan2, whose last bit depends on the processor.
     theta = list(map(atan2, sines.tolist(), cosines.tolist()))
     stamps = rows["seconds"].astype(np.int64) * NANOSECONDS + rows["nanoseconds"]
-    return PoseColumns(stamps, x, y, theta, covariances)
+    has_headings = bool(((qx != 0.0) | (qy != 0.0) | (qz != 0.0) | (qw != 0.0)).all())
+    return PoseColumns(stamps, x, y, theta, covariances, has_headings)
 
 
 def _covariances(full: NDArray[np.float64]) -> Sequence[NDArray[np.float64] | None]:

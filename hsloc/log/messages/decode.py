@@ -8,6 +8,7 @@ decoders raise `BAD_PAYLOAD` on what they cannot read.
 from __future__ import annotations
 
 from functools import lru_cache
+from math import nan
 from struct import Struct
 from struct import error as StructError
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,7 +27,19 @@ if TYPE_CHECKING:
     Payload = memoryview | bytes
 
 NANOSECONDS = 1_000_000_000
-LITTLE_ENDIAN = b"\x00\x01"
+LITTLE_ENDIAN, BIG_ENDIAN = b"\x00\x01", b"\x00\x00"
+_ALIGNMENTS = {LITTLE_ENDIAN: 8, b"\x00\x07": 4}
+"""Encapsulations that are read by hand, and the widest alignment in them: XCDR2 aligns doubles to four bytes."""
+_ENCAPSULATIONS = {
+    b"\x00\x02": "big-endian PL_CDR (a parameter list)",
+    b"\x00\x03": "PL_CDR (a parameter list)",
+    b"\x00\x06": "big-endian XCDR2",
+    b"\x00\x08": "big-endian delimited XCDR2",
+    b"\x00\x09": "delimited XCDR2",
+    b"\x00\x0a": "big-endian PL_CDR2 (a parameter list)",
+    b"\x00\x0b": "PL_CDR2 (a parameter list)",
+}
+"""Encapsulations that are not read, by the names of the DDS-XTypes standard (7.6.3.1.2)."""
 BAD_PAYLOAD = (StructError, ValueError, IndexError, OverflowError)
 """What decoders raise on a payload that is not what its channel says (UnicodeDecodeError is a ValueError)."""
 
@@ -46,6 +59,7 @@ class ScanMessage(NamedTuple):
     scan_time: float = 0.0
     T_frame_laser: Transform3 | None = None
     """The laser's pose in `frame_id`, which Foxglove's message has and ROS's has not."""
+    angle_max: float = nan
 
 
 class OdometryMessage(NamedTuple):
@@ -89,16 +103,23 @@ class PoseMessage(NamedTuple):
 _STAMP_AND_SIZE = Struct("<iII")
 _SIZE = Struct("<I")
 _SCAN = Struct("<7fI")
+_F4_ONE = Struct("<f")
 _POSE = Struct("<7d")
 POSE_BYTES = _POSE.size
 _F4 = np.dtype("<f4")
 _MAP_INFO = Struct("<fII")
 COVARIANCE_BYTES = 36 * 8
+"""Size of a ROS covariance of 6 x 6 doubles."""
+_ODOMETRY_TAIL = POSE_BYTES + COVARIANCE_BYTES + 6 * 8 + COVARIANCE_BYTES
+_STAMPED_TAILS = (POSE_BYTES, POSE_BYTES + COVARIANCE_BYTES)
+"""Bytes behind the head of an odometry message, and of the stamped poses: they tell XCDR1 from XCDR2."""
 _ZEROS = bytes(COVARIANCE_BYTES)
 PLANE = np.array((0, 1, 5, 6, 7, 11, 30, 31, 35))
+"""Where (x, y, yaw) x (x, y, yaw) lie in the 36 values of a ROS covariance over (x, y, z, roll, pitch, yaw)."""
 _BODY = 4
 """Offsets of CDR count from behind the encapsulation."""
 _MAX_NAME = 4096
+"""Maximum length of a frame's name. Internal: guards the memory against a hostile file."""
 
 
 @lru_cache(maxsize=4096)
@@ -107,16 +128,30 @@ def _name(raw: bytes) -> str:
     return raw.rstrip(b"\0").decode().lstrip("/")
 
 
-def _aligned(at: int, size: int) -> int:
+def aligned(at: int, size: int) -> int:
+    """The next offset that is a multiple of `size` bytes behind the encapsulation."""
     return at + (_BODY - at) % size
 
 
-def _check_encapsulation(data: Payload) -> None:
-    if data[:2] != LITTLE_ENDIAN:
-        raise ValueError("not little-endian CDR")
+def alignment(data: Payload) -> int:
+    """The alignment of doubles in a message; raises ValueError for an encapsulation that is not read."""
+    identifier = bytes(data[:2])
+    found = _ALIGNMENTS.get(identifier)
+    if found is None:
+        name = _ENCAPSULATIONS.get(identifier)
+        raise ValueError(f"encoded as {name}, which is not read" if name else "not little-endian CDR")
+    return found
 
 
-def _header(data: Payload, at: int) -> tuple[int, str, int]:
+def _fits(data: Payload, end: int) -> bool:
+    """Whether a message ends at `end`, but for bytes that fill up a word.
+
+    Some middleware labels its messages as XCDR2 and lays them out as XCDR1 does: their length tells which it is.
+    """
+    return 0 <= len(data) - end < 4
+
+
+def header(data: Payload, at: int) -> tuple[int, str, int]:
     """(stamp, frame_id, offset behind) of a std_msgs/Header."""
     seconds, nanoseconds, size = _STAMP_AND_SIZE.unpack_from(data, at)
     end = at + 12 + size
@@ -125,8 +160,9 @@ def _header(data: Payload, at: int) -> tuple[int, str, int]:
     return seconds * NANOSECONDS + nanoseconds, _name(bytes(data[at + 12 : end])), end
 
 
-def _string(data: Payload, at: int) -> tuple[str, int]:
-    at = _aligned(at, 4)
+def string(data: Payload, at: int) -> tuple[str, int]:
+    """(text, offset behind) of a string; of a frame's name without the leading slash of ROS 1."""
+    at = aligned(at, 4)
     (size,) = _SIZE.unpack_from(data, at)
     end = at + 4 + size
     if size > _MAX_NAME or end > len(data):
@@ -146,10 +182,12 @@ def _floats(data: Payload, at: int, count: int) -> NDArray[np.float32]:
 
 def laser_scan(data: Payload) -> ScanMessage:
     """sensor_msgs/LaserScan from CDR."""
-    _check_encapsulation(data)
-    stamp, frame, at = _header(data, 4)
-    at = _aligned(at, 4)
-    angle_min, _, increment, time_increment, scan_time, range_min, range_max, count = _SCAN.unpack_from(data, at)
+    alignment(data)
+    stamp, frame, at = header(data, 4)
+    at = aligned(at, 4)
+    angle_min, angle_max, increment, time_increment, scan_time, range_min, range_max, count = _SCAN.unpack_from(
+        data, at
+    )
     at += _SCAN.size
     if at + 4 * count > len(data):
         raise ValueError("more ranges than the message holds")
@@ -157,9 +195,37 @@ def laser_scan(data: Payload) -> ScanMessage:
     at += 4 * count
     (count,) = _SIZE.unpack_from(data, at)
     intensities = _floats(data, at + 4, count) if count else None
-    return ScanMessage(
-        stamp, frame, angle_min, increment, time_increment, range_min, range_max, ranges, intensities, scan_time
+    values = (increment, time_increment, range_min, range_max, ranges, intensities, scan_time)
+    return ScanMessage(stamp, frame, angle_min, *values, angle_max=angle_max)
+
+
+def multi_echo_laser_scan(data: Payload) -> ScanMessage:
+    """sensor_msgs/MultiEchoLaserScan from CDR: of each beam the first echo, NaN where it has none."""
+    alignment(data)
+    stamp, frame, at = header(data, 4)
+    at = aligned(at, 4)
+    angle_min, angle_max, increment, time_increment, scan_time, range_min, range_max, count = _SCAN.unpack_from(
+        data, at
     )
+    ranges, at = _first_echoes(data, at + _SCAN.size, count)
+    (count,) = _SIZE.unpack_from(data, at)
+    intensities = _first_echoes(data, at + 4, count)[0] if count else None
+    values = (increment, time_increment, range_min, range_max, ranges, intensities, scan_time)
+    return ScanMessage(stamp, frame, angle_min, *values, angle_max=angle_max)
+
+
+def _first_echoes(data: Payload, at: int, count: int) -> tuple[NDArray[np.float32], int]:
+    if at + 4 * count > len(data):
+        raise ValueError("more echoes than the message holds")
+    echoes = np.full(count, np.nan, dtype=np.float32)
+    for beam in range(count):
+        (size,) = _SIZE.unpack_from(data, at)
+        if at + 4 + 4 * size > len(data):
+            raise ValueError("more echoes than the message holds")
+        if size:
+            (echoes[beam],) = _F4_ONE.unpack_from(data, at + 4)
+        at += 4 + 4 * size
+    return echoes, at
 
 
 @lru_cache(maxsize=64)
@@ -176,10 +242,12 @@ def plane_covariance(raw: bytes) -> NDArray[np.float64] | None:
 
 def _odometry_head(data: Payload) -> tuple[int, str, str, int]:
     """(stamp, frame, child frame, offset of the pose) of a nav_msgs/Odometry."""
-    _check_encapsulation(data)
-    stamp, frame, at = _header(data, 4)
-    child, at = _string(data, at)
-    return stamp, frame, child, _aligned(at, 8)
+    widest = alignment(data)
+    stamp, frame, at = header(data, 4)
+    child, at = string(data, at)
+    if widest == 4 and not _fits(data, aligned(at, 4) + _ODOMETRY_TAIL):
+        widest = 8
+    return stamp, frame, child, aligned(at, widest)
 
 
 def odometry_pose_at(data: Payload) -> int:
@@ -200,39 +268,55 @@ def odometry(data: Payload) -> OdometryMessage:
 
 def transforms(data: Payload) -> list[LinkMessage]:
     """tf2_msgs/TFMessage from CDR."""
-    _check_encapsulation(data)
+    widest = alignment(data)
+    links, end = _links(data, widest)
+    if widest == 4 and not _fits(data, end):
+        links, end = _links(data, 8)
+    if end < 0:
+        raise ValueError("a transform is cut off")
+    return links
+
+
+def _links(data: Payload, widest: int) -> tuple[list[LinkMessage], int]:
+    """The links of a message whose doubles are aligned to `widest` bytes, and where the last of them ends."""
     (count,) = _SIZE.unpack_from(data, 4)
     if count * 76 > len(data):
         raise ValueError("more transforms than the message holds")
-    links = []
+    links: list[LinkMessage] = []
     at = 8
     for _ in range(count):
-        stamp, parent, at = _header(data, _aligned(at, 4))
-        child, at = _string(data, at)
-        at = _aligned(at, 8)
+        stamp, parent, at = header(data, aligned(at, 4))
+        child, at = string(data, at)
+        at = aligned(at, widest)
+        if at + _POSE.size > len(data):
+            return links, -1
         x, y, z, qx, qy, qz, qw = _POSE.unpack_from(data, at)
         at += _POSE.size
         links.append(LinkMessage(stamp, parent, child, Transform3((x, y, z), (qx, qy, qz, qw))))
-    return links
+    return links, at
 
 
 def occupancy_grid(data: Payload) -> GridMessage:
     """nav_msgs/OccupancyGrid from CDR."""
-    _check_encapsulation(data)
-    stamp, frame, at = _header(data, 4)
-    at = _aligned(at, 4) + 8
+    widest = alignment(data)
+    stamp, frame, at = header(data, 4)
+    at = aligned(at, 4) + 8
     resolution, width, height = _MAP_INFO.unpack_from(data, at)
-    at = _aligned(at + _MAP_INFO.size, 8)
+    at += _MAP_INFO.size
+    if widest == 4 and not _fits(data, aligned(at, 4) + POSE_BYTES + 4 + width * height):
+        widest = 8
+    at = aligned(at, widest)
     origin = _pose2(_POSE.unpack_from(data, at))
     at += _POSE.size
     (count,) = _SIZE.unpack_from(data, at)
     if at + 4 + count > len(data):
         raise ValueError("more cells than the message holds")
     cells = np.frombuffer(data, dtype=np.int8, count=count, offset=at + 4).copy()
-    return GridMessage(stamp, frame, _grid(cells, width, height, resolution, origin))
+    return GridMessage(stamp, frame, make_grid(cells, width, height, resolution, origin))
 
 
-def _grid(cells: NDArray[np.int8], width: int, height: int, resolution: float, origin: Pose2) -> OccupancyGrid:
+def make_grid(cells: NDArray[np.int8], width: int, height: int, resolution: float, origin: Pose2) -> OccupancyGrid:
+    """A grid of int8 cells (width * height,), row by row; raises ValueError where they do not fit."""
     if width * height != len(cells) or not len(cells):
         raise ValueError(f"a map of {width} x {height} with {len(cells)} cells")
     if not 0.0 < resolution < 1e6 or not origin.is_finite():
@@ -243,9 +327,11 @@ def _grid(cells: NDArray[np.int8], width: int, height: int, resolution: float, o
 
 def _stamped_head(data: Payload) -> tuple[int, str, int]:
     """(stamp, frame, offset of the pose) of a geometry_msgs/PoseStamped."""
-    _check_encapsulation(data)
-    stamp, frame, at = _header(data, 4)
-    return stamp, frame, _aligned(at, 8)
+    widest = alignment(data)
+    stamp, frame, at = header(data, 4)
+    if widest == 4 and not any(_fits(data, aligned(at, 4) + tail) for tail in _STAMPED_TAILS):
+        widest = 8
+    return stamp, frame, aligned(at, widest)
 
 
 def stamped_pose_at(data: Payload) -> int:
@@ -259,81 +345,12 @@ def pose_stamped(data: Payload) -> PoseMessage:
     return PoseMessage(stamp, frame, _pose2(_POSE.unpack_from(data, at)))
 
 
-# The same from message objects of rosbags.
-
-
-def _object_header(message: Any) -> tuple[int, str]:
-    stamp = message.header.stamp
-    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec), str(message.header.frame_id).lstrip("/")
-
-
-def _object_pose(pose: Any) -> Pose2:
-    p, q = pose.position, pose.orientation
-    return Pose2.from_quaternion(float(p.x), float(p.y), float(q.x), float(q.y), float(q.z), float(q.w))
-
-
-def object_laser_scan(message: Any) -> ScanMessage:
-    """From a message object."""
-    intensities = np.array(message.intensities, dtype=np.float32)
-    return ScanMessage(
-        *_object_header(message),
-        float(message.angle_min),
-        float(message.angle_increment),
-        float(message.time_increment),
-        float(message.range_min),
-        float(message.range_max),
-        np.array(message.ranges, dtype=np.float32),
-        intensities if len(intensities) else None,
-        float(message.scan_time),
-    )
-
-
-def object_odometry(message: Any) -> OdometryMessage:
-    """From a message object."""
-    raw = np.array(message.pose.covariance, dtype="<f8").tobytes()
-    child = str(message.child_frame_id).lstrip("/")
-    pose, q = _object_pose(message.pose.pose), message.pose.pose.orientation
-    quaternion = (float(q.x), float(q.y), float(q.z), float(q.w))
-    return OdometryMessage(*_object_header(message), child, pose, plane_covariance(raw), quaternion)
-
-
-def object_transforms(message: Any) -> list[LinkMessage]:
-    """From a message object."""
-    links = []
-    for item in message.transforms:
-        t, q = item.transform.translation, item.transform.rotation
-        transform = Transform3((float(t.x), float(t.y), float(t.z)), (float(q.x), float(q.y), float(q.z), float(q.w)))
-        links.append(LinkMessage(*_object_header(item), str(item.child_frame_id).lstrip("/"), transform))
-    return links
-
-
-def object_occupancy_grid(message: Any) -> GridMessage:
-    """From a message object."""
-    info = message.info
-    cells = np.array(message.data, dtype=np.int8)
-    grid = _grid(cells, int(info.width), int(info.height), float(info.resolution), _object_pose(info.origin))
-    return GridMessage(*_object_header(message), grid)
-
-
-def object_pose(message: Any) -> PoseMessage:
-    """From a PoseStamped, or a PoseWithCovarianceStamped."""
-    pose = getattr(message.pose, "pose", message.pose)
-    return PoseMessage(*_object_header(message), _object_pose(pose))
-
-
 BY_HAND: dict[str, Callable[[Payload], Any]] = {
     definitions.LASER_SCAN: laser_scan,
+    definitions.MULTI_ECHO_LASER_SCAN: multi_echo_laser_scan,
     definitions.ODOMETRY: odometry,
     definitions.TF_MESSAGE: transforms,
     definitions.OCCUPANCY_GRID: occupancy_grid,
     definitions.POSE_STAMPED: pose_stamped,
     definitions.POSE_WITH_COVARIANCE_STAMPED: pose_stamped,
-}
-FROM_OBJECT: dict[str, Callable[[Any], Any]] = {
-    definitions.LASER_SCAN: object_laser_scan,
-    definitions.ODOMETRY: object_odometry,
-    definitions.TF_MESSAGE: object_transforms,
-    definitions.OCCUPANCY_GRID: object_occupancy_grid,
-    definitions.POSE_STAMPED: object_pose,
-    definitions.POSE_WITH_COVARIANCE_STAMPED: object_pose,
 }

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import LogFormatError
 from hsloc.log.messages import cdr_batch_decode as columns
-from hsloc.log.messages import decode, definitions, foxglove
+from hsloc.log.messages import decode, definitions, foxglove, from_objects, point_cloud, ros_json
 from hsloc.log.messages import definition_compatibility as schema
 from hsloc.log.messages.definitions import long_name
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,6 +23,13 @@ if TYPE_CHECKING:
 
 _ALIASES = {"tf/msg/tfMessage": definitions.TF_MESSAGE} | foxglove.TYPES
 """ROS 1's old name of a type that is otherwise the same, and Foxglove's types."""
+
+BY_HAND = decode.BY_HAND | {definitions.POINT_CLOUD2: point_cloud.point_cloud}
+FROM_OBJECT = from_objects.FROM_OBJECT | {definitions.POINT_CLOUD2: point_cloud.object_point_cloud}
+_ENCODINGS = ("cdr", "ros1", "json")
+_ZSTD = b"\x28\xb5\x2f\xfd"
+"""How a payload begins that rosbag2 compressed by itself (`--compression-mode message`); CDR begins with a zero."""
+_MAX_UNPACKED_BYTES = 256 << 20
 
 
 class Undecodable(Exception):
@@ -37,19 +46,30 @@ def is_decodable(channel: Channel) -> bool:
     """Whether hsloc has a decoder for the channel's type and encoding."""
     if channel.typename.startswith(foxglove.PREFIX):
         return foxglove.is_foxglove(channel)
-    return channel.message_encoding in ("cdr", "ros1") and canonical_type(channel.typename) in decode.BY_HAND
+    return channel.message_encoding in _ENCODINGS and canonical_type(channel.typename) in BY_HAND
 
 
-def decoder_for(channel: Channel) -> Decoder:
+def decoder_for(channel: Channel, warnings: list[RunWarning] | None = None) -> Decoder:
     """A function from payload to one of the tuples of `hsloc.log.messages.decode`; it raises `Undecodable` alone.
 
+    A definition of a standard type that is incomplete is replaced by the standard one, which is added to `warnings`.
     Raises LogFormatError where the channel's definition cannot be used.
     """
     if foxglove.is_foxglove(channel):
-        return _by_foxglove(channel)
+        return _guarded(foxglove.decoder(channel))
     typename = canonical_type(channel.typename)
+    if channel.message_encoding == "json":
+        return _guarded(ros_json.decoder(FROM_OBJECT[typename]))
     if channel.message_encoding == "cdr" and _is_known(channel, typename):
         return _by_hand(channel, typename)
+    if _is_incomplete(channel, typename):
+        if warnings is not None:
+            text = (
+                f"{channel.topic}: the log's definition of {channel.typename} is incomplete; the standard one is used"
+            )
+            warnings.append(RunWarning(WarningCode.DEFINITION_INCOMPLETE, text))
+        channel = dataclasses.replace(channel, schema=b"", schema_encoding="")
+        return _by_hand(channel, typename) if channel.message_encoding == "cdr" else _by_rosbags(channel, typename)
     return _by_rosbags(channel, typename)
 
 
@@ -70,15 +90,24 @@ def _is_known(channel: Channel, typename: str) -> bool:
     return schema.is_known(channel.schema.decode(errors="replace"), typename)
 
 
+def _is_incomplete(channel: Channel, typename: str) -> bool:
+    """Whether a definition says nothing against the standard one: it is empty, a mere name, or lacks its parts."""
+    if channel.schema_encoding not in ("ros2msg", "ros1msg", ""):
+        return False
+    return schema.is_incomplete(channel.schema.decode(errors="replace"), typename, channel.message_encoding == "ros1")
+
+
 def _by_hand(channel: Channel, typename: str) -> Decoder:
-    fast = decode.BY_HAND[typename]
+    fast = BY_HAND[typename]
     slow: list[Decoder] = []
 
     def decoder(data: Payload) -> Any:
         try:
             return fast(data)
         except decode.BAD_PAYLOAD as error:
-            if data[:2] != b"\x00\x00":
+            if data[:4] == _ZSTD:
+                return decoder(_unpacked(data))
+            if data[:2] != decode.BIG_ENDIAN:
                 raise Undecodable(str(error)) from error
         # Big endian: rare enough for the slow way.
         if not slow:
@@ -88,9 +117,21 @@ def _by_hand(channel: Channel, typename: str) -> Decoder:
     return decoder
 
 
-def _by_foxglove(channel: Channel) -> Decoder:
-    read = foxglove.decoder(channel)
+def _unpacked(data: Payload) -> bytes:
+    """A payload that was compressed by itself."""
+    import zstandard
 
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(bytes(data)) as reader:
+            found: bytes = reader.read(_MAX_UNPACKED_BYTES + 1)
+    except zstandard.ZstdError as error:
+        raise Undecodable(f"its compression is damaged ({error})") from error
+    if len(found) > _MAX_UNPACKED_BYTES or found[:4] == _ZSTD:
+        raise Undecodable(f"unpacks to more than {_MAX_UNPACKED_BYTES >> 20} MB, or is packed twice")
+    return found
+
+
+def _guarded(read: Callable[[Payload], Any]) -> Decoder:
     def decoder(data: Payload) -> Any:
         try:
             return read(data)
@@ -128,9 +169,11 @@ def _by_rosbags(channel: Channel, typename: str) -> Decoder:
             f"{channel.topic}: the definition of {name} cannot be used ({_short(error)}); name another topic"
         ) from error
     deserialise = store.deserialize_ros1 if channel.message_encoding == "ros1" else store.deserialize_cdr
-    convert = decode.FROM_OBJECT[typename]
+    convert = FROM_OBJECT[typename]
 
     def decoder(data: Payload) -> Any:
+        if data[:4] == _ZSTD:
+            data = _unpacked(data)
         try:
             return convert(deserialise(data, name))
         except Exception as error:  # As above.

@@ -8,6 +8,7 @@ from hsloc.log.messages import definitions
 from hsloc.log.messages.definitions import short_name
 
 MAX_SCHEMA_BYTES = 64 << 10
+"""Maximum size of a definition that is parsed. Internal: guards the time against a hostile file."""
 MAX_ARRAY = 4096
 """Longest fixed array in a definition that is not ours: the parser unrolls them."""
 
@@ -69,6 +70,38 @@ def is_known(text: str, typename: str) -> bool:
         # The fields are the known ones, and so every name in them is known as well.
         pending += [kind.partition("[")[0] for kind, _ in _KNOWN[name] if "/" in kind]
     return True
+
+
+def is_incomplete(text: str, typename: str, is_ros1: bool = False) -> bool:
+    """Whether a definition of a standard type says less than the standard one, and nothing else.
+
+    Some recorders write the type's name in place of its definition, or leave out the definitions of the types within.
+    In ROS 1 a header has a sequence number, which ROS 2 has not.
+    """
+    name = short_name(typename)
+    if len(text) > MAX_SCHEMA_BYTES or name not in _KNOWN:
+        return False
+    bare = text.strip()
+    if bare in ("", name, typename, name.rpartition("/")[2]):
+        return True
+    found = parse_definition(text, typename)
+    for part, fields in found.items():
+        known = _KNOWN.get(part)
+        if known is None:
+            return False
+        if part == "std_msgs/Header" and is_ros1:
+            fields = tuple(field for field in fields if field[1] != "seq")
+            known = tuple((kind, field) for kind, field in known)
+        if [field for _, field in fields] != [field for _, field in known]:
+            return False
+    needed, seen = [name], set()
+    while needed:
+        part = needed.pop()
+        if part in seen:
+            continue
+        seen.add(part)
+        needed += [kind.partition("[")[0] for kind, _ in _KNOWN[part] if "/" in kind]
+    return not seen - {"builtin_interfaces/Time"} <= found.keys()
 
 
 def refusal(text: str, encoding: str) -> str | None:

@@ -7,6 +7,8 @@ on every machine. A test holds them equal to what rosbags generates.
 from __future__ import annotations
 
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
+MULTI_ECHO_LASER_SCAN = "sensor_msgs/msg/MultiEchoLaserScan"
+POINT_CLOUD2 = "sensor_msgs/msg/PointCloud2"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
@@ -60,6 +62,31 @@ FIELDS: dict[str, tuple[str, ...]] = {
         "string child_frame_id",
         "geometry_msgs/PoseWithCovariance pose",
         "geometry_msgs/TwistWithCovariance twist",
+    ),
+    "sensor_msgs/PointField": ("string name", "uint32 offset", "uint8 datatype", "uint32 count"),
+    "sensor_msgs/PointCloud2": (
+        "std_msgs/Header header",
+        "uint32 height",
+        "uint32 width",
+        "sensor_msgs/PointField[] fields",
+        "bool is_bigendian",
+        "uint32 point_step",
+        "uint32 row_step",
+        "uint8[] data",
+        "bool is_dense",
+    ),
+    "sensor_msgs/LaserEcho": ("float32[] echoes",),
+    "sensor_msgs/MultiEchoLaserScan": (
+        "std_msgs/Header header",
+        "float32 angle_min",
+        "float32 angle_max",
+        "float32 angle_increment",
+        "float32 time_increment",
+        "float32 scan_time",
+        "float32 range_min",
+        "float32 range_max",
+        "sensor_msgs/LaserEcho[] ranges",
+        "sensor_msgs/LaserEcho[] intensities",
     ),
     "sensor_msgs/LaserScan": (
         "std_msgs/Header header",

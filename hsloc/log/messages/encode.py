@@ -32,8 +32,6 @@ _SCAN = Struct("<7f")
 _POSE = Struct("<7d")
 _MAP_INFO = Struct("<iIfII")
 
-"""Where the 3 x 3 of (x, y, yaw) stands in the 6 x 6 of (x, y, z, roll, pitch, yaw), both row by row."""
-
 
 def stamp_bytes(stamp_ns: int) -> bytes:
     """builtin_interfaces/Time. Raises OutputError for a time that 32-bit seconds cannot hold."""

@@ -50,6 +50,7 @@ _MAX_LINKS = 10_000
 _MAX_NAME = 4096
 _MAX_SECONDS = 1 << 33
 _MAX_FILES = 200
+"""Maximum links of a message, length of a name, seconds and files of a schema. Internal: guards the memory."""
 _SECOND = 1_000_000_000
 
 

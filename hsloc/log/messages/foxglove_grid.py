@@ -23,6 +23,7 @@ _UINT8, _INT8 = 1, 2
 """foxglove.NumericType."""
 _NAMES = {"UINT8": _UINT8, "INT8": _INT8}
 _MOST_CELLS = 400_000_000
+"""Maximum number of cells. Internal: guards the memory against a hostile file."""
 
 
 def occupancy(message: Any, get: Get, origin: Pose2) -> OccupancyGrid:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from math import isfinite
+from math import isfinite, pi
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from hsloc.log.messages import definitions
+from hsloc.log.messages.point_cloud import slice_of
 from hsloc.log.session.ordering import Arrivals
+from hsloc.log.session.scan_geometry import ScanFixes, ScanSurvey, TurnAssembler
+from hsloc.log.session.transform_topics import is_map_frame
 from hsloc.log.transforms import Transform3
 from hsloc.model import Odometry, Pose2, Scan, Truth
 
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
 
     from hsloc.log.messages.cdr_batch_decode import PoseColumns
     from hsloc.log.messages.decode import LinkMessage, OdometryMessage, PoseMessage, ScanMessage
+    from hsloc.log.messages.point_cloud import CloudMessage
     from hsloc.log.session.extrinsics import Extrinsics
     from hsloc.log.session.ordering import TopicClock
     from hsloc.log.summary import Losses
@@ -24,7 +28,6 @@ if TYPE_CHECKING:
 
     Stamped = tuple[TopicClock, Event]
 
-MAP_FRAME = "map"
 MAX_ABS = 1e7
 """Coordinates beyond (metres) are taken for damage; the Earth's circumference is 4e7."""
 
@@ -54,8 +57,22 @@ class ScanFeed:
 
     typename = definitions.LASER_SCAN
 
-    def __init__(self, clock: TopicClock, mountings: Extrinsics, losses: Losses, deskew: bool = False) -> None:
-        """With `deskew`, a scan that does not say how long a beam takes gets an even part of its duration."""
+    def __init__(
+        self,
+        clock: TopicClock,
+        mountings: Extrinsics,
+        losses: Losses,
+        deskew: bool = False,
+        fixes: ScanFixes | None = None,
+        survey: ScanSurvey | None = None,
+    ) -> None:
+        """With `deskew`, a scan that does not say how long a beam takes gets an even part of its duration.
+
+        `fixes` are overridden fields, `survey` is what the first scans of the topic say.
+        """
+        self._fixes = ScanFixes() if fixes is None else fixes
+        self._survey = ScanSurvey() if survey is None else survey
+        self._turns = TurnAssembler(self._survey) if self._survey.segments > 1 else None
         self.topic = clock.topic
         self.clocks = (clock,)
         self._clock = clock
@@ -64,10 +81,17 @@ class ScanFeed:
         self._deskew = deskew
 
     def events(self, message: ScanMessage, log_time_ns: int) -> Iterable[Stamped]:
-        """One scan."""
+        """One scan; of a segment the turn that it completes, if it does."""
         stamp = self._clock.stamp(message.stamp_ns, log_time_ns)
         if stamp is None:
             return ()
+        message = self._fixes.apply(message, self._survey.interval_s)
+        if self._turns is None:
+            return self._scan(message, stamp)
+        turns = self._turns.add(message._replace(stamp_ns=stamp))
+        return [event for turn in turns for event in self._scan(turn, turn.stamp_ns)]
+
+    def _scan(self, message: ScanMessage, stamp: int) -> tuple[Stamped, ...]:
         _, frame, angle_min, increment, time_increment, range_min, range_max, ranges, intensities, *_ = message
         if (
             not (isfinite(angle_min) and isfinite(increment) and range_max > 0.0)
@@ -82,7 +106,9 @@ class ScanFeed:
             angle_min, increment = -angle_min, -increment
         if not isfinite(time_increment):
             time_increment = 0.0
-        if self._deskew and time_increment == 0.0 and isfinite(message.scan_time):
+        if self._deskew and self._survey.sweep_is_wrong and self._survey.interval_s is not None:
+            time_increment = self._survey.interval_s * abs(increment) / (2.0 * pi)
+        elif self._deskew and time_increment == 0.0 and isfinite(message.scan_time):
             time_increment = message.scan_time / max(len(ranges), 1)
         scan = Scan(
             stamp,
@@ -95,6 +121,42 @@ class ScanFeed:
             mounting.T_base_laser,
             frame,
             intensities,
+        )
+        return ((self._clock, scan),)
+
+
+class CloudFeed:
+    """sensor_msgs/PointCloud2 to Scan: what a slice of the cloud shows."""
+
+    typename = definitions.POINT_CLOUD2
+
+    def __init__(self, clock: TopicClock, mountings: Extrinsics, losses: Losses, heights: tuple[float, float]) -> None:
+        """`heights` above the base (m) between which points are taken."""
+        self.topic = clock.topic
+        self.clocks = (clock,)
+        self._clock = clock
+        self._mountings = mountings
+        self._losses = losses
+        self._heights = heights
+
+    def events(self, message: CloudMessage, log_time_ns: int) -> Iterable[Stamped]:
+        """One scan."""
+        stamp = self._clock.stamp(message.stamp_ns, log_time_ns)
+        if stamp is None:
+            return ()
+        T_base_lidar = self._mountings.in_space(message.frame_id)
+        found = slice_of(message, T_base_lidar, *self._heights)
+        x, y, _ = T_base_lidar.translation
+        scan = Scan(
+            stamp,
+            found.ranges,
+            found.angle_min,
+            found.angle_increment,
+            found.range_min,
+            found.range_max,
+            0.0,
+            Pose2(x, y, 0.0),
+            message.frame_id,
         )
         return ((self._clock, scan),)
 
@@ -124,16 +186,21 @@ class OdometryFeed:
         pose = message.pose if self._T_child_base is None else message.pose @ self._T_child_base
         if self.is_truth:
             return ((self._clock, Truth(stamp, pose)),)
-        return ((self._clock, Odometry(stamp, pose, message.covariance)),)
+        has_heading = any(getattr(message, "quaternion", (1.0,)))
+        if not has_heading:
+            self._losses.orientations_unset[self.topic] += 1
+        return ((self._clock, Odometry(stamp, pose, message.covariance, has_heading)),)
 
     def arrivals(self, columns: PoseColumns, places: Sequence[int], log_times: Sequence[int]) -> Arrivals | None:
         """The events of many messages at once, as `events` gives them; None where one needs a closer look."""
         x, y, theta = columns.x, columns.y, columns.theta
         with np.errstate(invalid="ignore"):
             usable = (np.abs(x) < MAX_ABS) & (np.abs(y) < MAX_ABS) & np.isfinite(theta)
-        if not (usable.all() and columns.stamps_ns.all()):
+        if not (usable.all() and columns.stamps_ns.all() and columns.has_headings):
             return None
-        stamps = columns.stamps_ns.tolist()
+        stamps = list(log_times) if self._clock.by_log else columns.stamps_ns.tolist()
+        if self._clock.offset_ns:
+            stamps = [stamp + self._clock.offset_ns for stamp in stamps]
         poses: Iterable[Pose2] = map(Pose2, x.tolist(), y.tolist(), theta)
         T_child_base = self._T_child_base
         if T_child_base is not None:
@@ -183,9 +250,13 @@ class TransformFeed:
         """Events of the links that matter."""
         found: list[Stamped] = []
         for link in message:
-            if link.parent == MAP_FRAME and link.child == self._odom_frame:
+            if is_map_frame(link.parent) and link.child == self._odom_frame:
                 self._T_map_odom = link.transform.normalised()
-            elif link.child == self._base_frame and link.parent == (self._odom_frame or MAP_FRAME):
+            elif is_map_frame(link.child) and link.parent == self._odom_frame:  # some localisers publish the inverse
+                self._T_map_odom = link.transform.normalised().inverse()
+            elif link.child == self._base_frame and (
+                is_map_frame(link.parent) if self._odom_frame is None else link.parent == self._odom_frame
+            ):
                 found += self._base(link, log_time_ns)
         return found
 
@@ -200,7 +271,10 @@ class TransformFeed:
         if self._odometry is not None:
             stamp = self._odometry.stamp(link.stamp_ns, log_time_ns)
             if stamp is not None:
-                yield self._odometry, Odometry(stamp, pose)
+                has_heading = any(link.transform.rotation)
+                if not has_heading:
+                    self._losses.orientations_unset[self.topic] += 1
+                yield self._odometry, Odometry(stamp, pose, None, has_heading)
         if self._truth is None:
             return
         stamp = self._truth.stamp(link.stamp_ns, log_time_ns)

@@ -5,66 +5,39 @@ from __future__ import annotations
 from math import degrees, radians
 from typing import TYPE_CHECKING
 
-from hsloc.errors import LogFormatError
-from hsloc.log.messages import definitions
-from hsloc.log.messages.decoders import Undecodable, canonical_type, decoder_for, is_decodable
-from hsloc.log.session.topic_selection import TF, TF_STATIC, carries
-from hsloc.log.summary import Losses
+from hsloc.log.session.transform_topics import BASE_FRAMES, last_name, read_links
 from hsloc.log.transforms import FrameTree, Mounting, Transform3, laser_mounting
 from hsloc.model import IDENTITY, Pose2
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Collection, Sequence
 
     from hsloc.log.container import Container
-    from hsloc.log.messages.decode import LinkMessage
-    from hsloc.log.messages.decoders import Decoder
+    from hsloc.log.session.transform_topics import TransformTopics
 
-BASE_FRAMES = ("base_footprint", "base_link", "base")
-"""Names to try where no odometry names the base, in this order."""
 TILT_WARNING = radians(3.0)
-
-
-def read_links(
-    containers: Sequence[Container], topic: str, limit: int | None = None, warnings: list[RunWarning] | None = None
-) -> Iterator[LinkMessage]:
-    """All transforms on a topic, in the order of the log; at most `limit` messages of each file.
-
-    A log can be read without them: what prevents reading them is added to `warnings`.
-    """
-    for container in containers:
-        decoders: dict[int, Decoder] = {}
-        for channel in container.channels.values():
-            if not carries(channel, topic) or canonical_type(channel.typename) != definitions.TF_MESSAGE:
-                continue
-            try:
-                if is_decodable(channel):
-                    decoders[channel.id] = decoder_for(channel)
-            except LogFormatError as error:
-                if warnings is not None:
-                    warnings.append(RunWarning(WarningCode.TRANSFORMS_UNREADABLE, f"transforms are not read: {error}"))
-        if not decoders:
-            continue
-        # Damage is counted when the log is read for its events.
-        for number, (_, _, channel_id, data) in enumerate(container.messages(decoders.keys(), Losses())):
-            if limit is not None and number >= limit:
-                break
-            try:
-                yield from decoders[channel_id](data)
-            except Undecodable:
-                continue
 
 
 class Extrinsics:
     """The mounting of each laser frame; `warnings` grows with what had to be assumed."""
 
-    def __init__(self, containers: Sequence[Container], base_frame: str | None, override: Pose2 | None) -> None:
+    def __init__(
+        self,
+        containers: Sequence[Container],
+        topics: TransformTopics,
+        base_frame: str | None,
+        override: Pose2 | None,
+        assumed: Collection[str] = (),
+    ) -> None:
+        """`assumed` are laser frames whose mounting was assumed when the log was written."""
         self._containers = containers
+        self._topics = topics
         self._override = override
+        self._assumed = assumed
         self._static = FrameTree()
         self.warnings: list[RunWarning] = []
-        for link in read_links(containers, TF_STATIC, warnings=self.warnings):
+        for link in read_links(containers, topics.static, warnings=self.warnings):
             self._static.add(link.parent, link.child, link.transform)
         self._all: FrameTree | None = None
         self._known: dict[str, tuple[Mounting, str]] = {}
@@ -78,8 +51,15 @@ class Extrinsics:
         self.found(laser_frame)
         return laser_mounting(self._spatial.get(laser_frame, Transform3()) @ T_frame_laser)
 
+    def in_space(self, frame: str) -> Transform3:
+        """T_base_frame in space, the identity where it is not known; a mounting that was given is in the plane."""
+        if self._override is not None:
+            return Transform3.from_pose2(self._override)
+        self.found(frame)
+        return self._spatial.get(frame, Transform3())
+
     def found(self, laser_frame: str) -> tuple[Mounting, str]:
-        """The mounting, and where it comes from: `option`, `/tf_static`, `/tf` or `identity`."""
+        """The mounting, and where it comes from: `option`, topics of transforms, `same frame` or `identity`."""
         known = self._known.get(laser_frame)
         if known is None:
             known = self._known[laser_frame] = self._find(laser_frame)
@@ -87,8 +67,17 @@ class Extrinsics:
 
     def between(self, target: str, source: str) -> Transform3 | None:
         """T_target_source from all that the log knows, or None."""
-        transform = self._static.lookup(target, source)
-        return transform if transform is not None else self._whole_tree().lookup(target, source)
+        return self._lookup(target, source)[0]
+
+    def _lookup(self, target: str, source: str) -> tuple[Transform3 | None, FrameTree]:
+        """T_target_source and the tree that says so; frames may lack their prefix."""
+        for tree in (self._static, self._whole_tree):
+            tree = tree if isinstance(tree, FrameTree) else tree()
+            to, of = tree.resolve(target, source), tree.resolve(source, target)
+            transform = tree.lookup(to, of) if to is not None and of is not None else None
+            if transform is not None:
+                return transform, tree
+        return None, self._whole_tree()
 
     def _find(self, laser: str) -> tuple[Mounting, str]:
         if self._override is not None:
@@ -97,12 +86,11 @@ class Extrinsics:
         if base is not None and base == laser:
             return Mounting(IDENTITY), "same frame"
         if base is not None:
-            transform, source = self._static.lookup(base, laser), TF_STATIC
-            if transform is None:
-                tree = self._whole_tree()
-                transform, source = tree.lookup(base, laser), TF
+            transform, tree = self._lookup(base, laser)
+            if tree is not self._static:
                 self._warn_if_moving(tree, base, laser)
             if transform is not None:
+                self._warn_if_restated(tree, base, laser)
                 self._spatial[laser] = transform
                 mounting = laser_mounting(transform)
                 if mounting.tilt > TILT_WARNING:
@@ -113,12 +101,22 @@ class Extrinsics:
                             "ranges are used as if it were level",
                         )
                     )
-                return mounting, source
+                if laser in self._assumed:
+                    self.warnings.append(
+                        RunWarning(
+                            WarningCode.EXTRINSICS_ASSUMED,
+                            f"the mounting of {laser} was assumed when this log was converted",
+                            "give --laser-pose x,y,yaw",
+                        )
+                    )
+                    return mounting, "identity"
+                topics = self._topics.static if tree is self._static else self._topics.dynamic
+                return mounting, ", ".join(sorted(topics))
         self.warnings.append(
             RunWarning(
                 WarningCode.EXTRINSICS_ASSUMED,
-                f"no transform from {base or 'the base'} to {laser or 'the laser'} in /tf_static or /tf: the laser is "
-                "assumed to be at the origin of the base",
+                f"no transform from {base or 'the base'} to {laser or 'the laser'} in {self._topics.names}: the laser "
+                "is assumed to be at the origin of the base",
                 "give --laser-pose x,y,yaw",
             )
         )
@@ -129,10 +127,10 @@ class Extrinsics:
         if self._all is None:
             self._all = FrameTree()
             static = self._static.children()
-            for link in read_links(self._containers, TF, warnings=self.warnings):
+            for link in read_links(self._containers, self._topics.dynamic, warnings=self.warnings):
                 if link.child not in static:
                     self._all.add(link.parent, link.child, link.transform)
-            for link in read_links(self._containers, TF_STATIC):
+            for link in read_links(self._containers, self._topics.static):
                 self._all.add(link.parent, link.child, link.transform)
         return self._all
 
@@ -147,6 +145,33 @@ class Extrinsics:
                 )
             )
 
+    def _warn_if_restated(self, tree: FrameTree, base: str, laser: str) -> None:
+        """Static transforms that are stated twice with different values: the later ones were taken."""
+        path = tree.path(tree.resolve(base, laser) or base, tree.resolve(laser, base) or laser)
+        for frame in path[0] + path[1] if path else (laser,):
+            statements = self._static.statements(frame)
+            if len(statements) > 1:
+                listed = " and ".join(
+                    f"{parent} -> {frame} at {_in_plane(transform)}" for parent, transform in statements
+                )
+                self.warnings.append(
+                    RunWarning(
+                        WarningCode.EXTRINSICS_RESTATED,
+                        f"{', '.join(sorted(self._topics.static))} states the place of {frame} {len(statements)} "
+                        f"times: {listed}; the last that leads to {base} is used",
+                        "choose with --laser-pose x,y,yaw",
+                    )
+                )
+
     def _guessed_base(self) -> str | None:
-        static = next((frame for frame in BASE_FRAMES if frame in self._static), None)
-        return static or next((frame for frame in BASE_FRAMES if frame in self._whole_tree()), None)
+        for tree in (self._static, self._whole_tree()):
+            for name in BASE_FRAMES:
+                found = sorted(frame for frame in tree.frames() if last_name(frame) == name)
+                if found:
+                    return name if name in found else found[0]
+        return None
+
+
+def _in_plane(transform: Transform3) -> str:
+    pose = transform.to_pose2()
+    return f"{pose.x:.3f},{pose.y:.3f},{pose.theta:.3f}"

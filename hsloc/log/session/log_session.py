@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hsloc.log.messages import definitions, foxglove
 from hsloc.log.messages.decoders import Undecodable, canonical_type, decoder_for, is_decodable
-from hsloc.log.session.event_builders import MAP_FRAME
-from hsloc.log.session.extrinsics import BASE_FRAMES, Extrinsics, read_links
+from hsloc.log.session.extrinsics import Extrinsics
+from hsloc.log.session.scan_geometry import ScanFixes, ScanSurvey, survey
 from hsloc.log.session.split_recordings import check_parts
-from hsloc.log.session.topic_selection import TF, TRUTH_TYPES, carries, choose_topics, is_truth_name, of_type
+from hsloc.log.session.topic_selection import (
+    TF,
+    TRUTH_TYPES,
+    choose_scans,
+    choose_topics,
+    has_name,
+    is_truth_name,
+    names_transforms,
+    of_type,
+)
+from hsloc.log.session.transform_topics import choose_transforms, is_map_frame, is_odometry_frame
 from hsloc.log.summary import LaserSummary, LogSummary, Losses, ReadOptions, TopicSummary
 from hsloc.model import IDENTITY
 from hsloc.warnings import RunWarning, WarningCode
@@ -25,8 +35,8 @@ if TYPE_CHECKING:
 CONVERTED = "hsloc.convert"
 """Metadata record of a converted log; `order` = `log` says that the order of the log is the true one."""
 
-_LINKS_AT_OPENING = 2000
 _STAMPS_AT_OPENING = 100
+_SCANS_AT_OPENING = 60
 _SAME_CLOCK_NS = 3600 * 1_000_000_000
 _CLOCKS_APART_NS = 5_000_000_000
 
@@ -69,23 +79,38 @@ class LogSession:
             for channel in container.channels.values()
             if (statistics := container.statistics.get(channel.id)) is not None and statistics.count
         ]
-        links = {(link.parent, link.child) for link in read_links(containers, TF, _LINKS_AT_OPENING)}
-        self.tf_frames = _odometry_frames(links, options.base_frame)
-        self._has_map_to_odom = any(parent == MAP_FRAME for parent, _ in links)
         where = str(containers[0].path)
         if len(containers) > 1:
             where += f" and {len(containers) - 1} more"
+        scans = choose_scans(where, self.active, options, [])
+        self.scan_types = scans
+        self.scans = {topic: self._first(topic, kind) for topic, kind in scans.items()}
+        frames = [(topic, first.message.frame_id) for topic, first in self.scans.items() if first is not None]
+        self.transforms = choose_transforms(
+            containers, frames, options.base_frame, names_transforms(self.active, options.odom_topic)
+        )
+        self._warnings += self.transforms.warnings
+        self.tf_frames = self.transforms.odometry
         self.choice = choose_topics(where, self.active, options, self.tf_frames is not None)
         self._warnings += self.choice.warnings
-        frames = self.tf_frames if self.choice.odom == TF else None
-        self._parts, of_parts = check_parts(containers, self.choice.scans, self.choice.odom, frames)
+        odom = self.choice.odom
+        self._parts, of_parts = check_parts(
+            containers,
+            self.choice.scans,
+            () if odom is None else self.transforms.dynamic if odom == TF else (odom,),
+            self.tf_frames if odom == TF else None,
+        )
         self._warnings += of_parts
-        self.scans = {topic: self._first(topic, definitions.LASER_SCAN) for topic in self.choice.scans}
+        self.fixes = ScanFixes.parse(options.scan_fix)
+        self.surveys = {topic: self._survey(topic) for topic in scans}
         self.odom_type = self._pose_type(self.choice.odom)
         self.odom = self._first(self.choice.odom, self.odom_type)
         self.truth_type = self._pose_type(self.choice.truth)
         self.truth = self._first(self.choice.truth, self.truth_type)
-        self.mountings = Extrinsics(containers, self._base_frame(), options.laser_pose)
+        assumed = {
+            frame for c in containers for frame in c.metadata.get(CONVERTED, {}).get("assumed_mountings", "").split(",")
+        }
+        self.mountings = Extrinsics(containers, self.transforms, self._base_frame(), options.laser_pose, assumed)
         self.T_child_base = self._child_to_base()
         # A truth that speaks of the same frame as the odometry moves with it.
         truth_child = getattr(self.truth.message, "child_frame_id", None) if self.truth is not None else None
@@ -96,7 +121,8 @@ class LogSession:
         """(number of the container, channel) of a topic, those that can be decoded."""
         for number, container in enumerate(self.containers):
             for channel in container.channels.values():
-                if carries(channel, topic) and is_decodable(channel):
+                meant = channel.topic in self.transforms.dynamic if topic == TF else has_name(channel, topic)
+                if meant and is_decodable(channel):
                     kind = canonical_type(channel.typename)
                     if typename is None or kind == typename:
                         yield number, channel
@@ -105,7 +131,7 @@ class LogSession:
         """The decoder of a channel of a container; made once. Raises LogFormatError."""
         key = (number, channel.id)
         if key not in self._decoders:
-            self._decoders[key] = decoder_for(channel)
+            self._decoders[key] = decoder_for(channel, self._warnings)
         return self._decoders[key]
 
     def messages(self, topic: str, typename: str | None = None) -> Iterator[tuple[int, Any]]:
@@ -139,6 +165,25 @@ class LogSession:
             return definitions.ODOMETRY
         kinds = {canonical_type(channel.typename) for _, channel in self.channels(topic)}
         return next((kind for kind in TRUTH_TYPES if kind in kinds), definitions.ODOMETRY)
+
+    def _survey(self, topic: str) -> ScanSurvey:
+        """A look at the first scans of a topic, with what the user overrides."""
+        kind = self.scan_types[topic]
+        if kind == definitions.POINT_CLOUD2:
+            return ScanSurvey()
+        first = [message for _, message in islice(self.messages(topic, kind), _SCANS_AT_OPENING)]
+        interval = survey(first).interval_s
+        found = survey(self.fixes.apply(message, interval) for message in first)
+        self._warnings += [RunWarning(p.code, f"{topic}: {p.text}", p.remedy) for p in found.problems]
+        if found.segments > 1:
+            self._warnings.append(
+                RunWarning(
+                    WarningCode.SCAN_SEGMENTS,
+                    f"{topic}: a turn comes in {found.segments} segments, which are joined and deskewed",
+                    "record the topic of whole turns if the driver has one",
+                )
+            )
+        return found
 
     @property
     def odometry_child(self) -> str | None:
@@ -181,6 +226,11 @@ class LogSession:
         laser = lasers[0] if lasers else LaserSummary("", "", IDENTITY, False, "identity")
         converted = any(c.metadata.get(CONVERTED, {}).get("order") == "log" for c in self.containers)
         self._warn_of_clocks()
+        self.initial_pose = self.find_initial_pose()
+        self.maps, others = self.map_topics()
+        if others and not self.maps:
+            text = f"{', '.join(others)} is a costmap, not a map: it is not used"
+            self._warnings.append(RunWarning(WarningCode.MAP_IS_COSTMAP, text, "give a map with --map"))
         starts = [topic.first_ns for topic in statistics if topic.first_ns is not None]
         ends = [topic.last_ns for topic in statistics if topic.last_ns is not None]
         formats = list(dict.fromkeys(container.format for container in self.containers))
@@ -193,7 +243,7 @@ class LogSession:
             origin_ns=self._origin(in_log_time=converted),
             topics=tuple(statistics),
             scan_topic=",".join(self.choice.scans) or None,
-            odom_topic=self.choice.odom,
+            odom_topic=self._odometry_topic(),
             truth_topic=self.choice.truth,
             reference_candidates=self._candidates(),
             odom_frame=self._odom_frame(),
@@ -205,6 +255,7 @@ class LogSession:
             lasers=tuple(lasers),
             parts=self._parts,
             order="log" if converted else "stamp",
+            segments=max((found.segments for found in self.surveys.values()), default=1),
             metadata={name: dict(v) for c in self.containers for name, v in c.metadata.items()},
             warnings=tuple(dict.fromkeys(self._warnings + self.mountings.warnings)),
         )
@@ -212,7 +263,7 @@ class LogSession:
     def _laser(self, topic: str, first: FirstMessage) -> LaserSummary:
         frame = first.message.frame_id
         extrinsics = self.mountings.found(frame)[1]
-        mounting = self.mountings.of(frame, first.message.T_frame_laser)
+        mounting = self.mountings.of(frame, getattr(first.message, "T_frame_laser", None))
         return LaserSummary(topic, frame, mounting.T_base_laser, mounting.flipped, extrinsics)
 
     def _topics(self) -> list[TopicSummary]:
@@ -239,8 +290,68 @@ class LogSession:
         poses = [topic for typename in TRUTH_TYPES[1:] for topic in of_type(self.active, typename)]
         truths = [topic for topic in of_type(self.active, definitions.ODOMETRY) if is_truth_name(topic)]
         return tuple(
-            dict.fromkeys(truths + sorted({*poses} - {self.choice.odom}) + (["tf"] if self._has_map_to_odom else []))
+            dict.fromkeys(
+                truths + sorted({*poses} - {self.choice.odom}) + (["tf"] if self.transforms.has_map_to_odometry else [])
+            )
         )
+
+    def _odometry_topic(self) -> str | None:
+        """The topic of the odometry, that of the transforms where these are it."""
+        if self.choice.odom != TF:
+            return self.choice.odom
+        return ",".join(sorted(self.transforms.dynamic)) or TF
+
+    def map_topics(self) -> tuple[list[str], list[str]]:
+        """Topics of maps, the best first, and topics of grids that are none.
+
+        A costmap is no map: it is inflated, and a local one rolls along with the robot in the frame of its odometry.
+        """
+        maps: list[str] = []
+        others: list[str] = []
+        for topic in of_type(self.active, definitions.OCCUPANCY_GRID):
+            is_named_map = topic.strip("/").rpartition("/")[2] == "map"
+            frame = "" if is_named_map else next((m.frame_id for _, m in self.messages(topic)), "")
+            is_map = is_named_map or not ("costmap" in topic or is_odometry_frame(frame))
+            (maps if is_map else others).append(topic)
+        maps.sort(key=lambda topic: (topic.lstrip("/") != "map", not topic.endswith("/map"), topic))
+        return maps, others
+
+    def find_initial_pose(self) -> tuple[int, Pose2] | None:
+        """(stamp in ns, pose in the map) of the first message on /initialpose that can be used.
+
+        RViz publishes the pose in its fixed frame: one in the odometry's frame is moved to the map where a transform
+        tells how, and is left out otherwise.
+        """
+        topic = definitions.POSE_WITH_COVARIANCE_STAMPED
+        names = [t for t in of_type(self.active, topic) if t.strip("/").rpartition("/")[2] == "initialpose"]
+        for name in names[:1]:
+            for log_time, message in self.messages(name, topic):
+                frame, stamp = message.frame_id, message.stamp_ns or log_time
+                if not frame or is_map_frame(frame):
+                    return stamp, message.pose
+                T_map_frame = self._map_to(frame, log_time)
+                if T_map_frame is not None:
+                    return stamp, T_map_frame @ message.pose
+                self._warnings.append(
+                    RunWarning(
+                        WarningCode.START_FRAME,
+                        f"{name} gives a pose in the frame {frame}, not in the map's, and no transform leads there: it "
+                        "is not used",
+                        "give the start with --initial-pose x,y,yaw",
+                    )
+                )
+        return None
+
+    def _map_to(self, frame: str, log_time_ns: int) -> Pose2 | None:
+        """T_map_frame as it was last published before a time of the log."""
+        found = None
+        for log_time, links in self.messages(TF, definitions.TF_MESSAGE):
+            if log_time > log_time_ns and found is not None:
+                break
+            for link in links:
+                if is_map_frame(link.parent) and link.child == frame:
+                    found = link.transform.normalised().to_pose2()
+        return found
 
     def _odom_frame(self) -> str | None:
         if self.odom is not None:
@@ -279,12 +390,3 @@ class LogSession:
                         "log's clock: they may come from different clocks",
                     )
                 )
-
-
-def _odometry_frames(links: set[tuple[str, str]], base: str | None) -> tuple[str, str] | None:
-    """(odometry frame, base frame) of a dynamic link that is odometry, if there is one."""
-    children = sorted(child for parent, child in links if parent == "odom" and child != MAP_FRAME)
-    wanted = [name for name in (base, *BASE_FRAMES) if name in children]
-    if wanted:
-        return "odom", wanted[0] or ""
-    return ("odom", children[0]) if len(children) == 1 else None

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import heapq
 from collections import defaultdict
+from math import inf
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
 from hsloc.log.container import in_runs
 from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import Undecodable, canonical_type, is_decodable
-from hsloc.log.session.event_builders import OdometryFeed, PoseFeed, ScanFeed, TransformFeed
-from hsloc.log.session.extrinsics import BASE_FRAMES
+from hsloc.log.session.event_builders import CloudFeed, OdometryFeed, PoseFeed, ScanFeed, TransformFeed
 from hsloc.log.session.log_session import FirstMessage, LogSession
 from hsloc.log.session.ordering import KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH, Reorder, TopicClock, one_by_one
 from hsloc.log.session.topic_reader import Route
-from hsloc.log.session.topic_selection import TF, of_type
+from hsloc.log.session.topic_selection import TF
+from hsloc.log.session.transform_topics import BASE_FRAMES
 from hsloc.log.source import Observation
-from hsloc.log.summary import Losses
+from hsloc.log.summary import NANOSECONDS, Losses
 from hsloc.model import Pose2
 
 if TYPE_CHECKING:
@@ -31,10 +32,11 @@ if TYPE_CHECKING:
 _CHANNELS = 1 << 32
 """More channels than a file can have."""
 _FIRST_BATCH = 16
+"""Messages of the first batch. Internal: small, so that the first event is there at once."""
 _CUT_BATCH = 64
-"""Where the end of a log is left out: what is damaged there is not looked at."""
+"""Messages of a batch where the end of a log is left out. Internal: damage behind the end is not read."""
 _BATCH = 1024
-"""Messages that are decoded together."""
+"""Messages that are decoded together. Internal: time alone, the events are the same."""
 
 INITIAL_POSE = "hsloc.initial_pose"
 """Metadata record with x, y, theta (m, m, rad) and, if it is not the first stamp, stamp_ns."""
@@ -96,22 +98,39 @@ class RosSource:
         feeds: list[Feed] = []
         tf_odometry = tf_truth = None
         if choice.odom == TF:
-            tf_odometry = _clock(TF, KIND_ODOMETRY, None, losses)
+            tf_odometry = self._clock(TF, KIND_ODOMETRY, None, losses)
         elif choice.odom is not None:
-            clock = _clock(choice.odom, KIND_ODOMETRY, survey.odom, losses)
+            clock = self._clock(choice.odom, KIND_ODOMETRY, survey.odom, losses)
             feeds.append(_pose_feed(clock, losses, survey.odom_type, False, survey.T_child_base))
         for topic, first in survey.scans.items():
-            clock = _clock(topic, KIND_SCAN, first, losses)
-            feeds.append(ScanFeed(clock, survey.mountings, losses, survey.options.deskew))
+            clock = self._clock(topic, KIND_SCAN, first, losses)
+            if survey.scan_types[topic] == definitions.POINT_CLOUD2:
+                feeds.append(CloudFeed(clock, survey.mountings, losses, survey.options.heights() or (-inf, inf)))
+                continue
+            feed = ScanFeed(clock, survey.mountings, losses, survey.options.deskew, survey.fixes, survey.surveys[topic])
+            feed.typename = survey.scan_types[topic]
+            feeds.append(feed)
         if choice.truth == TF:
-            tf_truth = _clock(TF, KIND_TRUTH, None, losses)
+            tf_truth = self._clock(TF, KIND_TRUTH, None, losses)
         elif choice.truth is not None:
-            clock = _clock(choice.truth, KIND_TRUTH, survey.truth, losses)
+            clock = self._clock(choice.truth, KIND_TRUTH, survey.truth, losses)
             feeds.append(_pose_feed(clock, losses, survey.truth_type, True, survey.T_truth_base))
         if tf_odometry is not None or tf_truth is not None:
             frames = survey.tf_frames or (None, survey.mountings.base_frame or BASE_FRAMES[0])
             feeds.append(TransformFeed(TF, frames, tf_odometry, tf_truth, losses, survey.T_child_base))
         return feeds
+
+    def _clock(self, topic: str, kind: int, first: FirstMessage | None, losses: Losses) -> TopicClock:
+        """The clock of a topic, with what the user says of it."""
+        options = self._survey.options
+        names = {
+            topic.lstrip("/"),
+            *(name.lstrip("/") for name in (self._survey.transforms.dynamic if topic == TF else ())),
+        }
+        offsets = options.offsets_s()
+        offset_s = sum(seconds for name, seconds in offsets.items() if name in names)
+        shares = first is None or first.shares_log_clock
+        return TopicClock(topic, kind, losses, shares, round(offset_s * NANOSECONDS), options.stamps == "log")
 
     def _routes(self, feeds: Sequence[Feed]) -> dict[int, Route]:
         """The route of each channel that is read, by its key in `_stream`: one for all channels of a feed."""
@@ -137,9 +156,8 @@ class RosSource:
 
     def map(self) -> OccupancyGrid | None:
         """The last map of /map, or of the only topic with maps."""
-        topics = of_type(self._survey.active, definitions.OCCUPANCY_GRID)
-        named = [t for t in topics if t.lstrip("/") == "map"] or [t for t in topics if t.endswith("/map")] or topics
-        if not named or (len(named) > 1 and len(topics) > 1):
+        named = self._survey.maps
+        if not named or (len(named) > 1 and named[0].rpartition("/")[2] != "map"):
             return None
         grid = None
         for _, message in self._survey.messages(named[0], definitions.OCCUPANCY_GRID):
@@ -147,9 +165,9 @@ class RosSource:
         return grid
 
     def initial_pose(self) -> tuple[int, Pose2] | None:
-        """The first message on /initialpose, else the metadata record `hsloc.initial_pose`."""
-        for log_time, message in self._survey.messages("/initialpose", definitions.POSE_WITH_COVARIANCE_STAMPED):
-            return message.stamp_ns or log_time, message.pose
+        """The first usable message on /initialpose, else the metadata record `hsloc.initial_pose`."""
+        if self._survey.initial_pose is not None:
+            return self._survey.initial_pose
         values = self.summary.metadata.get(INITIAL_POSE)
         if values is None:
             return None
@@ -199,10 +217,6 @@ def _pose_feed(
     if typename == definitions.ODOMETRY:
         return OdometryFeed(clock, losses, is_truth, T_child_base)
     return PoseFeed(clock, losses, typename, is_truth, T_child_base)
-
-
-def _clock(topic: str, kind: int, first: FirstMessage | None, losses: Losses) -> TopicClock:
-    return TopicClock(topic, kind, losses, first is None or first.shares_log_clock)
 
 
 def _added(parts: Iterable[Losses]) -> Losses:

@@ -25,24 +25,47 @@ if TYPE_CHECKING:
 KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH = 0, 1, 2
 
 WINDOW_NS = 2_000_000_000
-"""An event waits at most this long (log time) for events of other topics that belong before it."""
+"""Maximum time (of the log) that an event waits for earlier ones of other topics. Internal: bounds the memory; longer
+delays are reported by `hsloc check`."""
 JUMP_NS = 10_000_000_000
 """A stamp further than this from the topic's last one (beyond what the log time advanced) is not trusted, unless
 the next one agrees with it."""
 MAX_PENDING = 20_000
+"""Maximum number of events that wait. Internal: bounds the memory."""
 
 
 class TopicClock:
     """Effective stamps of one topic.
 
     `shares_log_clock` says whether header stamps and log times are of one clock, so that a missing stamp can be
-    replaced.
+    replaced. `offset_ns` is added to every stamp; with `by_log` the log's time is taken in place of each stamp.
     """
 
-    __slots__ = ("_last_log_ns", "_last_own_ns", "_losses", "_suspect", "kind", "last_ns", "shares_log_clock", "topic")
+    __slots__ = (
+        "_last_log_ns",
+        "_last_own_ns",
+        "_losses",
+        "_suspect",
+        "by_log",
+        "kind",
+        "last_ns",
+        "offset_ns",
+        "shares_log_clock",
+        "topic",
+    )
 
-    def __init__(self, topic: str, kind: int, losses: Losses, shares_log_clock: bool = True) -> None:
+    def __init__(
+        self,
+        topic: str,
+        kind: int,
+        losses: Losses,
+        shares_log_clock: bool = True,
+        offset_ns: int = 0,
+        by_log: bool = False,
+    ) -> None:
         self.topic = topic
+        self.offset_ns = offset_ns
+        self.by_log = by_log
         self.kind = kind
         self.shares_log_clock = shares_log_clock
         self.last_ns: int | None = None
@@ -53,13 +76,15 @@ class TopicClock:
 
     def stamp(self, stamp_ns: int, log_time_ns: int) -> int | None:
         """The stamp to use for a message: its own, the log's where it has none, None where it must be dropped."""
+        if self.by_log and log_time_ns > 0:
+            return log_time_ns + self.offset_ns
         if stamp_ns != 0 or log_time_ns == 0:
-            return stamp_ns
+            return stamp_ns + self.offset_ns
         if not self.shares_log_clock:
             self._losses.stamps_zero_dropped[self.topic] += 1
             return None
         self._losses.stamps_zero[self.topic] += 1
-        return log_time_ns
+        return log_time_ns + self.offset_ns
 
     def effective(self, stamp_ns: int, log_time_ns: int) -> tuple[int, bool]:
         """(effective stamp, whether it was raised) for the topic's next message."""

@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, NamedTuple
 from hsloc.errors import LogError
 from hsloc.log.messages.decode import OdometryMessage, PoseMessage
 from hsloc.log.messages.decoders import Undecodable, decoder_for, is_decodable
-from hsloc.log.session.topic_selection import carries
 from hsloc.log.summary import NANOSECONDS, Losses, PartSummary
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
-    from hsloc.log.container import Container, RawMessage
+    from hsloc.log.container import Channel, Container, RawMessage
     from hsloc.log.messages.decoders import Decoder
     from hsloc.model import Pose2
 
@@ -41,6 +40,7 @@ _RESET, _AWAY = 0.01, 0.5
 """Odometry within so many metres of zero has begun anew, if it was farther away than the second before."""
 _ENDS = 200
 """Messages looked at on either end of a part."""
+
 _ANOTHER_RUN = "if that is another run, replay each file by itself"
 
 
@@ -54,14 +54,15 @@ class _Edge(NamedTuple):
 def check_parts(
     containers: Sequence[Container],
     scan_topics: Iterable[str],
-    odom_topic: str | None,
+    odometry: Collection[str],
     tf_frames: tuple[str, str] | None,
 ) -> tuple[tuple[PartSummary, ...], list[RunWarning]]:
     """The files in the order of time, and warnings where they may not be parts of one run.
 
-    `tf_frames` are the frames of the odometry where `odom_topic` is /tf. Raises LogError for files that are not.
+    `odometry` are the topics that carry it, `tf_frames` its frames where these are transforms. Raises LogError for
+    files that are not parts of one run.
     """
-    topics = [*([] if odom_topic is None else [odom_topic]), *scan_topics]
+    topics = [*odometry, *scan_topics]
     found = [(part, container) for container in containers if (part := _span(container, topics)) is not None]
     found.sort(key=lambda entry: (entry[0].start_ns, entry[0].end_ns))
     parts = tuple(part for part, _ in found)
@@ -71,7 +72,7 @@ def check_parts(
         spans = [span for _, container in found if (span := _span(container, [topic])) is not None]
         for a, b in combinations(spans, 2):
             _refuse_same_time(a, b, topic)
-    return parts, _gaps(parts) + ([] if odom_topic is None else _jumps(found, odom_topic, tf_frames))
+    return parts, _gaps(parts) + _jumps(found, odometry, tf_frames)
 
 
 def _span(container: Container, topics: Sequence[str]) -> PartSummary | None:
@@ -82,11 +83,16 @@ def _span(container: Container, topics: Sequence[str]) -> PartSummary | None:
     statistics = [
         container.statistics[channel.id]
         for channel in container.channels.values()
-        if channel.id in container.statistics and any(carries(channel, topic) for topic in topics)
+        if channel.id in container.statistics and _is_one_of(channel, topics)
     ]
     firsts = [item.first_ns for item in statistics if item.count and item.first_ns is not None]
     lasts = [item.last_ns for item in statistics if item.count and item.last_ns is not None]
     return PartSummary(container.path, min(firsts), max(lasts)) if firsts and lasts else None
+
+
+def _is_one_of(channel: Channel, topics: Collection[str]) -> bool:
+    """Whether a channel's topic is one of these, with or without the leading slash that ROS 1 leaves out."""
+    return channel.topic.lstrip("/") in {topic.lstrip("/") for topic in topics}
 
 
 def _refuse_same_time(a: PartSummary, b: PartSummary, topic: str) -> None:
@@ -123,9 +129,9 @@ def _duration(nanoseconds: int) -> str:
 
 
 def _jumps(
-    found: Sequence[tuple[PartSummary, Container]], topic: str, tf_frames: tuple[str, str] | None
+    found: Sequence[tuple[PartSummary, Container]], odometry: Collection[str], tf_frames: tuple[str, str] | None
 ) -> list[RunWarning]:
-    ends = [(part, *_edges(container, topic, tf_frames)) for part, container in found]
+    ends = [(part, *_edges(container, odometry, tf_frames)) for part, container in found]
     told = [(part, first, last) for part, first, last in ends if first is not None and last is not None]
     return [
         warning
@@ -155,12 +161,14 @@ def _jump(a: PartSummary, end: _Edge, b: PartSummary, begin: _Edge) -> list[RunW
     return []
 
 
-def _edges(container: Container, topic: str, tf_frames: tuple[str, str] | None) -> tuple[_Edge | None, _Edge | None]:
+def _edges(
+    container: Container, odometry: Collection[str], tf_frames: tuple[str, str] | None
+) -> tuple[_Edge | None, _Edge | None]:
     """The first and the last odometry of a file. All of the topic is read, but little of it decoded."""
     decoders = {
         channel.id: decoder_for(channel)
         for channel in container.channels.values()
-        if carries(channel, topic) and is_decodable(channel)
+        if _is_one_of(channel, odometry) and is_decodable(channel)
     }
     messages = container.messages(decoders.keys(), Losses())
     # Copies: a view would hold on to the chunk that it is part of.

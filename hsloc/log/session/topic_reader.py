@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from hsloc.model import Event
 
 _FEW = 4
-"""Messages that are rather decoded one by one."""
+"""Number of messages up to which they are decoded one by one. Internal: time alone, the events are the same."""
 
 
 class Route:

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from hsloc.errors import TopicError
-from hsloc.log.messages import definitions, foxglove
+from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import canonical_type, is_decodable
+from hsloc.log.session.transform_topics import is_static_topic, is_transform_topic, namespace
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -23,6 +24,10 @@ TF_NAMES = ("tf", "/tf")
 TRUTH_TYPES = (definitions.ODOMETRY, definitions.POSE_STAMPED, definitions.POSE_WITH_COVARIANCE_STAMPED)
 _TRUTH_NAME = re.compile(r"ground_?truth|(^|/)truth($|/)|(^|/)gt($|/)")
 _ODOMETRY_NAME = re.compile(r"(^|/)odom(etry)?($|/)")
+SCAN_TYPES = (definitions.LASER_SCAN, definitions.MULTI_ECHO_LASER_SCAN, definitions.POINT_CLOUD2)
+"""What scans are made of, the plainest first."""
+_ECHOES = ("first", "most_intense", "last")
+"""Names under which drivers publish the echoes of one laser, the one to read first."""
 _LISTED = 12
 
 
@@ -41,17 +46,19 @@ def has_name(channel: Channel, name: str) -> bool:
     return channel.topic.lstrip("/") == name.lstrip("/")
 
 
-def carries(channel: Channel, topic: str) -> bool:
-    """Whether a channel belongs to a topic: Foxglove's transforms are found by their type, under any name."""
-    if has_name(channel, topic):
-        return True
-    is_transform = foxglove.TYPES.get(channel.typename) == definitions.TF_MESSAGE
-    return topic == TF and is_transform and not has_name(channel, TF_STATIC)
-
-
 def of_type(channels: Sequence[Channel], typename: str) -> list[str]:
     """Topics of a type that can be decoded, sorted."""
     return sorted({c.topic for c in channels if canonical_type(c.typename) == typename and is_decodable(c)})
+
+
+def names_transforms(channels: Sequence[Channel], name: str | None) -> str | None:
+    """The topic of transforms that a user names in place of odometry, as the log has it; `/tf` for `tf`."""
+    if name is None:
+        return None
+    if name in TF_NAMES:
+        return TF
+    found = sorted({c.topic for c in channels if has_name(c, name) and is_transform_topic(c)})
+    return found[0] if found and not is_static_topic(found[0]) else None
 
 
 def choose_topics(
@@ -64,8 +71,8 @@ def choose_topics(
     """
     choice = TopicSelection()
     choice.truth = _truth(where, channels, options)
-    choice.scans = _scans(where, channels, options, choice.warnings)
-    if options.odom_topic in TF_NAMES:
+    choice.scans = tuple(choose_scans(where, channels, options, choice.warnings))
+    if names_transforms(channels, options.odom_topic) is not None:
         choice.odom = TF
     else:
         others = [c for c in channels if c.topic != choice.truth and not is_truth_name(c.topic)]
@@ -96,19 +103,36 @@ def is_truth_name(topic: str) -> bool:
     return _TRUTH_NAME.search(topic) is not None
 
 
-def _scans(
+def choose_scans(
     where: str, channels: Sequence[Channel], options: ReadOptions, warnings: list[RunWarning]
-) -> tuple[str, ...]:
-    """The scan topics: the only one, or those that are named, separated by commas."""
-    candidates = of_type(channels, definitions.LASER_SCAN)
+) -> dict[str, str]:
+    """The scan topics with their types: the only one, or those that are named, separated by commas.
+
+    Plain scans come first; several echoes or clouds of points are read where there are no others, or if they are named.
+    """
+    types = [kind for kind in SCAN_TYPES if kind != definitions.POINT_CLOUD2 or options.slice is not None]
+    by_type = {kind: of_type(channels, kind) for kind in types}
+    kinds = {topic: kind for kind in reversed(types) for topic in by_type[kind]}
+    first = next((kind for kind in types if by_type[kind]), definitions.LASER_SCAN)
+    candidates = by_type[first]
     names: list[str | None] = [None]
     if options.scan_topic is not None:
         names = [*dict.fromkeys(name.strip() for name in options.scan_topic.split(","))]
-    chosen = [
-        _pick(where, channels, "scan", definitions.LASER_SCAN, candidates, name, options.require_scan, warnings)
-        for name in names
-    ]
-    return tuple(dict.fromkeys(topic for topic in chosen if topic is not None))
+        candidates = sorted(kinds)
+    elif len(candidates) > 1:
+        echoes = [topic for topic in candidates if topic.rpartition("/")[2] in _ECHOES]
+        if len(echoes) == len(candidates) and len({namespace(topic) for topic in echoes}) == 1:
+            first_echo = min(echoes, key=lambda topic: _ECHOES.index(topic.rpartition("/")[2]))
+            warnings.append(
+                RunWarning(
+                    WarningCode.SCAN_ECHOES,
+                    f"{', '.join(echoes)} are echoes of one laser; {first_echo} is used",
+                    "choose with --scan-topic",
+                )
+            )
+            names = [first_echo]
+    chosen = [_pick(where, channels, "scan", first, candidates, name, options.require_scan, warnings) for name in names]
+    return {topic: kinds[topic] for topic in chosen if topic is not None}
 
 
 def _odometry_candidates(channels: Sequence[Channel], named: bool) -> list[str]:
@@ -146,7 +170,12 @@ def _pick(
         text = f"{where}: {len(candidates)} {what} topics ({listing})"
         warning = RunWarning(WarningCode.TOPIC_AMBIGUOUS, text, remedy)
     else:
-        remedy = "without odometry a map can be built (--no-odom)" if kind == "odom" and required else ""
+        remedy = "motion can be estimated from the scans alone: --no-odom" if kind == "odom" and required else ""
+        if kind == "scan" and of_type(channels, definitions.POINT_CLOUD2):
+            remedy = (
+                "point clouds are read as scans with --slice LOW,HIGH, the heights above the base [m] between which "
+                "walls are seen"
+            )
         text = f"{where}: no {what} topic ({typename}); the log holds {listed(channels)}"
         warning = RunWarning(WarningCode.TOPIC_MISSING, text, remedy)
     if required:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_BEAMS = 20_000
+"""Maximum number of beams of a scan. Internal: guards the memory against a damaged file."""
 
 
 def beam_angles(count: int) -> tuple[float, float]:

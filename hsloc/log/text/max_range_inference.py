@@ -11,10 +11,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 NO_RETURN_CM = 8183
+"""Reading (cm) of a SICK LMS without a return."""
 CLIP_REPEATS = 3
+"""Minimum number of equal largest readings of a log that make them a clipping value."""
 CLIP_MIN = 5.0
+"""Minimum clipping value (m)."""
 RANGE_MIN = 0.02
-"""Metres; readings of zero are invalid."""
+"""Minimum range (m); readings of zero are invalid."""
 
 
 @dataclass(slots=True)

@@ -81,8 +81,10 @@ def find_format(path: Path) -> LineFormat | None:
 class TextSource:
     """A text log as events in the order of its lines: there the order is right even where the stamps are not."""
 
-    def __init__(self, path: Path, line_format: LineFormat, options: ReadOptions) -> None:
+    def __init__(self, path: Path, line_format: LineFormat, options: ReadOptions, shown: Path | None = None) -> None:
+        """`shown` is the name for messages to people, where the file is a copy of another."""
         self._path = path
+        self._shown = shown or path
         self._format = line_format
         self._options = options
         self._rule = RangeRule()
@@ -99,7 +101,7 @@ class TextSource:
                 line = parse(words)
             except (ValueError, IndexError, OverflowError) as error:
                 losses.undecodable_messages[words[0]] += 1
-                losses.note(f"{self._path}: a line {words[0]} cannot be read ({str(error)[:80]})")
+                losses.note(f"{self._shown}: a line {words[0]} cannot be read ({str(error)[:80]})")
                 continue
             yield words[0], line
 
@@ -187,7 +189,7 @@ class TextSource:
         if self._has_odometry_lines and not self._format.laser_odometry:
             odometry = {keyword: None for keyword in odometry if keyword not in kinds["scan"]}
         return LogSummary(
-            paths=(self._path,),
+            paths=(self._shown,),
             format=self._format.name,
             start_ns=first_ns,
             end_ns=last_ns,
@@ -211,11 +213,11 @@ class TextSource:
     def _check(self, has_scans: bool, has_odometry: bool) -> None:
         for flag, name in (("scan", self._options.scan_topic), ("odom", self._options.odom_topic)):
             if name is not None:
-                raise TopicError(f"{self._path}: a text log has no topics; leave out --{flag}-topic {name}")
+                raise TopicError(f"{self._shown}: a text log has no topics; leave out --{flag}-topic {name}")
         if self._options.require_scan and not has_scans:
-            raise TopicError(f"{self._path}: no laser lines in this {self._format.name} log")
+            raise TopicError(f"{self._shown}: no laser lines in this {self._format.name} log")
         if self._options.require_odometry and not has_odometry:
-            raise TopicError(f"{self._path}: no odometry lines in this {self._format.name} log")
+            raise TopicError(f"{self._shown}: no odometry lines in this {self._format.name} log")
 
     def events(self, losses: Losses) -> Iterator[tuple[int, Event]]:
         """As `Source.events`: in the order of the lines; effective stamps are the running maximum."""

@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 METRES = 0.01
+"""Unit of the format (m)."""
 BEAMS = 180
+"""Beams of each scan of the format."""
 
 
 class Wean:

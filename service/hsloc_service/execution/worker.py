@@ -60,6 +60,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, float, int], None]) -> dict[str, Any]:
     """Replay and write the results into `folder/output`; returns the summary for the job's row."""
+    from hsloc.analysis.limits import exceeded_limits
     from hsloc.evaluation import read_relations
     from hsloc.export.results_folder import write_results
     from hsloc.replay.run import run
@@ -84,7 +85,9 @@ def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, 
         progress=lambda share: report("write", share, 1.0, scans),
     )
     write_viewer(result, written.analysis, folder / "output")
-    return summarise(written.metrics, written.timings)
+    limits = exceeded_limits(spec, written.metrics)
+    found = {"outcome": "below_threshold" if limits else "ok", "limits": [line[:500] for line in limits]}
+    return found | summarise(written.metrics, written.timings)
 
 
 _SUMMARISED = ("verdict", "run", "log", "scans", "localised", "ape", "relations", "losses")
@@ -136,7 +139,7 @@ def make_spec(job: Mapping[str, Any], folder: Path) -> RunRequest:
 def linked_map(folder: Path, name: str, image: str) -> Path:
     """The map's YAML, with its image under the name that it asks for.
 
-    The name must be plain: a YAML that says `image: /etc/passwd` would have us read what was not uploaded.
+    Of a path the last name counts: a YAML that says `image: /etc/passwd` must not have us read what was not uploaded.
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
@@ -151,9 +154,16 @@ def linked_map(folder: Path, name: str, image: str) -> Path:
         wanted = values["image"]
     except (YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise MapError(f"{name}: not a map's YAML with an `image`") from error
-    if not isinstance(wanted, str) or wanted in ("", ".", "..") or "/" in wanted or "\0" in wanted or len(wanted) > 200:
-        raise MapError(f"{name}: image is {wanted!r:.100}; it must be the plain name of a file beside the YAML")
-    target = folder / "map" / wanted
+    plain = wanted.replace("\\", "/").rpartition("/")[2] if isinstance(wanted, str) else ""
+    if plain in ("", ".", "..") or "\0" in plain or len(plain) > 200:
+        raise MapError(f"{name}: image is {wanted!r:.100}; it must name a file")
+    if plain != wanted:
+        # The path is of another machine: the image is the one that was uploaded, never a file of this machine.
+        values["image"] = plain
+        path.unlink()
+        with path.open("w", encoding="utf-8") as file:
+            YAML(typ="safe", pure=True).dump(values, file)
+    target = folder / "map" / plain
     if not target.exists():
         target.symlink_to(folder / "map" / image)
     return path

@@ -236,6 +236,10 @@ class JobView(BaseModel):
     ended: AwareDatetime | None
     progress: ProgressView | None
     heartbeat_age_s: float | None = Field(description="seconds since the job's supervisor said that it lives")
+    outcome: Literal["ok", "below_threshold"] | None = Field(
+        description="of a job that succeeded: below_threshold if its result does not keep a limit of the request, such "
+        "as min_localised; `summary.limits` names them"
+    )
     summary: dict[str, Any] | None
 
 

@@ -57,6 +57,7 @@ def job_view(row: JobRow) -> JobView:
         ended=moment(row.ended),
         progress=progress,
         heartbeat_age_s=max(now - (row.heartbeat or now), 0.0) if running else None,
+        outcome=(row.summary or {}).get("outcome"),
         summary=row.summary,
     )
 

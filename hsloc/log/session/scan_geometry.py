@@ -1,0 +1,277 @@
+"""Scans as drivers publish them: fields that contradict each other, and turns that come in segments.
+
+`survey` looks at the first scans of a topic and says what does not fit; `ScanFixes` are what the user wants overridden;
+`TurnAssembler` makes one scan of the segments of a turn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import inf, isfinite, nan, pi, radians
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from hsloc.errors import ConfigError
+from hsloc.warnings import WarningCode
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from hsloc.log.messages.decode import ScanMessage
+
+_TURN = 2.0 * pi
+_LONGEST_TURN = 1.25 * _TURN
+"""Some lidars measure a little more than a turn (rad)."""
+_WIDEST_SEGMENT = pi
+"""A segment of a turn spans at most half of it (rad)."""
+_SPARE_BEAMS = 2.5
+"""By so many beams drivers may be off where they count the last beam, or round (beams)."""
+_LEAST_DISAGREEMENT = radians(2.0)
+"""Angles that fit within this are not worth a word (rad)."""
+_LONGEST_SWEEP, _SHORTEST_SWEEP = 1.5, 0.25
+"""A lidar that turns once between two scans measures its beams in as large a part of the interval as they span of a
+turn; a sweep that takes a smaller or larger part of that than this is an error of the driver, or of another lidar."""
+_FAR_SHARE = 0.05
+"""Finite readings beyond range_max that are worth a word, as a part of all finite ones: cheap lidars have stray ones, a
+hundredth of all in a real log."""
+_CODE_SHARE = 0.5
+"""Readings beyond range_max of which more than this part have one value are a code for no return."""
+
+
+class Problem(NamedTuple):
+    """What does not fit in the scans of a topic, and what to do."""
+
+    code: str
+    text: str
+    remedy: str
+
+
+@dataclass(frozen=True, slots=True)
+class ScanFixes:
+    """Fields of scans that are overridden (`--scan-fix`). None and False leave the field as it is.
+
+    `increment` is an angle in radians, or `angles` (from angle_min, angle_max and the number of beams) or `negate`;
+    `degrees` says that all angles are in degrees; `time_increment` is a time in seconds, or `interval` (from the time
+    between scans); `range_max` is in metres.
+    """
+
+    increment: float | str | None = None
+    degrees: bool = False
+    time_increment: float | str | None = None
+    range_max: float | None = None
+
+    @staticmethod
+    def parse(text: str | None) -> ScanFixes:
+        """From `name=value` items with commas between. Raises ConfigError naming the item."""
+        items = [item.strip() for item in text.split(",")] if text else []
+        values: dict[str, float | str | bool] = {}
+        words = {"increment": ("angles", "negate"), "time_increment": ("interval",), "angles": ("degrees",)}
+        for item in items:
+            name, _, text = item.partition("=")
+            if name not in ("increment", "time_increment", "range_max", "angles"):
+                raise ConfigError(
+                    f"--scan-fix {item}: {name!r} is unknown; known are increment, time_increment, range_max, angles"
+                )
+            if text in words.get(name, ()):
+                values["degrees" if name == "angles" else name] = True if name == "angles" else text
+                continue
+            try:
+                number = float(text)
+            except ValueError:
+                number = nan
+            allowed = " or ".join([*words.get(name, ()), *(["a number"] if name != "angles" else [])])
+            if not isfinite(number) or name == "angles" or (name == "range_max" and number <= 0.0):
+                raise ConfigError(f"--scan-fix {item}: {text!r} must be {allowed}")
+            values[name] = number
+        return ScanFixes(**values)  # type: ignore[arg-type]
+
+    def apply(self, message: ScanMessage, interval_s: float | None) -> ScanMessage:
+        """The message with the fields overridden; `interval_s` is the usual time between scans."""
+        low, increment, high = message.angle_min, message.angle_increment, message.angle_max
+        if self.degrees:
+            low, increment, high = radians(low), radians(increment), radians(high)
+        if self.increment == "angles" and len(message.ranges) > 1 and isfinite(high):
+            increment = (high - low) / (len(message.ranges) - 1)
+        elif self.increment == "negate":
+            increment = -increment
+        elif isinstance(self.increment, float):
+            increment = self.increment
+        step = message.time_increment
+        if self.time_increment == "interval":
+            step = abs(increment) / _TURN * interval_s if interval_s is not None else step
+        elif isinstance(self.time_increment, float):
+            step = self.time_increment
+        return message._replace(
+            angle_min=low,
+            angle_increment=increment,
+            angle_max=high,
+            time_increment=step,
+            range_max=message.range_max if self.range_max is None else self.range_max,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ScanSurvey:
+    """What the first scans of a topic say: the usual time between them (s), segments of a turn, and what is wrong.
+
+    `segments` is how many messages make a turn, 1 where each is a whole scan; `first_angle` that of the segment with
+    which a turn begins (rad). `sweep_is_wrong`: time_increment cannot be that of the lidar.
+    """
+
+    interval_s: float | None = None
+    segments: int = 1
+    first_angle: float = 0.0
+    sweep_is_wrong: bool = False
+    problems: tuple[Problem, ...] = ()
+
+
+def survey(messages: Iterable[ScanMessage]) -> ScanSurvey:
+    """Look at scans of one topic, in the order of the log."""
+    scans = [message for message in messages if len(message.ranges) > 1]
+    if not scans:
+        return ScanSurvey()
+    steps = np.diff([scan.stamp_ns for scan in scans])
+    steps = steps[steps > 0]
+    interval = float(np.median(steps)) / 1e9 if len(steps) else None
+    segments, first_angle = _segments(scans)
+    turn = None if interval is None else interval * segments
+    problems = [problem for problem in (_angles(scans[0]), _ranges(scans)) if problem is not None]
+    sweep = _sweep(scans[0], turn)
+    if sweep is not None:
+        problems.append(sweep)
+    return ScanSurvey(turn, segments, first_angle, sweep is not None, tuple(problems))
+
+
+def _angles(scan: ScanMessage) -> Problem | None:
+    """Whether angle_min, angle_max, the increment and the number of beams fit each other."""
+    low, increment, high, beams = scan.angle_min, scan.angle_increment, scan.angle_max, len(scan.ranges)
+    if not (isfinite(low) and isfinite(increment)) or increment == 0.0:
+        return None
+    known = [angle for angle in (low, high) if isfinite(angle)]
+    if max(map(abs, known)) > _TURN + _LEAST_DISAGREEMENT and abs(increment) * (beams - 1) > 1.5 * _TURN:
+        fits = abs(increment) * (beams - 1) <= 360.0 + _SPARE_BEAMS * abs(increment)
+        text = f"angles from {low:g} to {high:g} with steps of {increment:g} are no radians"
+        return Problem(
+            WarningCode.SCAN_ANGLE_UNIT, text, "--scan-fix angles=degrees reads them as degrees" if fits else _REPAIR
+        )
+    if not isfinite(high):
+        return None
+    end = low + (beams - 1) * increment
+    tolerance = max(_LEAST_DISAGREEMENT, _SPARE_BEAMS * abs(increment))
+    # A full turn may be written to end where it began, and angles may be written with or without a turn.
+    is_one_turn = abs(increment) * (beams - 1) <= _LONGEST_TURN
+    if is_one_turn and min(abs(end - high + turn) for turn in (-_TURN, 0.0, _TURN)) <= tolerance:
+        return None
+    text = (
+        f"angle_min {low:.4f} and {beams} beams of angle_increment {increment:.5f} end at {end:.4f} rad, angle_max is "
+        f"{high:.4f}"
+    )
+    remedy = "find out which is right: --scan-fix increment=angles takes angle_max's, increment=VALUE any other"
+    if abs(low - (beams - 1) * increment - high) <= tolerance:
+        text += ": they differ by the sign of the increment, and the scan is mirrored if that is wrong"
+        remedy = "--scan-fix increment=negate takes the sign of angle_max's"
+    return Problem(WarningCode.SCAN_ANGLE_INCREMENT, text, remedy)
+
+
+_REPAIR = "repair the driver; --scan-fix overrides a field"
+
+
+def _ranges(scans: Sequence[ScanMessage]) -> Problem | None:
+    """Whether readings beyond range_max are measured: then they are dropped, and range_max is wrong."""
+    limit = scans[0].range_max
+    if not isfinite(limit):
+        return None
+    readings = np.concatenate([scan.ranges[np.isfinite(scan.ranges)] for scan in scans])
+    beyond = readings[readings > limit * (1.0 + 1e-6)]
+    if len(beyond) <= _FAR_SHARE * max(len(readings), 1):
+        return None
+    _, counts = np.unique(beyond, return_counts=True)
+    if counts.max() > _CODE_SHARE * len(beyond):
+        return None
+    share, farthest = 100.0 * len(beyond) / len(readings), float(np.percentile(beyond, 99.0))
+    return Problem(
+        WarningCode.SCAN_RANGE_MAX,
+        f"{share:.0f} % of the finite readings lie beyond range_max, {limit:g} m, and are discarded, as the message's "
+        "definition asks",
+        f"--scan-fix range_max={np.ceil(farthest + 0.5):g} uses them, if the lidar measures as far",
+    )
+
+
+def _sweep(scan: ScanMessage, interval_s: float | None) -> Problem | None:
+    """Whether time_increment fits the time between scans, for a lidar that turns once a scan."""
+    beams, step = len(scan.ranges), scan.time_increment
+    span = abs(scan.angle_increment) * (beams - 1)
+    if interval_s is None or interval_s > 1.0 or not isfinite(step) or step == 0.0 or not 0.0 < span <= 2.0 * _TURN:
+        return None
+    sweep, expected = abs(step) * (beams - 1), interval_s * min(span / _TURN, 1.0)
+    if _SHORTEST_SWEEP * expected <= sweep <= max(_LONGEST_SWEEP * expected, 1.05 * interval_s):
+        return None
+    return Problem(
+        WarningCode.SCAN_TIME_INCREMENT,
+        f"{beams} beams of time_increment {step:g} s take {sweep:g} s, a scan comes every {interval_s:.3f} s",
+        "--scan-fix time_increment=interval takes the time between scans; it matters for --deskew alone",
+    )
+
+
+def _segments(scans: Sequence[ScanMessage]) -> tuple[int, float]:
+    """How many messages make a turn, and the angle with which it begins; (1, 0.0) where each is a scan of its own."""
+    first = scans[0]
+    span = len(first.ranges) * abs(first.angle_increment)
+    if len(scans) < 6 or not 0.0 < span <= _WIDEST_SEGMENT + _LEAST_DISAGREEMENT:
+        return 1, 0.0
+    starts = [scan.angle_min for scan in scans]
+    alike = sum(_follows(a, b) for a, b in pairwise(scans))
+    if alike < 0.5 * (len(scans) - 1) or len({round(start, 3) for start in starts}) < 2:
+        return 1, 0.0
+    rising = first.angle_increment > 0.0
+    begin = min(starts) if rising else max(starts)
+    places = [k for k, start in enumerate(starts) if abs(start - begin) <= _SPARE_BEAMS * abs(first.angle_increment)]
+    turns = np.diff(places)
+    if len(turns) == 0:
+        return 1, 0.0
+    return int(np.median(turns)), begin
+
+
+def _follows(first: ScanMessage, second: ScanMessage) -> bool:
+    """Whether a segment begins where the one before ended."""
+    end = first.angle_min + len(first.ranges) * first.angle_increment
+    off = (second.angle_min - end + pi) % _TURN - pi
+    tolerance = _SPARE_BEAMS * abs(first.angle_increment) + 1e-3
+    return abs(off) <= tolerance and abs(second.angle_increment - first.angle_increment) <= 1e-6
+
+
+class TurnAssembler:
+    """Makes one scan of the segments of each turn, every beam at the time of its segment.
+
+    A turn begins with the segment at `first_angle`; one that lacks a segment is given as far as it goes without a gap.
+    """
+
+    def __init__(self, survey: ScanSurvey) -> None:
+        self._survey = survey
+        self._parts: list[ScanMessage] = []
+
+    def add(self, message: ScanMessage) -> Iterator[ScanMessage]:
+        """Take a segment; the turns that are complete with it."""
+        begins = abs(message.angle_min - self._survey.first_angle) <= _SPARE_BEAMS * abs(message.angle_increment)
+        if self._parts and (begins or not _follows(self._parts[-1], message)):
+            yield self._turn()
+        self._parts.append(message)
+        if len(self._parts) >= self._survey.segments:
+            yield self._turn()
+
+    def _turn(self) -> ScanMessage:
+        parts, self._parts = self._parts, []
+        first, last = parts[0], parts[-1]
+        before = sum(len(part.ranges) for part in parts[:-1])
+        step = (last.stamp_ns - first.stamp_ns) / 1e9 / before if before else first.time_increment
+        intensities = [part.intensities for part in parts if part.intensities is not None]
+        return first._replace(
+            ranges=np.concatenate([part.ranges for part in parts]),
+            intensities=np.concatenate(intensities) if len(intensities) == len(parts) else None,
+            time_increment=step,
+            scan_time=self._survey.interval_s or first.scan_time,
+            angle_max=last.angle_max,
+            range_max=max((part.range_max for part in parts), default=inf),
+        )

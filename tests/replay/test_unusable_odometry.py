@@ -1,0 +1,133 @@
+"""Odometry that does not move or has no heading is ignored with a warning; a robot is followed by its lidar alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import log_formats
+import numpy as np
+import pytest
+
+from hsloc.evaluation import evaluate
+from hsloc.log import ReadOptions, open_log
+from hsloc.log.messages import definitions, encode
+from hsloc.log.messages.decode import odometry as decode_odometry
+from hsloc.model import Odometry, Pose2, Scan
+from hsloc.preprocessing.odometry_watch import OdometryWatch, UnusableOdometry
+from hsloc.replay.run import run
+from hsloc.request import RunRequest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+OFFICE = Path(__file__).resolve().parents[2] / "recordings" / "office.mcap"
+END = ReadOptions(end_s=14.0)
+
+
+def rewritten(target: Path, change: Callable[[int, Pose2], Pose2 | None]) -> Path:
+    """The office with other odometry: `change` gets number and pose of a message; None is a quaternion of zeros."""
+
+    def items() -> list[log_formats.Message]:
+        found, number = [], 0
+        for schema, channel, log_time, data in log_formats.messages(OFFICE):
+            if channel.topic == "/tf":
+                continue
+            if schema.name == definitions.ODOMETRY and channel.topic == "/odom":
+                message = decode_odometry(data)
+                pose = change(number, message.pose)
+                number += 1
+                kept = message.pose if pose is None else pose
+                data = encode.odometry(message.stamp_ns, kept, None, (0.0, 0.0, 0.0), ("odom", "base_link"))
+                if pose is None:
+                    at = len(data) - 680
+                    data = data[: at + 24] + bytes(32) + data[at + 56 :]
+            found.append((schema, channel, log_time, data))
+        return found
+
+    return log_formats.write(target, items(), OFFICE)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda number, pose: Pose2(0.0, 0.0, 0.0), "does not move"),
+        (lambda number, pose: pose if number < 200 else Pose2(1.0, 2.0, 0.5), "does not move"),
+        (lambda number, pose: None, "never set"),
+    ],
+    ids=["zero", "freezes", "no heading"],
+)
+def test_unusable_odometry_is_ignored_with_a_warning(
+    tmp_path: Path, change: Callable[[int, Pose2], Pose2 | None], reason: str
+) -> None:
+    log = rewritten(tmp_path / "log.mcap", change)
+    result = run(RunRequest(logs=(log,), read=END))
+    (warning,) = [warning for warning in result.warnings if warning.code == "odometry_unusable"]
+    assert reason in warning.text
+    assert result.lidar_only
+    assert result.mode == "localise"
+    assert result.localised.all()
+    assert result.reference is not None
+    errors = evaluate(result.trajectory, result.reference).ape.trans_part
+    assert errors.rmse < 0.02
+    assert errors.max < 0.1
+
+
+def test_sound_odometry_is_kept(tmp_path: Path) -> None:
+    result = run(RunRequest(logs=(OFFICE,), read=END))
+    assert not result.lidar_only
+    assert result.warnings == ()
+
+
+def test_a_map_is_built_without_the_odometry_that_does_not_move(tmp_path: Path) -> None:
+    log = rewritten(tmp_path / "log.mcap", lambda number, pose: Pose2(0.0, 0.0, 0.0))
+    result = run(RunRequest(logs=(log,), read=END, mode="slam"))
+    assert any(warning.code == "odometry_unusable" for warning in result.warnings)
+    assert result.reference is not None
+    assert evaluate(result.trajectory, result.reference, alignment="se2").ape.trans_part.rmse < 0.03
+
+
+def test_lidar_alone_on_a_given_map_gives_the_same_bytes_twice() -> None:
+    request = RunRequest(logs=(OFFICE,), read=END, mode="localise", no_odometry=True)
+    first, second = run(request), run(request)
+    assert first.trajectory.poses.tobytes() == second.trajectory.poses.tobytes()
+    assert len(first.odometry) == len(first.diagnostics)
+
+
+# The watch by itself.
+
+
+def still(seconds: float, changed: float, moving_odometry: bool) -> list[Odometry | Scan]:
+    """Odometry at 50 Hz and scans at 10 Hz, of which a part of the beams changes from scan to scan."""
+    rng = np.random.default_rng(3)
+    base = rng.uniform(1.0, 8.0, 360).astype(np.float32)
+    events: list[Odometry | Scan] = []
+    for tick in range(int(seconds * 50)):
+        stamp = tick * 20_000_000
+        events.append(Odometry(stamp, Pose2(1e-6 * tick if moving_odometry else 0.0, 0.0, 0.0)))
+        if tick % 5 == 0:
+            ranges = (base + rng.normal(0.0, 0.01, 360)).astype(np.float32)
+            beams = rng.random(360) < changed
+            ranges[beams] = rng.uniform(0.5, 9.0, int(beams.sum()))
+            events.append(Scan(stamp, ranges, -3.14, 0.01745, 0.05, 12.0))
+    return events
+
+
+@pytest.mark.parametrize(
+    ("changed", "moving_odometry"), [(0.0, False), (0.25, False), (0.95, True)], ids=["at rest", "in a crowd", "moves"]
+)
+def test_a_robot_at_rest_and_odometry_that_ticks_raise_nothing(changed: float, moving_odometry: bool) -> None:
+    events = still(60.0, changed, moving_odometry)
+    assert list(OdometryWatch(events)) == events
+
+
+def test_a_robot_that_moves_without_odometry_is_noticed_within_seconds() -> None:
+    passed: list[Odometry | Scan] = []
+    with pytest.raises(UnusableOdometry, match="does not move"):
+        passed.extend(OdometryWatch(still(60.0, 0.95, False)))  # type: ignore[arg-type]
+    assert len(passed) < 6 * 60
+
+
+def test_the_watch_needs_no_pass_of_its_own_over_a_real_log() -> None:
+    events = list(open_log(OFFICE).events())
+    assert list(OdometryWatch(events)) == events

@@ -104,7 +104,7 @@ FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
 """Least covariance of a motion (m^2, rad^2). Internal: a part of a cell, keeps the equations solvable."""
 _FORGET = 0.05
 """Weight of a new match in the usual fitness."""
-_LONGEST_PREDICTION = 4.0
+_LONGEST_PREDICTION = 2.0
 """Periods of the scans for which a velocity is trusted."""
 _KNOWN = 0.85
 """A point is spared whose nearest node scores as much: the local map has one within a part of a cell."""
@@ -187,9 +187,9 @@ class FrontEnd:
         stamp, pose = self._last if self._last is not None else (paired.scan.stamp_ns, self._T_map_key)
         seconds = max((paired.scan.stamp_ns - stamp) * 1e-9, 0.0)
         periods = min(seconds / self._period, _LONGEST_PREDICTION)
-        # A clock that jumps makes wild velocities: no step of a period is predicted longer than the window is wide.
+        # A clock that jumps makes wild velocities: no step is predicted longer than the window is wide.
         most = np.array((p.no_odometry_window, p.no_odometry_window, p.no_odometry_window_angle))
-        step = np.clip(self._velocity, -most, most) * periods
+        step = np.clip(self._velocity * periods, -most, most)
         motion = self._T_map_key.between(pose @ Pose2(float(step[0]), float(step[1]), float(step[2])))
         return motion, np.diag((most / p.window_sigmas) ** 2)
 

@@ -1,3 +1,7 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 from test_point_to_line import room_scan, terms
@@ -7,18 +11,24 @@ from hsloc.kernels.registration import Prior, RegistrationParameters, Scene, add
 from hsloc.model import Pose2, Scan
 from hsloc.slam.keyscans import KeyScan, KeyScans
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    F64 = NDArray[np.float64]
+    Room = tuple[KeyScans, F64, Pose2]
+
 PARAMETERS = RegistrationParameters((0.3, 0.2, 0.15), 0.33, 100.0, np.inf, 10)
 
 
-def scene(first_moving, poses, scans):
+def scene(first_moving: int, poses: F64, scans: KeyScans) -> Scene:
     return Scene(first_moving, poses, scans.arrays(10_000))
 
 
-def naive_pairs(pose, first_moving, scan_poses, scans, gate):
+def naive_pairs(pose: F64, first_moving: int, scan_poses: F64, scans: KeyScans, gate: float) -> tuple[F64, F64, F64]:
     """The same equations by numeric derivatives of the relative poses, pair by pair."""
     information, gradient, counts = np.zeros((3, 3)), np.zeros(3), np.zeros(5)
 
-    def relative(at, k, m, moving_first):
+    def relative(at: F64, k: int, m: int, moving_first: bool) -> F64:
         moved = Pose2.from_array(at) @ Pose2.from_array(scan_poses[k])
         fixed = Pose2.from_array(scan_poses[m])
         return (fixed.between(moved) if moving_first else moved.between(fixed)).to_array()
@@ -42,7 +52,7 @@ def naive_pairs(pose, first_moving, scan_poses, scans, gate):
 
 
 @pytest.fixture(scope="module")
-def room():
+def room() -> Room:
     """Two scans that stand still and two that move together, one of them a companion mounted behind."""
     still = [Pose2(2.0, 1.5, 0.3), Pose2(2.2, 1.6, 0.2)]
     base, companion = Pose2(2.5, 1.8, 0.5), Pose2(-0.3, 0.1, 0.4)
@@ -51,7 +61,7 @@ def room():
     return KeyScans.from_scans(scans), poses, base
 
 
-def test_equations_are_those_of_the_pairs(room):
+def test_equations_are_those_of_the_pairs(room: Room) -> None:
     scans, poses, base = room
     pose = base.to_array() + np.array((0.04, -0.03, 0.01))
     information, gradient, counts = np.zeros((3, 3)), np.zeros(3), np.zeros(5)
@@ -62,7 +72,7 @@ def test_equations_are_those_of_the_pairs(room):
     np.testing.assert_allclose(counts, wanted[2], rtol=1e-9)
 
 
-def test_a_scan_finds_its_pose(room):
+def test_a_scan_finds_its_pose(room: Room) -> None:
     scans, poses, base = room
     pose = base.to_array() + np.array((0.12, -0.1, 0.05))
     prior = np.eye(3) * 1e-3
@@ -73,7 +83,7 @@ def test_a_scan_finds_its_pose(room):
     assert counts[1] == 0
 
 
-def corridor_scan(reach=4.0):
+def corridor_scan(reach: float = 4.0) -> Scan:
     """A laser in a corridor 2 m wide without an end, that sees `reach` metres."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, 181)
     with np.errstate(divide="ignore"):
@@ -81,7 +91,7 @@ def corridor_scan(reach=4.0):
     return Scan(0, np.where(ranges < reach, ranges, np.inf).astype(np.float32), -np.pi / 2, np.pi / 180.0, 0.05, reach)
 
 
-def test_along_a_corridor_the_prior_decides():
+def test_along_a_corridor_the_prior_decides() -> None:
     """A field of scores pulls such a scan back to where both overlap; here nothing pulls along the walls."""
     scans = KeyScans.from_scans([KeyScan.of(corridor_scan()), KeyScan.of(corridor_scan())])
     poses, prior = np.zeros((2, 3)), np.diag((100.0, 100.0, 100.0))
@@ -93,7 +103,7 @@ def test_along_a_corridor_the_prior_decides():
     assert information[0, 0] < 1e-3 * information[1, 1]
 
 
-def test_a_refuted_prior_loses_its_weight(room):
+def test_a_refuted_prior_loses_its_weight(room: Room) -> None:
     scans, poses, base = room
     predicted = base.to_array() + np.array((0.0, 0.0, 0.6))
     prior = np.diag((1e6, 1e6, 1e5))

@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import json
 from dataclasses import replace
 
@@ -10,7 +12,7 @@ N = 200
 
 
 @pytest.fixture
-def lap():
+def lap() -> Recorded:
     """Two laps of a square of 10 m, keyscans each 0.4 m; the second lap sees the walls of the first."""
     s = np.arange(N) * 0.4 % 40.0
     side, along = (s // 10.0).astype(int), s % 10.0
@@ -33,16 +35,16 @@ def lap():
     )
 
 
-def codes(recorded):
+def codes(recorded: Recorded) -> tuple[str, list[str]]:
     found = weigh(recorded)
     return found.verdict, [reason.code for reason in found.reasons]
 
 
-def test_a_right_map_is_good(lap):
+def test_a_right_map_is_good(lap: Recorded) -> None:
     assert codes(lap) == ("good", [])
 
 
-def test_refused_steps_that_no_loop_spans_are_named(lap):
+def test_refused_steps_that_no_loop_spans_are_named(lap: Recorded) -> None:
     refused = lap.refused.copy()
     refused[150:153] = True
     found = weigh(replace(lap, refused=refused))
@@ -56,7 +58,7 @@ def test_refused_steps_that_no_loop_spans_are_named(lap):
     assert codes(spanned) == ("good", []), "a loop from 10 to 110 holds what lies between"
 
 
-def test_one_refused_step_matters_if_it_may_hide_much(lap):
+def test_one_refused_step_matters_if_it_may_hide_much(lap: Recorded) -> None:
     refused = lap.refused.copy()
     refused[150] = True
     assert codes(replace(lap, refused=refused)) == ("good", [])
@@ -66,33 +68,33 @@ def test_one_refused_step_matters_if_it_may_hide_much(lap):
 
 
 @pytest.mark.parametrize(("wrong", "verdict"), [(5, "check"), (40, "failed")])
-def test_second_visits_that_look_through_walls_are_wrong(lap, wrong, verdict):
+def test_second_visits_that_look_through_walls_are_wrong(lap: Recorded, wrong: int, verdict: str) -> None:
     counts = lap.counts.copy()
     counts[20 : 20 + wrong, :2] = (50.0, 100.0)
     assert codes(replace(lap, counts=counts)) == (verdict, ["second-visit"])
 
 
-def test_a_person_who_stands_in_the_way_is_no_wrong_map(lap):
+def test_a_person_who_stands_in_the_way_is_no_wrong_map(lap: Recorded) -> None:
     counts = lap.counts.copy()
     counts[20:22, :2] = (50.0, 100.0)
     assert codes(replace(lap, counts=counts)) == ("good", [])
 
 
-def test_odometry_that_contradicts_is_told_where_no_loop_spans(lap):
-    odometry = lap.odometry.copy()
+def test_odometry_that_contradicts_is_told_where_no_loop_spans(lap: Recorded) -> None:
+    odometry = lap.poses.copy()
     odometry[150:, 0] += 8.0
     assert codes(replace(lap, odometry=odometry)) == ("check", ["odometry"])
-    within = lap.odometry.copy()
+    within = lap.poses.copy()
     within[50:, 0] += 8.0
     assert codes(replace(lap, odometry=within)) == ("good", [])
     assert codes(replace(lap, odometry=None)) == ("good", [])
 
 
-def test_loops_that_contradict_each_other_are_told(lap):
+def test_loops_that_contradict_each_other_are_told(lap: Recorded) -> None:
     assert codes(replace(lap, torn=np.array([(20, 120), (30, 140)]))) == ("check", ["torn-loop"])
 
 
-def test_what_the_lidar_did_not_see_is_told(lap):
+def test_what_the_lidar_did_not_see_is_told(lap: Recorded) -> None:
     motions = lap.motions.copy()
     motions[60:70, 0] = 3.0
     assert codes(replace(lap, motions=motions)) == ("check", ["blind"])

@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +14,7 @@ from hsloc.simulation.presets import preset
 from hsloc.slam.front_end import odometry_chi, odometry_scale
 
 
-def test_the_weight_of_the_odometry_is_what_its_steps_deserve():
+def test_the_weight_of_the_odometry_is_what_its_steps_deserve() -> None:
     noise, random = OdometryNoise(), np.random.default_rng(0)
     motion = Pose2(0.3, 0.0, 0.2)
     root = np.linalg.cholesky(noise.covariance(motion) + np.diag((0.005, 0.005, 0.002)) ** 2)
@@ -33,7 +35,7 @@ def test_the_weight_of_the_odometry_is_what_its_steps_deserve():
     ],
     ids=["80 deg", "reversed", "1 m"],
 )
-def test_a_step_that_odometry_has_wrong_is_found_by_the_scans(slip):
+def test_a_step_that_odometry_has_wrong_is_found_by_the_scans(slip: Slip) -> None:
     """An 80 degree turn that did not happen was refused, and the rest of the map turned with it."""
     events, truth = drive("office", duration_s=25.0, seed=4, slips=(slip,))
     result, _ = mapped(events)
@@ -41,7 +43,7 @@ def test_a_step_that_odometry_has_wrong_is_found_by_the_scans(slip):
     assert result.evidence.verdict == "good"
 
 
-def test_a_lidar_that_sees_four_metres_does_not_shorten_corridors():
+def test_a_lidar_that_sees_four_metres_does_not_shorten_corridors() -> None:
     """The mean score pulled every step back to where the scans overlapped most."""
     sensor = replace(preset("corridor-loop").sensor, range_max=4.0)
     events, truth = drive("corridor-loop", duration_s=30.0, seed=2, sensor=sensor)

@@ -133,3 +133,17 @@ def test_rare_directions_are_chosen_in_full() -> None:
     assert count == 20
     assert (np.diff(rows) > 0).all()
     assert np.ptp(rows[rows < 90]) > 70, "spread over the whole wall"
+
+
+def test_what_lies_beyond_a_short_range_was_not_looked_through() -> None:
+    """A lidar that sees 4 m has no return from farther walls: they are no conflict with what another scan saw there."""
+    pose = Pose2(1.0, 2.0, 0.0)
+    far = room_scan(pose)
+    short = Scan(0, np.where(far.ranges < 4.0, far.ranges, np.inf).astype(np.float32), far.angle_min, DEGREE, 0.05, 4.0)
+    scans = KeyScans.from_scans([KeyScan.of(far), KeyScan.of(short)])
+    _, _, counts = terms(scans, 0, 1, (0.0, 0.0, 0.0))
+    assert counts[1] == 0
+    assert counts[0] > 60
+    near = KeyScans.from_scans([KeyScan.of(room_scan(Pose2(3.5, 2.0, 0.0))), KeyScan.of(short)])
+    _, _, counts = terms(near, 0, 1, (0.0, 0.0, 0.0))
+    assert counts[1] > 10, "a wall 2.5 m ahead was looked through"

@@ -95,14 +95,14 @@ class Recorded:
         """Metres to each keyscan from the one before."""
         return np.asarray(np.hypot(self.motions[:, 0], self.motions[:, 1]), dtype=np.float64)
 
-    def spanned(self) -> Bools:
-        """Steps (n,) that lie between the two ends of an accepted loop: a wrong one would have kept it from closing."""
+    def spanned(self, loops: int = 1) -> Bools:
+        """Steps (n,) that lie between the two ends of so many accepted loops: a wrong one would have kept them open."""
         change = np.zeros(len(self.poses) + 1, dtype=np.int64)
         if len(self.loops):
             low, high = self.loops.min(axis=1), self.loops.max(axis=1)
             np.add.at(change, low + 1, 1)
             np.add.at(change, high + 1, -1)
-        return np.asarray(np.cumsum(change)[: len(self.poses)] > 0)
+        return np.asarray(np.cumsum(change)[: len(self.poses)] >= loops)
 
 
 _SECOND_VISIT_M = 12.0
@@ -117,8 +117,14 @@ _FAILED_SHARE = 0.1
 """Share of all second visits that fail a map."""
 _OPEN_STEPS = 3
 """Refused steps in a row that no loop spans: fewer are bridged by the scans around them."""
-_OPEN_SIGMA_M = 0.5
-"""Standard deviation [m] of such steps together, of which one is enough."""
+_OPEN_SIGMA_M = 0.4
+"""Standard deviation [m] of such steps together, of which one is enough: that of a step that the scans contradicted."""
+_OPEN_LOOPS = 2
+"""Accepted loops that verify the steps between their ends."""
+_HEALED = 0.9
+"""Consistency of the scans before and after refused steps at which these did no harm, as is asked of a loop."""
+_HEALED_WITHIN = 10
+"""Keyscans before and after that are compared."""
 _WINDOW = 20
 """Keyscans over which odometry and map are compared."""
 _ODOMETRY_SHARE = 0.5
@@ -153,16 +159,26 @@ def nothing_seen() -> Evidence:
 
 
 def _open_joints(r: Recorded) -> Reason | None:
-    """Runs of steps that only odometry holds, and that no accepted loop spans."""
+    """Runs of steps that only odometry holds: one loop over several of them shares out their errors as it likes."""
     wrong = []
-    for first, last in _runs(r.refused & ~r.spanned()):
+    for first, last in _runs(r.refused & ~r.spanned(_OPEN_LOOPS)):
         sigma = float(np.sqrt(np.trace(r.covariances[first : last + 1, :2, :2].sum(axis=0))))
-        if last - first + 1 >= _OPEN_STEPS or sigma > _OPEN_SIGMA_M:
+        if (last - first + 1 >= _OPEN_STEPS or sigma > _OPEN_SIGMA_M) and not _healed(r, first, last):
             wrong.append((first, last))
     if not wrong:
         return None
-    text = f"{len(wrong)} joint(s) of the map are held by odometry alone: the scans refused it, and no loop spans them"
+    text = (
+        f"{len(wrong)} joint(s) of the map are held by odometry alone: the scans refused it, and fewer than two loops span it"
+    )
     return _reason(r, "open-joint", text, wrong, failed=False)
+
+
+def _healed(r: Recorded, first: int, last: int) -> bool:
+    """Whether the scans just before and after refused steps agree in the finished map after all."""
+    i, j = r.pairs.min(axis=1), r.pairs.max(axis=1)
+    across = (i < first) & (j >= last) & (j - i <= last - first + _HEALED_WITHIN)
+    paired, conflict = r.counts[across, :2].sum(axis=0)
+    return bool(paired >= _VISIT_SEEN and paired >= _HEALED * (paired + conflict))
 
 
 def _second_visits(r: Recorded) -> Reason | None:

@@ -54,8 +54,24 @@ def test_refused_steps_that_no_loop_spans_are_named(lap: Recorded) -> None:
     assert reason.places == (tuple(lap.poses[152, :2]),)
     assert reason.times_s == ((149.0, 152.0),)
     assert json.loads(json.dumps(found.to_dict()))["reasons"][0]["code"] == "open-joint"
-    spanned = replace(lap, refused=np.roll(refused, -100))
-    assert codes(spanned) == ("good", []), "a loop from 10 to 110 holds what lies between"
+    once = replace(lap, refused=np.roll(refused, -100))
+    assert codes(once) == ("check", ["open-joint"]), "a single loop shares out the errors of what it spans"
+    assert codes(replace(once, loops=np.array([(10, 110), (20, 120)]))) == ("good", [])
+
+
+@pytest.mark.parametrize(("counts", "codes_wanted"), [((90.0, 5.0), []), ((60.0, 60.0), ["open-joint"])])
+def test_scans_around_refused_steps_may_agree_after_all(
+    lap: Recorded, counts: tuple[float, float], codes_wanted: list[str]
+) -> None:
+    refused = lap.refused.copy()
+    refused[150:153] = True
+    around = replace(
+        lap,
+        refused=refused,
+        pairs=np.vstack((lap.pairs, (149, 154))),
+        counts=np.vstack((lap.counts, (*counts, 150.0, 0.0, 90.0))),
+    )
+    assert codes(around)[1] == codes_wanted
 
 
 def test_one_refused_step_matters_if_it_may_hide_much(lap: Recorded) -> None:

@@ -167,9 +167,7 @@ def _open_joints(r: Recorded) -> Reason | None:
             wrong.append((first, last))
     if not wrong:
         return None
-    text = (
-        f"{len(wrong)} joint(s) of the map are held by odometry alone: the scans refused it, and fewer than two loops span it"
-    )
+    text = f"{len(wrong)} joint(s) are held by odometry alone: the scans refused it, fewer than two loops span it"
     return _reason(r, "open-joint", text, wrong, failed=False)
 
 

@@ -25,6 +25,7 @@ RUN useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin hslo
 COPY --from=build /venv /venv
 COPY --from=build /opt/hsloc /opt/hsloc
 ENV PATH=/venv/bin:$PATH HSLOC_SERVE_DATA=/data PORT=8000 PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 \
+    HSLOC_SANDBOX=if-possible \
     NUMBA_CACHE_DIR=/tmp/hsloc/numba MPLCONFIGDIR=/tmp/hsloc/matplotlib
 USER 10001
 VOLUME /data

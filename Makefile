@@ -12,15 +12,16 @@ demo: $(VENV)/.demo  ## replay a fixture recording on its map and show the error
 	$(BIN)/hsloc replay recordings/office.mcap --unknown-start --out results/demo --overwrite
 	@echo "Look at results/demo/report.png, or open results/demo/run.mcap in Lichtblick or Foxglove."
 
-# The kernels run twice: compiled, where coverage cannot see into them, and as plain Python, where it can.
+# The kernels run twice: compiled, where coverage cannot see into them, and as plain Python, where it can. Each run has a
+# data file of its own, as pytest-cov erases what is beside its own.
+COVERAGE := build/coverage
 test: $(VENV)/.dev  ## all tests on all cores, and the coverage gate (pyproject: fail_under)
-	rm -f .coverage .coverage.*
-	$(PYTEST) --cov --cov-report=
-	mv .coverage .coverage.compiled
-	NUMBA_DISABLE_JIT=1 $(PYTEST) -p no:cacheprovider --cov --cov-report= tests/kernels
-	mv .coverage .coverage.plain
-	$(BIN)/coverage combine -q .coverage.compiled .coverage.plain
-	$(BIN)/coverage report
+	rm -rf $(COVERAGE) && mkdir -p $(COVERAGE)/compiled $(COVERAGE)/plain
+	COVERAGE_FILE=$(COVERAGE)/compiled/data $(PYTEST) --cov --cov-report= --cov-fail-under=0
+	NUMBA_DISABLE_JIT=1 COVERAGE_FILE=$(COVERAGE)/plain/data \
+		$(PYTEST) -p no:cacheprovider --cov --cov-report= --cov-fail-under=0 tests/kernels
+	$(BIN)/coverage combine -q --data-file=$(COVERAGE)/data $(COVERAGE)/compiled/data $(COVERAGE)/plain/data
+	$(BIN)/coverage report --data-file=$(COVERAGE)/data
 
 lint: $(VENV)/.dev  ## style, types and the direction of imports
 	$(BIN)/ruff check .

@@ -20,18 +20,22 @@ import time
 import urllib.error
 import urllib.request
 import uuid
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hsloc.errors import HslocError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
+    from os import PathLike
 
 TUS = {"Tus-Resumable": "1.0.0"}
+MIN_BLOCK = 64 << 10
 ENDED = ("succeeded", "failed", "crashed", "cancelled")
 _AGAIN = (408, 423, 429, 500, 502, 503, 504)
 _LONGEST_WAIT_S = 30.0
+FIRST_CONTACT_S = 3.0
+"""A server that has never answered is given up after this time; one that has answered is waited for."""
 
 
 class ClientError(HslocError):
@@ -64,12 +68,14 @@ class Client:
             raise ClientError(f"{url}: not the address of a service; it begins with http:// or https://")
         self.url = url.rstrip("/")
         self._token, self._attempts, self._timeout_s, self._block = token, attempts, timeout_s, block
+        self._has_answered = False
 
-    def upload(self, path: Path, progress: Callable[[int, int], None] | None = None) -> str:
+    def upload(self, path: str | PathLike[str], progress: Callable[[int, int], None] | None = None) -> str:
         """Upload a file in blocks and check its SHA-256; the id that the server gave it.
 
         `progress` gets bytes done and bytes in all.
         """
+        path = Path(path)
         try:
             with path.open("rb") as file:
                 size = file.seek(0, 2)
@@ -102,6 +108,9 @@ class Client:
                 failures = 0
             except ClientError as error:
                 failures += 1
+                if error.status == 413 and self._block > MIN_BLOCK:
+                    self._block //= 2  # a proxy takes smaller bodies only: nginx 1 MiB, unless it is configured
+                    continue
                 if failures >= self._attempts or (error.status not in (None, 409, 460, *_AGAIN)):
                     raise
                 time.sleep(min(0.2 * 2.0**failures, _LONGEST_WAIT_S))
@@ -143,8 +152,9 @@ class Client:
                 return job
             time.sleep(every_s)
 
-    def download(self, job_id: str, folder: Path) -> list[Path]:
+    def download(self, job_id: str, folder: str | PathLike[str]) -> list[Path]:
         """All files of the results into a folder, each checked against the manifest."""
+        folder = Path(folder)
         manifest = self.request("GET", f"/v1/jobs/{job_id}/results").json()
         paths = []
         try:
@@ -179,12 +189,15 @@ class Client:
         self, method: str, path: str, body: bytes | None = None, headers: Mapping[str, str] | None = None
     ) -> Answer:
         """A request that may be sent again, and is, with growing waits or as the server says."""
+        begin = time.monotonic()
         for attempt in range(1, self._attempts + 1):
             try:
                 return self._once(method, path, body, headers)
             except _Again as error:
                 if attempt == self._attempts:
                     raise ClientError(str(error), error.status) from error
+                if not self._has_answered and time.monotonic() - begin > FIRST_CONTACT_S:
+                    raise ClientError(f"{error}; is the server running, and the address right?") from error
                 time.sleep(min(error.wait_s or 0.2 * 2.0**attempt, _LONGEST_WAIT_S))
         raise ClientError(f"{self.url}: no attempt was allowed")
 
@@ -199,8 +212,10 @@ class Client:
             request.add_header("Authorization", f"Bearer {self._token}")
         try:
             with urllib.request.urlopen(request, timeout=self._timeout_s) as answer:
+                self._has_answered = True
                 return Answer(answer.status, answer.headers, answer.read())
         except urllib.error.HTTPError as error:
+            self._has_answered = True
             with error:
                 message = f"{self.url}: {_reason(error)}"
                 if error.code in _AGAIN:

@@ -7,6 +7,7 @@ import difflib
 import json
 import typing
 from dataclasses import dataclass, field, replace
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -22,7 +23,6 @@ from hsloc.slam.point_mapper import PointMapperParameters
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
-    from os import PathLike
 
     from hsloc.matching.match import Matcher
 
@@ -99,13 +99,13 @@ def combined(
 
     Raises ConfigError. What a ROS 2 parameter file has to warn of is added to `warnings`.
     """
-    if source is None or isinstance(source, dict):
-        config = from_dict(Config, source or {}, base)
+    if isinstance(source, str | PathLike):
+        config = load(Path(source), base, warnings)
     else:
-        config = load(Path(typing.cast("str", source)), base, warnings)
+        config = from_dict(Config, {} if source is None else source, base)
     if chosen:
         config = replace(config, **typing.cast("Any", dict(chosen)))
-    settings = list(settings)
+    settings = [settings] if isinstance(settings, str) else list(settings)
     if not settings:
         return config
     values = nested(settings, config.matcher)

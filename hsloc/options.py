@@ -34,6 +34,8 @@ MAPPERS = ("graph", "point")
 PRESETS = ("default", "paper", "paper-literal")
 ALIGNMENTS = ("none", "origin", "se2")
 STAMPS = ("header", "log")
+AUTO = "auto"
+"""Value of `time_offset` that has it estimated."""
 VERDICTS = ("check", "failed")
 
 
@@ -156,7 +158,7 @@ OPTIONS: tuple[Option, ...] = (
     ),
     Option(
         name="time_offset", flag="--time-offset", kind="topics", metavar="TOPIC=S", place="read", group=_READING,
-        help="Add seconds to the stamps of a topic [s]; several, or with commas.",
+        help="Add seconds to the stamps of a topic [s]; several, or with commas; auto estimates them from the data.",
     ),
     Option(
         name="stamps", flag="--stamps", kind="choice", choices=STAMPS, default="header", place="read", group=_READING,

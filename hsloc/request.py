@@ -11,7 +11,7 @@ from hsloc.config import Config, combined, differences, preset
 from hsloc.errors import ConfigError
 from hsloc.log import ReadOptions
 from hsloc.model.pose2 import Pose2, wrap_angle
-from hsloc.options import ALIGNMENTS, BY_NAME, MODES, OPTIONS, PRESETS, VERDICTS, merged
+from hsloc.options import ALIGNMENTS, BY_NAME, MATCHERS, MODES, OPTIONS, PRESETS, VERDICTS, merged
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -63,6 +63,17 @@ class RunRequest:
     bare_names: bool = False
 
     def __post_init__(self) -> None:
+        if isinstance(self.logs, str | os.PathLike):
+            object.__setattr__(self, "logs", (self.logs,))
+        object.__setattr__(self, "logs", tuple(Path(log) for log in self.logs))
+        for name in ("map_path", "resume", "relations"):
+            if isinstance(getattr(self, name), str):
+                object.__setattr__(self, name, Path(getattr(self, name)))
+        if self.own_matcher is not None and not callable(getattr(self.own_matcher, "match", None)):
+            raise ConfigError(
+                f"matcher is {self.own_matcher!r:.80}; it must be one of {', '.join(MATCHERS)}, or an object with the "
+                "method match(points, field, window, rng) of hsloc.Matcher"
+            )
         for name, choices in (("mode", MODES), ("alignment", ALIGNMENTS), ("preset", PRESETS), ("fail_if", VERDICTS)):
             value = getattr(self, name)
             if value is not None and value not in choices:
@@ -144,9 +155,15 @@ class RunRequest:
         found |= {name: getattr(self.config, name) for name in ("matcher", "mapper")}
         base = replace(base, matcher=self.config.matcher, mapper=self.config.mapper)
         found["set"] = differences(self.config, base)
-        if self.reference is not None and self.bare_names and Path(self.reference).exists():
-            found["reference"] = Path(self.reference).name
+        found["reference"] = self.reference_name
         return found
+
+    @property
+    def reference_name(self) -> str | None:
+        """What the reference is called in reports."""
+        if self.reference is not None and self.bare_names and Path(self.reference).exists():
+            return Path(self.reference).name
+        return self.reference
 
     @property
     def matcher(self) -> Matcher:

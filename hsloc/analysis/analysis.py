@@ -17,7 +17,7 @@ from hsloc.analysis.metrics import (
     run_identity,
     scan_counts,
 )
-from hsloc.analysis.quality import quality_warnings, verdict_reasons
+from hsloc.analysis.quality import offset_warnings, quality_warnings, verdict_reasons
 from hsloc.analysis.scan_statistics import ConvergenceSample, ExtrinsicsCheck, Residuals
 from hsloc.analysis.second_pass import posed_events
 from hsloc.errors import EvaluationError
@@ -74,8 +74,8 @@ def analyse(
     map, and se2 on a built one, whose frame is its own. `observer` sees each event of the second pass, for a
     recording of it. Raises EvaluationError for relations that cannot be used, and LogError where the log has changed.
     """
-    scans, spec, lasers = len(result.diagnostics), result.spec, len(result.summary.lasers)
-    likelihood, matcher = _likelihood(result), spec.matcher
+    scans, request, lasers = len(result.diagnostics), result.request, len(result.summary.lasers)
+    likelihood, matcher = _likelihood(result), request.matcher
     residuals = Residuals(result.grid)
     check = ExtrinsicsCheck(likelihood, matcher, scans, lasers)
     sample = ConvergenceSample(likelihood, matcher, scans)
@@ -85,8 +85,9 @@ def analyse(
         if posed.localised and isinstance(posed.event, PairedScan):
             for statistics in (residuals, check, sample):
                 statistics.add(posed.event.scan, posed.T_map_base)
-    errors = _Errors(result, spec.alignment or ("se2" if result.mode == "slam" else "none"))
-    warnings = (*result.warnings, *quality_warnings(result), *residuals.warnings(), *check.warnings())
+    errors = _Errors(result, request.alignment or ("se2" if result.mode == "slam" else "none"))
+    found = (*quality_warnings(result), *offset_warnings(result), *residuals.warnings(), *check.warnings())
+    warnings = (*result.warnings, *found)
     reasons = verdict_reasons(result, warnings)
     metrics = RunMetrics(
         verdict=verdict_of(reasons),
@@ -108,21 +109,21 @@ def analyse(
         relations=_relations(result),
     )
     return Analysis(
-        metrics, errors.whole, errors.odometry_alone, errors.odometry, sample.curves(spec.matcher_name.upper())
+        metrics, errors.whole, errors.odometry_alone, errors.odometry, sample.curves(request.matcher_name.upper())
     )
 
 
 def _likelihood(result: Result) -> LikelihoodField | None:
     """The field that was matched on, else one of the built map, which may take seconds; None where nothing needs it."""
-    needed = isinstance(result.spec.matcher, HarmonySearch) or len(result.summary.lasers) > 1
+    needed = isinstance(result.request.matcher, HarmonySearch) or len(result.summary.lasers) > 1
     if not needed or not result.grid.occupied().any():
         return None
-    parameters = result.spec.config.likelihood_field
+    parameters = result.request.config.likelihood_field
     return result.likelihood or LikelihoodField.from_grid(result.grid, parameters.sigma)
 
 
 def _relations(result: Result) -> RelationsResult | None:
-    path = result.spec.relations
+    path = result.request.relations
     return None if path is None else evaluate_relations(result.trajectory, read_relations(path))
 
 

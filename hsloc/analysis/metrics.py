@@ -37,23 +37,23 @@ if TYPE_CHECKING:
 
 def run_identity(result: Result) -> RunIdentity:
     """What was run."""
-    spec = result.spec
+    request = result.request
     return RunIdentity(
         hsloc=__version__,
         mode=result.mode,
-        inputs=spec.names(),
+        inputs=request.names(),
         input_sha256=result.input_sha256,
         map=_map_name(result),
-        seed=spec.seed,
-        preset=spec.preset,
+        seed=request.seed,
+        preset=request.preset,
         matcher=result.matcher_name,
     )
 
 
 def _map_name(result: Result) -> str:
     if result.mode == "slam":
-        return "built" if result.spec.resume is None else f"{result.spec.resume.name}, extended"
-    return "log" if result.spec.map_path is None else result.spec.map_path.name
+        return "built" if result.request.resume is None else f"{result.request.resume.name}, extended"
+    return "log" if result.request.map_path is None else result.request.map_path.name
 
 
 def log_metrics(result: Result) -> LogMetrics:
@@ -63,7 +63,7 @@ def log_metrics(result: Result) -> LogMetrics:
         LaserSummary(summary.scan_topic or "", summary.laser_frame or "", summary.T_base_laser, summary.laser_flipped,
                      summary.extrinsics),
     )  # fmt: skip
-    reference = summary.truth_topic if result.spec.reference is None else result.spec.reference
+    reference = result.request.reference_name or summary.truth_topic
     return LogMetrics(
         duration_s=duration(result),
         odometry_messages=len(result.odometry),

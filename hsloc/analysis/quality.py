@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.model.estimate import Status
 from hsloc.model.verdict import Verdict, VerdictReason
+from hsloc.slam.time_offset import Headings, find_offset, offset_warning, offsets_of_log
 from hsloc.trajectory_io.tum import NS_PER_S
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -24,6 +26,7 @@ _VERDICTS = {
     WarningCode.LASER_MISFIT: Verdict.CHECK,
     WarningCode.EXTRINSICS_DISAGREE: Verdict.CHECK,
     WarningCode.ODOMETRY_JUMPS: Verdict.CHECK,
+    WarningCode.CLOCK_OFFSET_LARGE: Verdict.CHECK,
 }
 """Warnings that concern the whole result, with the verdict that each alone gives."""
 
@@ -44,6 +47,40 @@ def quality_warnings(result: Result) -> list[RunWarning]:
             f"{without} of {scans} scans found no place on the map, so {meaning}",
             "check map, mounting (--laser-pose) and odometry (hsloc check), or give the start (--initial-pose)",
         )
+    ]
+
+
+def offset_warnings(result: Result) -> list[RunWarning]:
+    """Whether scans and odometry are stamped by clocks, or at moments, that differ: by the headings of the result.
+
+    The pose of a matched scan follows what the lidar saw; odometry with the same stamp should have turned as much.
+    """
+    known = (WarningCode.CLOCK_OFFSET, WarningCode.CLOCK_OFFSET_LARGE, WarningCode.CLOCK_OFFSET_APPLIED)
+    if result.lidar_only or not len(result.odometry) or any(w.code in known for w in result.warnings):
+        return []
+    stamps, odometry = result.diagnostics.stamps_ns, result.odometry
+    matched = np.array([status in (Status.MATCHED, Status.RELOCALISED) for status in result.diagnostics.status])
+    if result.mapping is not None:
+        theta = result.mapping.scan_poses[:, 2]
+    else:
+        # A match corrects the poses from the next odometry message on.
+        rows = np.searchsorted(odometry.stamps_ns, stamps)
+        matched &= rows < len(odometry)
+        rows = np.minimum(rows, len(odometry) - 1)
+        there = np.interp(stamps, odometry.stamps_ns, np.unwrap(odometry.poses[:, 2]))
+        theta = result.trajectory.poses[rows, 2] - odometry.poses[rows, 2] + there
+    scans = Headings.of(stamps[matched], theta[matched])
+    offset = find_offset(scans, Headings.of(odometry.stamps_ns, odometry.poses[:, 2]))
+    if not offset.is_significant:
+        return []
+    # Poses are weighed with the odometry, which hides a part of the offset: the scans alone show the whole of it.
+    spec = result.request
+    found = offsets_of_log(spec.logs, spec.reading(), spec.config.graph_mapper.front_end)
+    given = spec.read.offsets_s()
+    return [
+        offset_warning(topic, each, given.get(topic.lstrip("/"), 0.0))
+        for topic, each in found.items()
+        if each.is_significant
     ]
 
 

@@ -8,8 +8,7 @@ from hsloc.log import open_log
 from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.preprocessing.odometry_resets import ContinuousOdometry
-from hsloc.replay.engine import pair
-from hsloc.replay.garbage import seldom_collected
+from hsloc.replay.engine import pair, seldom_collected
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -34,7 +33,7 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
     odometry since the last message: within one message the correction hardly changes. `progress` is called with the
     part that is done.
     """
-    log = open_log(result.spec.logs, result.spec.reading())
+    log = open_log(result.request.logs, result.request.reading())
     poses, odometry, localised = result.trajectory.poses, result.odometry.poses, result.localised
     first = None if result.follows_scans else Pose2.from_array(odometry[0])
     row = -1

@@ -72,11 +72,11 @@ def fixture() -> Path | None:
 
 def time_replay(log: Path, repeats: int) -> ReplayTiming:
     """Replay `log` with the defaults once to warm up, `repeats` times by the clock and once taken to pieces."""
-    spec = RunRequest(logs=(log,))
-    run(spec)
+    request = RunRequest(logs=(log,))
+    run(request)
     seconds = []
     for _ in range(repeats):
-        result = run(spec)
+        result = run(request)
         seconds.append(result.seconds)
     diagnostics = result.diagnostics
     return ReplayTiming(
@@ -86,7 +86,7 @@ def time_replay(log: Path, repeats: int) -> ReplayTiming:
         matched=diagnostics.status.count("matched"),
         replay=Timing.of([one["replay"] for one in seconds]),
         whole=Timing.of([one["open"] + one["prepare"] + one["replay"] for one in seconds]),
-        parts=_parts(spec),
+        parts=_parts(request),
     )
 
 
@@ -104,12 +104,12 @@ class _Timed:
         return match
 
 
-def _parts(spec: RunRequest) -> dict[str, float]:
+def _parts(request: RunRequest) -> dict[str, float]:
     """Seconds of reading (unpacking and decoding the log), of searching, and of all else."""
-    log = open_log(spec.logs)
-    grid, _ = find_map(spec, log)
+    log = open_log(request.logs)
+    grid, _ = find_map(request, log)
     if grid is None:
-        raise MapError(f"{spec.logs[0]}: the log has no /map")
+        raise MapError(f"{request.logs[0]}: the log has no /map")
     config = Config()
     field = LikelihoodField.from_grid(grid, config.likelihood_field.sigma, config.likelihood_field.margin)
     stated = log.initial_pose()

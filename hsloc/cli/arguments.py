@@ -119,7 +119,7 @@ def add_no_progress(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--no-progress", action="store_true", help="Show no progress bar.")
 
 
-def request(arguments: argparse.Namespace) -> RunRequest:
+def run_request(arguments: argparse.Namespace) -> RunRequest:
     """The run that the arguments describe; warnings of a configuration file go to stderr."""
     from hsloc.request import RunRequest
 

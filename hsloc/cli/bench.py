@@ -22,11 +22,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "parts", nargs="*", type=_part, metavar="PART", help=f"of {', '.join(_PARTS)} (default: all)"
     )  # fmt: skip
     parser.add_argument(
-        "--cases", type=Path, metavar="FILE.npz", help="matching cases: real scans, a map, starts that are off"
+        "--cases", type=Path, metavar="FILE.npz", help="Matching cases: real scans, a map, and starts with an error."
     )
-    parser.add_argument("--quick", action="store_true", help="small inputs, few repeats: does it work at all")
-    parser.add_argument("--json", action="store_true", help="print the results as JSON on stdout")
-    parser.add_argument("-q", "--quiet", action="store_true", help="show no progress")
+    parser.add_argument(
+        "--quick", action="store_true", help="Use small inputs and few repetitions, to see that it works."
+    )
+    parser.add_argument("--json", action="store_true", help="Print the results as JSON on stdout.")
+    parser.add_argument("-q", "--quiet", action="store_true", help="Show no progress.")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ from hsloc.cli.progress import ProgressLine
 if TYPE_CHECKING:
     import argparse
 
-    from hsloc.log import CheckReport, Finding
+    from hsloc.log import CheckReport, Finding, Log
 
 HELP = "check a log for what spoils results"
 EXAMPLES = """
@@ -24,10 +24,10 @@ EXAMPLES = """
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `hsloc check`."""
-    parser.add_argument("log", nargs="+", metavar="LOG", help="the log: a file, its parts, or a folder with them")
+    parser.add_argument("log", nargs="+", metavar="LOG", help="Log: a file, its parts, or a folder with them.")
     add_read_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print errors and damage only")
+    parser.add_argument("--json", action="store_true", help="Print everything as JSON.")
+    parser.add_argument("-q", "--quiet", action="store_true", help="Print errors and damage only.")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -40,6 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
     start, span = log.summary.start_ns, max(log.summary.end_ns - log.summary.start_ns, 1)
     with ProgressLine(arguments.quiet or arguments.json or arguments.no_progress) as line:
         report = check_log(log, lambda log_time: line.show("check", (log_time - start) / span))
+    findings = (*report.findings, *_of_clocks(arguments, log))
+    report = replace(report, findings=findings)
     if arguments.json:
         from json import dumps
 
@@ -49,6 +51,23 @@ def run(arguments: argparse.Namespace) -> int:
     if report.has_errors:
         return 1
     return 3 if report.losses.data_lost else 0
+
+
+def _of_clocks(arguments: argparse.Namespace, log: Log) -> list[Finding]:
+    """The offset between the stamps of scans and odometry, where the motion determines it."""
+    from hsloc.errors import HslocError
+    from hsloc.log import Finding, Severity
+    from hsloc.slam.front_end import FrontEndParameters
+    from hsloc.slam.time_offset import offset_warning, offsets_of_log
+
+    if log.summary.scan_topic is None or log.summary.odom_topic is None:
+        return []
+    try:
+        found = offsets_of_log(log.summary.paths, read_options(arguments), FrontEndParameters())
+    except HslocError:  # What stands in the way is among the findings.
+        return []
+    warnings = [(topic, offset_warning(topic, offset)) for topic, offset in found.items() if offset.is_significant]
+    return [Finding(w.code, Severity.WARNING, topic, w.text, w.remedy, 1) for topic, w in warnings]
 
 
 def _values(report: CheckReport, paths: list[str], start_ns: int) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from hsloc.cli.arguments import CONFIG_OPTIONS, add_options, request
+from hsloc.cli.arguments import CONFIG_OPTIONS, add_options, run_request
 
 if TYPE_CHECKING:
     import argparse
@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.config import to_dict
     from hsloc.parameter_reference import commented_yaml
 
-    chosen = request(arguments).config
+    chosen = run_request(arguments).config
     if arguments.json:
         import json
 

@@ -23,12 +23,12 @@ EXAMPLES = """
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `hsloc convert`."""
-    parser.add_argument("log", metavar="IN", help="the log, or a folder with its parts")
-    parser.add_argument("out", metavar="OUT.mcap", help="the file to write")
+    parser.add_argument("log", metavar="IN", help="Log, or a folder with its parts.")
+    parser.add_argument("out", metavar="OUT.mcap", help="File to write.")
     add_read_arguments(parser)
-    parser.add_argument("--force", action="store_true", help="overwrite OUT.mcap")
-    parser.add_argument("--json", action="store_true", help="print the counts as JSON")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing but losses and errors")
+    parser.add_argument("--force", action="store_true", help="Overwrite OUT.mcap.")
+    parser.add_argument("--json", action="store_true", help="Print the counts as JSON.")
+    parser.add_argument("-q", "--quiet", action="store_true", help="Print losses and errors only.")
 
 
 def run(arguments: argparse.Namespace) -> int:

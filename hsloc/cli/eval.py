@@ -37,32 +37,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", nargs="+", metavar="POSES", help="REFERENCE ESTIMATE ..., or RESULTS ...")
     parser.add_argument(
         "--alignment", "-a", choices=("none", "origin", "se2", "se3"), default="none",
-        help="move the estimate onto the reference first: by its first pose, or by least squares (default: none)",
+        help="Align the estimate with the reference first: by its first pose, or by least squares (default: none).",
     )  # fmt: skip
     parser.add_argument(
         "--t-max-diff", type=_not_negative, default=0.01, metavar="S",
-        help="pair poses at most this far apart in time, seconds (default: 0.01)",
+        help="Largest time difference of a pair of poses [s] (default: 0.01).",
     )  # fmt: skip
     parser.add_argument(
-        "--t-offset", type=float, default=0.0, metavar="S", help="seconds to add to the estimate's stamps"
+        "--t-offset", type=float, default=0.0, metavar="S", help="Time that is added to the estimate's stamps [s]."
     )
     parser.add_argument(
         "--association", choices=("nearest", "interpolation"), default="nearest",
-        help="take the nearest pose, or interpolate the denser trajectory at the stamps of the other",
+        help="Take the nearest pose, or interpolate the denser trajectory at the stamps of the other.",
     )  # fmt: skip
     parser.add_argument(
-        "--delta", type=_positive, default=1.0, metavar="N", help="length of the RPE's pieces (default: 1)"
+        "--delta", type=_positive, default=1.0, metavar="N", help="Length of the pieces of the RPE (default: 1)."
     )
-    parser.add_argument("--delta-unit", choices=("m", "s", "frames"), default="m", help="its unit (default: m)")
-    parser.add_argument("--all-pairs", action="store_true", help="RPE: a piece starts at every pose")
-    parser.add_argument("--relations", metavar="FILE", help="score by relations too: `t1 t2 x y z roll pitch yaw`")
+    parser.add_argument("--delta-unit", choices=("m", "s", "frames"), default="m", help="Unit of --delta (default: m).")
+    parser.add_argument("--all-pairs", action="store_true", help="Begin a piece of the RPE at every pose.")
     parser.add_argument(
-        "--no-reference", action="store_true", help="with --relations: all files are estimates, none the reference"
+        "--relations",
+        metavar="FILE",
+        help="File of relative poses to evaluate against, too: `t1 t2 x y z roll pitch yaw` a line.",
     )
     parser.add_argument(
-        "--save-results", type=Path, metavar="DIR", help="write evo's result files there, for evo_res: a zip a measure"
+        "--no-reference",
+        action="store_true",
+        help="All files are estimates and none is the reference; with --relations.",
     )
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument(
+        "--save-results", type=Path, metavar="DIR", help="Write result files for evo_res there, a zip for each measure."
+    )
+    parser.add_argument("--json", action="store_true", help="Print JSON.")
 
 
 def run(arguments: argparse.Namespace) -> int:

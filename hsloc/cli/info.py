@@ -1,4 +1,4 @@
-"""Say what is in a log, what is wrong with it, and what hsloc would make of it."""
+"""Show what is in a log, what is wrong with it, and how hsloc would read it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from hsloc.log import Log, LogSummary, Losses
     from hsloc.model import Pose2
 
-HELP = "say what is in a log"
+HELP = "show what is in a log"
 EXAMPLES = """
   hsloc info run.mcap
   hsloc info bag_folder --quick --json
@@ -23,10 +23,10 @@ YEAR_2000_NS = 946_684_800_000_000_000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `hsloc info`."""
-    parser.add_argument("log", nargs="+", metavar="LOG", help="the log: a file, its parts, or a folder with them")
+    parser.add_argument("log", nargs="+", metavar="LOG", help="Log: a file, its parts, or a folder with them.")
     add_read_arguments(parser)
-    parser.add_argument("--quick", action="store_true", help="do not read it all in search of damage")
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    parser.add_argument("--quick", action="store_true", help="Do not read all of it in search of damage.")
+    parser.add_argument("--json", action="store_true", help="Print everything as JSON.")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import logging
 import os
 import signal
 import sys
@@ -112,6 +113,8 @@ def program() -> None:
     """
     if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")
+    # Without a writable home matplotlib keeps its fonts among the temporary files, and says so in two long lines.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     warnings.formatwarning = lambda message, *_, **__: f"hsloc: warning: {message}\n"
     status = main()
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping, Sequence
+    from typing import Any
 
+    from hsloc.report.table import Row
     from hsloc.run_metrics import RunMetrics, RunTimings
     from hsloc.warnings import RunWarning
 
@@ -50,26 +52,42 @@ def print_warnings(warnings: Iterable[RunWarning]) -> None:
         print(f"hsloc: warning: {warning}", file=sys.stderr)
 
 
+def print_job(summary: Mapping[str, Any]) -> None:
+    """The result of a job of the service, as `print_summary` and `print_warnings` show that of a replay."""
+    from hsloc.dataclass_json import from_json
+    from hsloc.model.verdict import VerdictReason
+    from hsloc.report.table import Row, reason_text
+    from hsloc.warnings import RunWarning
+
+    # A server of an earlier version sends warnings as text, and no figures.
+    found = [
+        RunWarning("", each) if isinstance(each, str) else from_json(RunWarning, each) for each in summary["warnings"]
+    ]
+    print_warnings(found)
+    verdict = summary.get("metrics", {}).get("verdict")
+    lines = [] if verdict is None else [f"verdict: {verdict}"]
+    lines += [f"  {reason_text(from_json(VerdictReason, each))}" for each in summary.get("verdict_reasons", ())]
+    _print(lines + _table([Row(each["name"], tuple(each["values"])) for each in summary.get("figures", ())]))
+
+
 def print_summary(metrics: RunMetrics, timings: RunTimings, folder: Path) -> None:
     """The verdict, the figures as the reports show them, how fast the run was, and where the results are."""
+    _print(summary_lines(metrics, timings, folder))
+
+
+def _print(lines: Iterable[str]) -> None:
+    """On stdout; a terminal without the degree sign gets a question mark, not a traceback."""
     encoding = sys.stdout.encoding or "utf-8"
-    for line in summary_lines(metrics, timings, folder):
-        # A terminal without the degree sign gets a question mark, not a traceback.
+    for line in lines:
         print(line.encode(encoding, "replace").decode(encoding))
 
 
 def summary_lines(metrics: RunMetrics, timings: RunTimings, folder: Path) -> list[str]:
     """The lines of `print_summary`."""
-    from hsloc.report.table import format_duration, format_length, table_rows
+    from hsloc.report.table import format_duration, format_length, reason_text, table_rows
 
-    lines = [f"verdict: {metrics.verdict}", *(f"  {reason.text}" for reason in metrics.verdict_reasons)]
-    rows = table_rows(metrics)
-    width = max(len(row.label) for row in rows) + 2
-    if any(len(row.values) == 2 for row in rows):
-        lines.append(f"{'':<{width}}{'translation':>12}{'rotation':>12}")
-    for row in rows:
-        values = "".join(f"{value:>12}" for value in row.values) if len(row.values) == 2 else f"  {row.values[0]}"
-        lines.append(f"{row.label:<{width}}{values}")
+    lines = [f"verdict: {metrics.verdict}", *(f"  {reason_text(reason)}" for reason in metrics.verdict_reasons)]
+    lines += _table(table_rows(metrics))
     if metrics.errors is not None:
         lines.append(
             f"compared with the reference: {metrics.errors.matched} pairs, alignment {metrics.errors.alignment}"
@@ -79,9 +97,15 @@ def summary_lines(metrics: RunMetrics, timings: RunTimings, folder: Path) -> lis
     lines.append(f"path {format_length(metrics.log.path_length_m)} in {format_duration(metrics.log.duration_s)}")
     if timings.times_real_time:
         work = timings.seconds["replay"] + timings.seconds.get("finish", 0.0)
-        lines.append(
-            f"replay: {work:.2f} s, {timings.times_real_time:.0f}x real time; "
-            f"with opening, analysis and reports {sum(timings.seconds.values()):.1f} s"
-        )
+        lines.append(f"replay: {work:.2f} s, {timings.times_real_time:.0f}x real time")
     lines.append(f"results: {folder}")
+    return lines
+
+
+def _table(rows: Sequence[Row]) -> list[str]:
+    width = max((len(row.label) for row in rows), default=0) + 2
+    lines = [f"{'':<{width}}{'translation':>12}{'rotation':>12}"] if any(len(row.values) == 2 for row in rows) else []
+    for row in rows:
+        values = "".join(f"{value:>12}" for value in row.values) if len(row.values) == 2 else f"  {row.values[0]}"
+        lines.append(f"{row.label:<{width}}{values}")
     return lines

@@ -34,7 +34,7 @@ EXAMPLES = """
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `hsloc record`."""
-    parser.add_argument("out", nargs="?", metavar="OUT.mcap", help="the log to write")
+    parser.add_argument("out", nargs="?", metavar="OUT.mcap", help="Log to write.")
     what = parser.add_argument_group("what to drive")
     what.add_argument(
         "--world",
@@ -42,68 +42,75 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="office, corridor-loop, hall, paper, ... (--list), or a file: a nav2 map (.yaml), "
         "a text of segments `x0 y0 x1 y1`, or one of points `x y`",
     )
-    what.add_argument("--scenario", metavar="NAME", help="a world together with what goes wrong in it (--list)")
+    what.add_argument("--scenario", metavar="NAME", help="A world together with its faults (--list).")
     what.add_argument(
-        "--waypoints", metavar="FILE", help="the way: a text of points `x y`; closed where the last is the first"
+        "--waypoints",
+        metavar="FILE",
+        help="Path of the robot: a text of points `x y` [m]; closed if the last is the first.",
     )
-    what.add_argument("--list", action="store_true", help="list worlds and scenarios, and end")
-    what.add_argument("--seed", type=seed, metavar="N", help="of all noise (default: 0)")
-    what.add_argument("--duration", type=float, metavar="S", help="seconds to record (default: as long as the way is)")
-    what.add_argument("--laps", type=float, metavar="N", help="times round the way (default: the scenario's)")
-    what.add_argument("--speed", type=float, metavar="M/S", help="the robot's top speed")
-    what.add_argument("--people", type=int, metavar="N", help="people walking about")
+    what.add_argument("--list", action="store_true", help="List worlds and scenarios, and exit.")
+    what.add_argument("--seed", type=seed, metavar="N", help="Seed of all noise (default: 0).")
     what.add_argument(
-        "--map-resolution", type=float, metavar="M", help="side of a cell of /map (default: 0.05; paper 0.1)"
+        "--duration", type=float, metavar="S", help="Time to record [s] (default: until the end of the path)."
+    )
+    what.add_argument("--laps", type=float, metavar="N", help="Number of laps (default: the scenario's).")
+    what.add_argument("--speed", type=float, metavar="M/S", help="Largest speed of the robot [m/s].")
+    what.add_argument("--people", type=int, metavar="N", help="Number of people who walk about.")
+    what.add_argument(
+        "--map-resolution", type=float, metavar="M", help="Side of a cell of /map [m] (default: 0.05; paper 0.1)."
     )
 
     lidar = parser.add_argument_group("lidar")
-    lidar.add_argument("--beams", type=int, metavar="N", help="readings a scan")
-    lidar.add_argument("--fov", type=float, metavar="DEG", help="field of view")
-    lidar.add_argument("--range-max", type=float, metavar="M", help="beyond it, readings are +inf")
-    lidar.add_argument("--range-noise", type=float, metavar="M", help="standard deviation of a reading")
-    lidar.add_argument("--dropout", type=float, metavar="P", help="share of readings that are lost, 0 to 1")
+    lidar.add_argument("--beams", type=int, metavar="N", help="Number of beams of a scan.")
+    lidar.add_argument("--fov", type=float, metavar="DEG", help="Field of view [deg].")
+    lidar.add_argument("--range-max", type=float, metavar="M", help="Largest range; beyond it, readings are +inf [m].")
+    lidar.add_argument("--range-noise", type=float, metavar="M", help="Standard deviation of a range [m].")
+    lidar.add_argument("--dropout", type=float, metavar="P", help="Share of readings that are lost [0 to 1].")
     lidar.add_argument(
         "--mounting",
         type=pose,
         metavar="X,Y,YAW",
-        help="of the laser on the base, metres and radians (write --mounting=-0.1,0,1.57 for a leading minus)",
+        help="Pose of the laser in the base frame: x, y [m], yaw [rad].",
     )
-    lidar.add_argument("--upside-down", action="store_true", default=None, help="the laser hangs head down")
+    lidar.add_argument("--upside-down", action="store_true", default=None, help="Mount the laser upside down.")
     lidar.add_argument(
-        "--motion-distortion", action="store_true", default=None, help="each beam at its own time during the sweep"
+        "--motion-distortion",
+        action="store_true",
+        default=None,
+        help="Measure each beam at its own time during the sweep.",
     )
-    lidar.add_argument("--scan-rate", type=float, metavar="HZ", help="scans a second")
+    lidar.add_argument("--scan-rate", type=float, metavar="HZ", help="Rate of the scans [Hz].")
 
     odometry = parser.add_argument_group("odometry (Probabilistic Robotics, Table 5.6)")
     for number, meaning in enumerate(
-        ("turns from turning", "turns from driving", "way from driving", "way from turning"), 1
+        ("turns from turning", "turns from driving", "distance from driving", "distance from turning"), 1
     ):
-        odometry.add_argument(f"--alpha{number}", type=float, metavar="A", help=f"noise on {meaning}")
+        odometry.add_argument(f"--alpha{number}", type=float, metavar="A", help=f"Noise of {meaning}.")
     odometry.add_argument(
         "--noise-interval",
         type=float,
         metavar="S",
-        help="seconds that a draw of the noise is held; 0: one draw a message",
+        help="Time for which a sample of the noise is kept [s]; 0: one sample for each message.",
     )
-    odometry.add_argument("--odometry-rate", type=float, metavar="HZ", help="messages a second")
+    odometry.add_argument("--odometry-rate", type=float, metavar="HZ", help="Rate of the odometry [Hz].")
     odometry.add_argument(
         "--slip",
         type=_numbers(2, 3, 4),
         action="append",
         metavar="AT,S[,FACTOR[,DEG/S]]",
-        help="from AT on for S seconds the wheels count FACTOR times the way, and turn without turning",
+        help="From AT on, for S seconds, the wheels count FACTOR times the distance and turn by DEG/S.",
     )
     odometry.add_argument(
         "--kidnap-at",
         type=_numbers(1, 2),
         action="append",
         metavar="AT[,SKIP]",
-        help="at AT seconds the robot is carried to where it would be SKIP seconds later (default: 20)",
+        help="At AT seconds the robot is kidnapped to where it would be SKIP seconds later (default: 20).",
     )
 
-    parser.add_argument("--force", action="store_true", help="overwrite OUT.mcap")
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print nothing")
+    parser.add_argument("--force", action="store_true", help="Overwrite OUT.mcap.")
+    parser.add_argument("--json", action="store_true", help="Print the summary as JSON.")
+    parser.add_argument("-q", "--quiet", action="store_true", help="Print nothing.")
 
 
 def run(arguments: argparse.Namespace) -> int:

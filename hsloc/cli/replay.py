@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.cli import BEGIN
-from hsloc.cli.arguments import add_no_progress, add_options, request
+from hsloc.cli.arguments import add_no_progress, add_options, run_request
 from hsloc.cli.output import default_folder, link_latest, print_warnings, refuse_early
 from hsloc.cli.progress import ProgressLine
 
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.export.results_folder import write_results
     from hsloc.replay.run import run as run_replay
 
-    spec = request(arguments)
+    request = run_request(arguments)
     folder = arguments.out or default_folder(arguments.log[0].name.split(".")[0] or "run")
     refuse_early(folder, arguments.overwrite)
     with ProgressLine(arguments.quiet or arguments.no_progress) as line:
@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
                 f"{progress.done_s:.0f} s of {progress.total_s:.0f} s, {speed:.0f}x real time",
             )
 
-        result = run_replay(spec, show)
+        result = run_replay(request, show)
         written = write_results(
             result,
             folder,
@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
     elif not arguments.quiet:
         print_summary(written.metrics, written.timings, folder)
         print(f"whole command: {time.perf_counter() - BEGIN:.1f} s, reading and writing included")
-    exceeded = exceeded_limits(spec, written.metrics)
+    exceeded = exceeded_limits(request, written.metrics)
     for limit in exceeded:
         print(f"hsloc: limit not kept: {limit}", file=sys.stderr)
     if exceeded:

@@ -29,20 +29,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--data", type=Path, metavar="DIR",
-        help="folder with the report's scan1.csv, localisation_map.csv and waypoints.csv (default: $HSLOC_DATA/paper, "
-        "or ../shared/data/paper; without it our own set-up alone)",
+        help="Folder with scan1.csv, localisation_map.csv and waypoints.csv (default: $HSLOC_DATA/paper, "
+        "or ../shared/data/paper; without it the simulated set-up only).",
     )  # fmt: skip
-    parser.add_argument("--own", action="store_true", help="our own set-up alone, even where the report's data is")
+    parser.add_argument(
+        "--own", action="store_true", help="Use the simulated set-up only, even where the data of the course report is."
+    )
     parser.add_argument(
         "--seeds", type=_count, metavar="N",
-        help="repetitions of each experiment (default: E1 200, E2 50, E3 20, E4 20, M1 200 windows)",
+        help="Repetitions of each experiment (default: E1 200, E2 50, E3 20, E4 20, M1 200 windows).",
     )  # fmt: skip
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="exactly this folder (default: results/reproduce-<time>)"
+        "--out", type=Path, metavar="DIR", help="Folder of the results (default: results/reproduce-TIME)."
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace the folder if it exists")
-    parser.add_argument("--json", action="store_true", help="print the results as JSON on stdout")
-    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
+    parser.add_argument("--overwrite", action="store_true", help="Replace the folder if it exists.")
+    parser.add_argument("--json", action="store_true", help="Print the results as JSON on stdout.")
+    parser.add_argument("-q", "--quiet", action="store_true", help="Print errors only.")
 
 
 def run(arguments: argparse.Namespace) -> int:

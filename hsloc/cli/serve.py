@@ -22,22 +22,29 @@ HSLOC_MIN_FREE_BYTES=256M, HSLOC_RETENTION_S, ...; HSLOC_TOKEN is a token of you
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Where to listen, where to keep, who may ask."""
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1)")
-    parser.add_argument("--port", type=int, default=8000, help="port to listen on (default: 8000)")
+    parser.add_argument("--host", default="127.0.0.1", help="Address to listen on (default: 127.0.0.1).")
+    parser.add_argument("--port", type=int, default=8000, help="Port to listen on (default: 8000).")
     parser.add_argument(
-        "--data", type=Path, metavar="DIR", help="folder for everything (default: $HSLOC_SERVE_DATA, else hsloc-data)"
+        "--data", type=Path, metavar="DIR", help="Folder of all data (default: $HSLOC_SERVE_DATA, else hsloc-data)."
     )
-    parser.add_argument("--slots", type=int, metavar="N", help="jobs at the same time (default: 1)")
-    parser.add_argument("--allowed-host", action="append", metavar="NAME", help="answer to this name, too; * for any")
-    parser.add_argument("--retention-days", type=float, metavar="D", help="remove jobs that ended so long ago")
+    parser.add_argument("--slots", type=int, metavar="N", help="Jobs at the same time (default: 1).")
+    parser.add_argument(
+        "--allowed-host", action="append", metavar="NAME", help="Answer requests for this host name, too; * for any."
+    )
+    parser.add_argument(
+        "--retention-days", type=float, metavar="D", help="Remove jobs that ended more than this many days ago."
+    )
+    parser.add_argument(
+        "--backup", type=Path, metavar="DIR", help="Copy the data folder to DIR, also while a server runs, and exit."
+    )
     group = parser.add_argument_group("tokens")
-    group.add_argument("--first-token", action="store_true", help="make a token on the first start and print it")
-    group.add_argument("--open-to-all", action="store_true", help="listen beyond loopback without any token")
-    group.add_argument("--new-token", metavar="TENANT", help="make a token for a tenant, print it, and end")
-    group.add_argument("--scopes", default="read,write,admin", help="scopes of the new token (default: all)")
-    group.add_argument("--expires-days", type=float, metavar="D", help="the new token ends after so many days")
-    group.add_argument("--list-tokens", action="store_true", help="show the tokens' ids and tenants, and end")
-    group.add_argument("--revoke-token", metavar="ID", help="make a token worthless, and end")
+    group.add_argument("--first-token", action="store_true", help="Make a token on the first start and print it.")
+    group.add_argument("--open-to-all", action="store_true", help="Listen beyond loopback without any token.")
+    group.add_argument("--new-token", metavar="TENANT", help="Make a token for a tenant, print it, and exit.")
+    group.add_argument("--scopes", default="read,write,admin", help="Scopes of the new token (default: all).")
+    group.add_argument("--expires-days", type=float, metavar="D", help="Validity of the new token [days].")
+    group.add_argument("--list-tokens", action="store_true", help="Show the ids and tenants of the tokens, and exit.")
+    group.add_argument("--revoke-token", metavar="ID", help="Revoke a token, and exit.")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -52,6 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
             from dataclasses import replace
 
             chosen = replace(chosen, allowed_hosts=(*chosen.allowed_hosts, *arguments.allowed_host))
+        if arguments.backup is not None:
+            return int(service.back_up_folder(chosen, arguments.backup))
         if arguments.new_token is not None:
             return int(service.new_token(chosen, arguments.new_token, arguments.scopes, arguments.expires_days))
         if arguments.list_tokens:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hsloc.cli.arguments import add_no_progress, add_options, values
+from hsloc.cli.output import print_job
 from hsloc.cli.progress import ProgressLine
 from hsloc.options import BY_NAME, MATCHER_ALIASES, merged
 
@@ -58,6 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
             if job["state"] == "succeeded" and arguments.out is not None:
                 client.download(job["id"], arguments.out)
     print(job["id"] if arguments.quiet else _tell(job, arguments.out))
+    if job["summary"] and not arguments.quiet:
+        print_job(job["summary"])
     if not (arguments.wait or arguments.out):
         return EXIT_OK
     if job["state"] != "succeeded":
@@ -85,7 +88,10 @@ def request_of(given: Mapping[str, Any], upload: Callable[[Path], str]) -> dict[
             image = read_metadata(value).image
             request["map"] = {"yaml": upload(value), "image": upload(image)}
         elif name == "config":
-            request["config"] = read_values(value)
+            warnings: list[str] = []
+            request["config"] = read_values(value, warnings)
+            for line in warnings:
+                print(f"hsloc: warning: {line}", file=sys.stderr)
         elif name == "resume":
             request["resume"] = str(value)
         elif name == "reference":

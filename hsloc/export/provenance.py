@@ -27,10 +27,10 @@ def provenance(result: Result) -> Provenance:
     """For the report."""
     versions = {"hsloc": __version__, "Python": platform.python_version()}
     versions |= {name: metadata.version(name) for name in _PACKAGES}
-    hashes = {" ".join(result.spec.names()): result.input_sha256}
-    if result.spec.map_path is not None:
-        hashes |= {path.name: _sha256(path) for path in map_files(result.spec.map_path)}
-    return Provenance(command(result.spec), dump(result.spec.config), versions, hashes)
+    hashes = {" ".join(result.request.names()): result.input_sha256}
+    if result.request.map_path is not None:
+        hashes |= {path.name: _sha256(path) for path in map_files(result.request.map_path)}
+    return Provenance(command(result.request), dump(result.request.config), versions, hashes)
 
 
 def _sha256(path: Path) -> str:
@@ -69,11 +69,11 @@ def _quoted(word: str) -> str:
 
 def config_text(result: Result) -> str:
     """The effective configuration; what else is needed to repeat the run stands above it."""
-    own = result.spec.own_matcher
+    own = result.request.own_matcher
     lines = [
-        f"# hsloc {__version__}; run it again with: {command(result.spec)}",
+        f"# hsloc {__version__}; run it again with: {command(result.request)}",
         *([] if own is None else [f"# matcher of the caller's own: {type(own).__name__}"]),
-        f"# preset: {result.spec.preset}",
+        f"# preset: {result.request.preset}",
         f"# input sha256: {result.input_sha256}",
     ]
-    return "\n".join(lines) + "\n" + dump(result.spec.config)
+    return "\n".join(lines) + "\n" + dump(result.request.config)

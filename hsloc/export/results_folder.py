@@ -10,6 +10,7 @@ import os
 import shutil
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.analysis import Analysis, analyse, run_timings
@@ -24,7 +25,7 @@ from hsloc.slam.map_state import STATE_FILE, write_state
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
+    from os import PathLike
 
     from hsloc.replay.run import Result
     from hsloc.run_metrics import RunMetrics, RunTimings
@@ -48,7 +49,7 @@ class WrittenResults:
 
 def write_results(
     result: Result,
-    folder: Path,
+    folder: str | PathLike[str],
     *,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
@@ -57,6 +58,7 @@ def write_results(
 
     Raises OutputError if the folder is there already, or cannot be written.
     """
+    folder = Path(folder)
     refuse_folder(folder, overwrite)
     folder = folder.resolve()  # "." and ".." have no name of their own, and a link stays what it is
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
@@ -107,7 +109,7 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
     write_json(folder / "metrics.json", analysis.metrics.to_json())
     (folder / "config.yaml").write_text(config_text(result), encoding="utf-8")
     shown = {
-        "title": " ".join(result.spec.names()),
+        "title": " ".join(result.request.names()),
         "trajectory": result.trajectory,
         "localised": result.localised,
         "odometry": analysis.odometry,

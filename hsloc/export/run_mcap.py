@@ -39,7 +39,7 @@ class RunRecording:
     def __enter__(self) -> RunRecording:
         begin = time.perf_counter()
         try:
-            self._writer.metadata("hsloc", {"version": __version__, "seed": str(self._result.spec.seed)})
+            self._writer.metadata("hsloc", {"version": __version__, "seed": str(self._result.request.seed)})
             self._writer.attachment("config.yaml", config_text(self._result).encode(), "application/yaml")
             self._writer.occupancy_grid(self._result.grid, self._start)
         except BaseException:

@@ -12,7 +12,7 @@ from hsloc.lazy import lazy_names
 
 if TYPE_CHECKING:
     from hsloc.log.checks.checker import CheckReport, check_log
-    from hsloc.log.checks.findings import Finding
+    from hsloc.log.checks.findings import Finding, Severity
     from hsloc.log.checks.topics import LEAST_JUMP, LONGEST_JUMP_S, MAX_SPEED
     from hsloc.log.convert import Conversion, convert_log
     from hsloc.log.messages.decode import LinkMessage
@@ -40,6 +40,7 @@ __all__ = [
     "LogWriter",
     "Losses",
     "ReadOptions",
+    "Severity",
     "Transform3",
     "check_log",
     "convert_log",
@@ -50,7 +51,7 @@ __all__ = [
 
 _MODULES = {
     "checks.checker": ("CheckReport", "check_log"),
-    "checks.findings": ("Finding",),
+    "checks.findings": ("Finding", "Severity"),
     "checks.topics": ("LEAST_JUMP", "LONGEST_JUMP_S", "MAX_SPEED"),
     "convert": ("Conversion", "convert_log"),
     "messages.decode": ("LinkMessage",),

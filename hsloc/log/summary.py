@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from hsloc.errors import ConfigError
 from hsloc.model import IDENTITY, Pose2
-from hsloc.options import STAMPS
+from hsloc.options import AUTO, STAMPS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,8 +35,8 @@ class ReadOptions:
 
     `scan_fix` overrides fields of scans (see `hsloc.log.session.scan_geometry.ScanFixes`). `slice` are two heights
     above the base [m], `LOW,HIGH`: point clouds are read as scans, the nearest point of each direction between them.
-    `time_offset` (`TOPIC=SECONDS`, several with commas) is added to the stamps of a topic. With `stamps` "log" the
-    log's times are used in place of the header stamps.
+    `time_offset` (`TOPIC=SECONDS`, several with commas, or `auto`) is added to the stamps of a topic. With `stamps`
+    "log" the log's times are used in place of the header stamps.
     """
 
     scan_topic: str | None = None
@@ -74,8 +74,10 @@ class ReadOptions:
 
     def offsets_s(self) -> dict[str, float]:
         """Seconds to add by topic, its name without the leading slash. Raises ConfigError."""
-        found = {}
-        for item in (self.time_offset or "").split(",") if self.time_offset else ():
+        found: dict[str, float] = {}
+        if self.time_offset is None or self.time_offset == AUTO:
+            return found
+        for item in self.time_offset.split(","):
             topic, _, seconds = item.rpartition("=")
             try:
                 value = float(seconds)
@@ -83,7 +85,7 @@ class ReadOptions:
                 value = float("nan")
             if not topic or not abs(value) <= LONGEST_OFFSET_S:
                 raise ConfigError(
-                    f"--time-offset {item}: must be TOPIC=SECONDS, with at most {LONGEST_OFFSET_S:g} seconds; "
+                    f"--time-offset {item}: must be auto, or TOPIC=SECONDS with at most {LONGEST_OFFSET_S:g} seconds; "
                     "--stamps log is the way out for clocks that are farther apart"
                 )
             found[topic.strip().lstrip("/")] = value
@@ -171,7 +173,8 @@ class LogSummary:
     in the order of their header stamps) or `log` (in the order of the log, where that is the true one). Where several
     lasers are merged, `scan_topic` names them all, `lasers` tells of each, and the other fields tell of the first.
     `parts` are the files that hold scans or odometry that are read, in the order of time. `segments` is how many
-    messages make a turn of the lidar, where these were joined.
+    messages make a turn of the lidar, where these were joined. `clocks_apart_s` is by how much the stamps of scans and
+    odometry differ beyond what their log times differ: a hint, since messages may be late.
     """
 
     paths: tuple[Path, ...]
@@ -195,6 +198,7 @@ class LogSummary:
     parts: tuple[PartSummary, ...] = ()
     order: str = "stamp"
     segments: int = 1
+    clocks_apart_s: float = 0.0
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     warnings: tuple[RunWarning, ...] = ()
 

@@ -29,6 +29,9 @@ UNKNOWN_PROBABILITY = (255 - UNKNOWN_PIXEL) / 255
 MAX_CELLS = 100_000_000
 """Maximum number of cells of a map that is read. Internal: guards the memory against a damaged file."""
 IMAGES = (".pgm", ".png", ".bmp", ".pnm")
+FORMATS = ("PPM", "PNG", "BMP")
+"""Pillow's decoders that a map's image may reach, by its content: PGM belongs to PPM. Among the other 40 are programs
+such as Ghostscript, which a hostile upload must not start."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,13 +81,13 @@ def read_map(path: Path | str) -> LoadedMap:
 
 
 def _read_image(path: Path, metadata: MapMetadata) -> _Pixels:
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     image = metadata.image
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(image) as opened:
+            with Image.open(image, formats=FORMATS) as opened:
                 width, height = opened.size
                 if width * height > MAX_CELLS:
                     raise MapError(f"{image}: {width} x {height} cells are too many, at most {MAX_CELLS} are read")
@@ -94,6 +97,8 @@ def _read_image(path: Path, metadata: MapMetadata) -> _Pixels:
         raise MapError(
             f"{path}: its image {image} does not exist; put {image.name} beside the YAML, or name it under `image:`"
         ) from error
+    except UnidentifiedImageError as error:
+        raise MapError(f"{image}: is no PGM, PNG or BMP image; convert it to one of them") from error
     except MapError:
         raise
     except Exception as error:  # Decoders of images raise whatever they please on damage.

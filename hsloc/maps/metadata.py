@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 MODES = ("trinary", "scale", "raw")
-MAX_YAML_BYTES = 1 << 20
+MAX_YAML_BYTES = 64 << 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class MapMetadata:
 
 def read_metadata(path: Path) -> MapMetadata:
     """Read map.yaml. Raises MapError naming the file and the key that is missing or wrong."""
-    values = _load_yaml(path)
+    values = load_yaml(path)
     image = _value(path, values, "image")
     if not isinstance(image, str) or not image:
         raise MapError(f"{path}: image must name a file, not {image!r}")
@@ -63,14 +63,21 @@ def _image(path: Path, image: str) -> Path:
     return beside if name and not named.exists() and beside.exists() else named
 
 
-def _load_yaml(path: Path) -> dict[str, Any]:
+def load_yaml(path: Path) -> dict[str, Any]:
+    """The keys of map.yaml. Raises MapError for what is no YAML of a map.
+
+    Aliases are refused: no writer of maps makes them, and nested ones expand half a kilobyte to gigabytes.
+    """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
+    from ruamel.yaml.events import AliasEvent
 
     try:
         if path.stat().st_size > MAX_YAML_BYTES:
             raise MapError(f"{path}: is too large for a map's YAML; name the .yaml file, not the image")
         text = path.read_bytes().decode()
+        if any(isinstance(event, AliasEvent) for event in YAML(typ="safe", pure=True).parse(text)):
+            raise MapError(f"{path}: has a YAML alias (*name), which no map needs; write the value in its place")
         values = YAML(typ="safe", pure=True).load(text)
     except FileNotFoundError as error:
         raise MapError(f"{path}: no such map") from error

@@ -60,8 +60,8 @@ class ScanDiagnostics:
     """One row for each scan of a run, as columns of length n.
 
     `status` holds values of `Status`; `fitness` is NaN where nothing was matched; `sigma` (n, 3) are the standard
-    deviations of x, y (m) and theta (rad), NaN where unknown; `evaluations` counts fitness evaluations;
-    `reason` is empty where there is no reason to state.
+    deviations of x, y (m) and theta (rad), and `covariance` (n, 3, 3) is over them in the map frame, NaN where unknown;
+    `evaluations` counts fitness evaluations; `reason` is empty where there is no reason to state.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -70,6 +70,7 @@ class ScanDiagnostics:
     sigma: NDArray[np.float64]
     evaluations: NDArray[np.int64]
     reason: tuple[str, ...]
+    covariance: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

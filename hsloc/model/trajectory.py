@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hsloc.errors import HslocError
 from hsloc.model.pose2 import Pose2, wrap_angles
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Trajectory:
     """Stamped poses of the robot base: `stamps_ns` int64 (n,), `poses` float64 (n, 3) of x, y, theta.
 
@@ -32,6 +33,10 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    def __repr__(self) -> str:
+        span = float(self.stamps_ns.max() - self.stamps_ns.min()) / 1e9 if len(self) else 0.0
+        return f"<Trajectory: {len(self)} poses, {self.length():.2f} m, {span:.2f} s>"
 
     @staticmethod
     def from_pairs(pairs: Iterable[tuple[int, Pose2]]) -> Trajectory:
@@ -62,6 +67,18 @@ class Trajectory:
         result: NDArray[np.float64] = poses[before] + fraction * delta
         result[:, 2] = wrap_angles(result[:, 2])
         return result
+
+    def to_frame(self) -> Any:
+        """A pandas.DataFrame with the columns stamp_ns, x, y (m) and theta (rad), a row for each pose.
+
+        Raises HslocError where pandas is not installed; hsloc itself does not need it.
+        """
+        try:
+            import pandas as pd
+        except ImportError as error:
+            raise HslocError("to_frame needs pandas; install it, or use stamps_ns and poses") from error
+        x, y, theta = self.poses.T
+        return pd.DataFrame({"stamp_ns": self.stamps_ns, "x": x, "y": y, "theta": theta})
 
     def length(self) -> float:
         """Length of the path in metres."""

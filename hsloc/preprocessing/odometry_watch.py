@@ -48,6 +48,7 @@ class OdometryWatch:
     def __init__(self, events: Iterable[Event]) -> None:
         self._events = events
         self._pose: tuple[float, float, float] | None = None
+        self._told_ns = 0
         self._since_ns = 0
         self._old: tuple[int, NDArray[np.float32]] | None = None
         self._moving_ns = 0
@@ -66,6 +67,7 @@ class OdometryWatch:
     def _follow(self, event: Odometry) -> None:
         pose = event.T_odom_base
         values = (pose.x, pose.y, pose.theta)
+        self._told_ns = event.stamp_ns
         if values != self._pose:
             self._pose, self._since_ns, self._moving_ns = values, event.stamp_ns, 0
         self._unset &= not event.has_heading
@@ -92,6 +94,9 @@ class OdometryWatch:
         seconds_ns = scan.stamp_ns - self._old[0]
         self._old = scan.stamp_ns, scan.ranges
         if both.sum() < _MIN_BEAMS or self._pose is None or step < 0:
+            return
+        if scan.stamp_ns - self._told_ns > _COMPARED_S * 1e9:  # odometry that is missing does not stand still
+            self._moving_ns = 0
             return
         if float(changed.mean()) > _CHANGED_SHARE and scan.stamp_ns - self._since_ns >= seconds_ns:
             self._moving_ns += seconds_ns

@@ -7,7 +7,9 @@ is one, else interpolated between the messages before and after, for which the s
 
 from __future__ import annotations
 
+import gc
 from collections import deque
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol
 
 from hsloc.model.events import Odometry, PairedScan, Scan, Truth
@@ -110,3 +112,19 @@ def _at(stamp_ns: int, recent: deque[Odometry], following: Odometry | None, firs
     if recent and (following is None or following.stamp_ns >= stamp_ns):
         return recent[-1].T_odom_base
     return following.T_odom_base if following is not None else first
+
+
+_COLLECT_AFTER = 50_000
+"""New objects after which the garbage collector looks at the youngest; Python's own limit is 700."""
+
+
+@contextmanager
+def seldom_collected() -> Iterator[None]:
+    """Let the garbage collector run seldom while a log streams by: events are many, and none is part of a cycle."""
+    before = gc.get_threshold()
+    if before[0] > 0:  # 0 is never, as somebody wants it.
+        gc.set_threshold(max(before[0], _COLLECT_AFTER), *before[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)

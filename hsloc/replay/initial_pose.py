@@ -27,16 +27,16 @@ _OUTSIDE = 5.0
 _GIVE_START = "give the start with --initial-pose"
 
 
-def find_start(spec: RunRequest, log: Log, grid: OccupancyGrid) -> tuple[Pose2 | None, tuple[RunWarning, ...]]:
+def find_start(request: RunRequest, log: Log, grid: OccupancyGrid) -> tuple[Pose2 | None, tuple[RunWarning, ...]]:
     """T_map_base at the first event, None if it is unknown; and warnings.
 
     Raises MapError for a start that is not on the map, and for an unknown one on a map that offers no place.
     """
     warnings: tuple[RunWarning, ...] = ()
-    start, stated_by = spec.initial_pose, "--initial-pose"
-    if start is None and not spec.unknown_start:
-        start, warnings = _stated(spec, log)
-        stated_by = f"{spec.logs[0]}: the start that the log states"
+    start, stated_by = request.initial_pose, "--initial-pose"
+    if start is None and not request.unknown_start:
+        start, warnings = _stated(request, log)
+        stated_by = f"{request.logs[0]}: the start that the log states"
     if start is None:
         if not grid.free().any():
             raise MapError(
@@ -45,7 +45,7 @@ def find_start(spec: RunRequest, log: Log, grid: OccupancyGrid) -> tuple[Pose2 |
             )
     elif not _is_on(grid, start):
         x0, y0, x1, y1 = grid.bounds()
-        remedy = "correct it" if spec.initial_pose is not None else "give the log's map, or --unknown-start"
+        remedy = "correct it" if request.initial_pose is not None else "give the log's map, or --unknown-start"
         raise MapError(
             f"{stated_by}, ({start.x:g}, {start.y:g}), is not on the map, which spans x from {x0:g} to {x1:g} "
             f"and y from {y0:g} to {y1:g}; {remedy}"
@@ -58,12 +58,12 @@ def first_odometry(events: Iterable[Event]) -> Pose2 | None:
     return next((event.T_odom_base for event in events if isinstance(event, Odometry)), None)
 
 
-def _stated(spec: RunRequest, log: Log) -> tuple[Pose2 | None, tuple[RunWarning, ...]]:
+def _stated(request: RunRequest, log: Log) -> tuple[Pose2 | None, tuple[RunWarning, ...]]:
     stated = log.initial_pose()
     if stated is None:
         return None, ()
     stamp_ns, T_map_base = stated
-    begin_ns = log.summary.origin_ns + round(max(spec.read.start_s or 0.0, 0.0) * 1e9)
+    begin_ns = log.summary.origin_ns + round(max(request.read.start_s or 0.0, 0.0) * 1e9)
     if stamp_ns < begin_ns - _STALE_NS:
         age = (begin_ns - stamp_ns) / 1e9
         text = (

@@ -77,16 +77,16 @@ def load_grid(path: Path) -> tuple[OccupancyGrid, tuple[RunWarning, ...]]:
     return loaded.grid, loaded.warnings
 
 
-def load_state(spec: RunRequest) -> tuple[MapState | None, tuple[RunWarning, ...]]:
+def load_state(request: RunRequest) -> tuple[MapState | None, tuple[RunWarning, ...]]:
     """The saved map that is to be extended, if one is, and warnings. Raises MapError."""
-    path = spec.resume
+    path = request.resume
     if path is None:
         return None, ()
     file = state_file(path)
     if not file.exists():
         raise MapError(f"{path}: no {STATE_FILE} there; --resume needs the results of a run that built its map")
     state = read_state(file)
-    if state.fingerprint != fingerprint(spec.mapping()):
+    if state.fingerprint != fingerprint(request.mapping()):
         text = f"{file}: built with other parameters of the mapper; those of this run are used from here on"
         return state, (RunWarning(WarningCode.MAP_PARAMETERS_DIFFER, text),)
     return state, ()

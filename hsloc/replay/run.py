@@ -20,19 +20,20 @@ from hsloc.matching.window import Window
 from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
+from hsloc.options import AUTO
 from hsloc.preprocessing.odometry_resets import ContinuousOdometry
 from hsloc.preprocessing.odometry_watch import OdometryWatch, UnusableOdometry
-from hsloc.replay.engine import replay
-from hsloc.replay.garbage import seldom_collected
+from hsloc.replay.engine import replay, seldom_collected
 from hsloc.replay.initial_pose import find_start, first_odometry
 from hsloc.replay.map_sources import load_grid, load_state, maps_beside, unread_maps
 from hsloc.replay.references import read_reference
-from hsloc.replay.run_history import RunHistory
+from hsloc.replay.run_history import RunHistory, pose_covariances
 from hsloc.request import RunRequest
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.parameters import Resume
 from hsloc.slam.point_mapper import PointMapper
+from hsloc.slam.time_offset import HINT_S, as_option, in_words, offset_warning, offsets_of_log
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ class Progress:
     scans: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Result:
     """What a run found, and what is needed to repeat it. `seconds` are wall times, the only thing not repeatable.
 
@@ -75,7 +76,7 @@ class Result:
     says whether the beams were moved to where the robot was when each was measured.
     """
 
-    spec: RunRequest
+    request: RunRequest
     summary: LogSummary
     input_sha256: str
     trajectory: Trajectory
@@ -94,11 +95,33 @@ class Result:
     lidar_only: bool = False
     deskewed: bool = False
 
+    def __repr__(self) -> str:
+        scans, share = self.diagnostics, 100.0 * float(self.localised.mean()) if len(self.localised) else 0.0
+        used = sum(status in ("matched", "relocalised") for status in scans.status)
+        name = " ".join(self.request.names())
+        return (
+            f"<Result of {name if len(name) < 80 else f'{name[:77]}...'}: {self.mode}, {len(self.trajectory)} poses, "
+            f"{self.trajectory.length():.1f} m, {share:.1f} % localised, {used} of {len(scans)} scans matched, "
+            f"{len(self.warnings)} warnings, {'no' if self.reference is None else 'with a'} reference>"
+        )
+
+    def pose_covariances(self) -> NDArray[np.float64]:
+        """Covariance (n, 3, 3) of each pose of `trajectory` over (x, y, theta) in the map frame (m^2, m rad, rad^2).
+
+        Those of the matched scans, propagated by the odometry; NaN where a pose is not localised, before the first
+        match, and in a map of the graph mapper, which does not compute them.
+        """
+        if self.mapping is not None:
+            return np.full((len(self.trajectory), 3, 3), np.nan)
+        config = self.request.config
+        noise = config.localiser.odometry_noise if self.mode == "localise" else config.point_mapper.odometry_noise
+        return pose_covariances(self.trajectory, self.localised, self.diagnostics, noise.covariance)
+
     @property
     def matcher_name(self) -> str | None:
         """The scan matcher that was used; None for the graph mapper, which has its own."""
-        own = self.mode == "slam" and self.spec.config.mapper == "graph"
-        return None if own else self.spec.matcher_name
+        own = self.mode == "slam" and self.request.config.mapper == "graph"
+        return None if own else self.request.matcher_name
 
     @property
     def follows_scans(self) -> bool:
@@ -121,7 +144,7 @@ def run(
         logs = [request] if isinstance(request, str | PathLike) else request
         request = RunRequest.from_values(logs, options)
     elif options:
-        raise ConfigError(f"a RunRequest says it all; put {', '.join(options)} into it")
+        raise ConfigError(f"{', '.join(options)}: options beside a RunRequest; put them into it")
     if progress is None:
         return _run(request, None)
     report = progress
@@ -129,65 +152,69 @@ def run(
         return _run(request, progress)
 
 
-def _run(spec: RunRequest, progress: Callable[[Progress], None] | None) -> Result:
+def _run(request: RunRequest, progress: Callable[[Progress], None] | None) -> Result:
     """The run; without the odometry of the log where that proves unusable on the way."""
     try:
-        return _run_with(spec, progress, lidar_only=spec.no_odometry)
+        return _run_with(request, progress, lidar_only=request.no_odometry)
     except UnusableOdometry as error:
         warning = RunWarning(
             WarningCode.ODOMETRY_UNUSABLE,
             f"the odometry is ignored: {error}",
             "repair its source, or name another with --odom-topic",
         )
-        return _run_with(spec, progress, lidar_only=True, warnings=(warning,))
+        return _run_with(request, progress, lidar_only=True, warnings=(warning,))
 
 
 def _run_with(
-    spec: RunRequest,
+    request: RunRequest,
     progress: Callable[[Progress], None] | None,
     *,
     lidar_only: bool,
     warnings: tuple[RunWarning, ...] = (),
 ) -> Result:
     begin = time.perf_counter()
-    log = open_log(spec.logs, spec.reading())
+    log = open_log(request.logs, request.reading())
+    if not lidar_only:
+        log, of_clocks = with_offset(request, log)
+        warnings = (*warnings, *of_clocks)
     of_reference: list[RunWarning] = []
-    reference = None if spec.reference is None else read_reference(spec.reference, spec.logs, of_reference)
-    grid, of_map = find_map(spec, log)
-    state, of_state = load_state(spec)
+    reference = None if request.reference is None else read_reference(request.reference, request.logs, of_reference)
+    grid, of_map = find_map(request, log)
+    state, of_state = load_state(request)
     warnings = (*warnings, *of_map, *of_state, *of_reference)
     # Without odometry the map of a log is used where the user asks for it.
-    builds = spec.mode == "slam" or state is not None or (spec.no_odometry and spec.map_path is None)
-    localise = spec.mode == "localise" or (grid is not None and not builds)
+    builds = request.mode == "slam" or state is not None or (request.no_odometry and request.map_path is None)
+    localise = request.mode == "localise" or (grid is not None and not builds)
     opened = time.perf_counter()
     if progress is not None:
         progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
     if localise:
-        start, of_start = find_start(spec, log, require_map(grid))
+        start, of_start = find_start(request, log, require_map(grid))
         warnings = (*warnings, *of_start)
         likelihood = LikelihoodField.from_grid(
-            require_map(grid), spec.config.likelihood_field.sigma, spec.config.likelihood_field.margin
+            require_map(grid), request.config.likelihood_field.sigma, request.config.likelihood_field.margin
         )
-        estimator: Estimator = _localiser(spec, require_map(grid), likelihood, start)
+        estimator: Estimator = _localiser(request, require_map(grid), likelihood, start)
     else:
-        require_matcher(spec)
-        likelihood, estimator = None, _mapper(spec, state, lidar_only)
+        require_matcher(request)
+        likelihood, estimator = None, _mapper(request, state, lidar_only)
     first = None if lidar_only else first_odometry(log.events())
     prepared = time.perf_counter()
-    history, events = RunHistory(), ContinuousOdometry(_events(spec, log, lidar_only, localise), log.summary.odom_topic)
+    history = RunHistory()
+    events = ContinuousOdometry(_events(request, log, lidar_only, localise), log.summary.odom_topic)
     # Turns that were joined of segments are known beam by beam; a whole turn is deskewed if the user asks for it.
-    deskew = spec.read.deskew or (log.summary.segments > 1 and not lidar_only)
+    deskew = request.read.deskew or (log.summary.segments > 1 and not lidar_only)
     with seldom_collected():
         for event, estimate in replay(_reported(log, events, history, progress), estimator, deskew=deskew, first=first):
             history.add(event, estimate)
     replayed = time.perf_counter()
     if history.scans == 0:
-        where = "between --start and --end" if _cut(spec) else f"on {log.summary.scan_topic} that could be read"
+        where = "between --start and --end" if _cut(request) else f"on {log.summary.scan_topic} that could be read"
         lost = "".join(f": {line}" for line in ["; ".join(log.losses.lines())] if line)
-        raise LogError(f"{spec.logs[0]}: no scan {where}{lost}")
+        raise LogError(f"{request.logs[0]}: no scan {where}{lost}")
     if first is None and not lidar_only:
-        where = "between --start and --end" if _cut(spec) else f"on {log.summary.odom_topic} that could be read"
-        raise LogError(f"{spec.logs[0]}: no odometry {where}")
+        where = "between --start and --end" if _cut(request) else f"on {log.summary.odom_topic} that could be read"
+        raise LogError(f"{request.logs[0]}: no odometry {where}")
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
     mapping, true_grid = None, None if localise else grid
     if isinstance(estimator, Mapper):
@@ -198,7 +225,7 @@ def _run_with(
         grid = estimator.grid()
     trajectory, localised = history.trajectory() if mapping is None else _mapped(history, mapping)
     return Result(
-        spec=spec,
+        request=request,
         summary=log.summary,
         input_sha256=log.sha256(),
         trajectory=trajectory,
@@ -219,6 +246,32 @@ def _run_with(
     )
 
 
+def with_offset(spec: RunRequest, log: Log) -> tuple[Log, tuple[RunWarning, ...]]:
+    """The log with the estimated offset of its scans, if that is asked for; a warning where there is one.
+
+    Otherwise it is estimated only where log times hint at it: `hsloc.analysis` finds smaller ones in the result.
+    """
+    automatic = spec.read.time_offset == AUTO
+    apart = abs(log.summary.clocks_apart_s) > HINT_S and spec.read.time_offset is None
+    if not (automatic or apart):
+        return log, ()
+    found = offsets_of_log(spec.logs, spec.reading(), spec.config.graph_mapper.front_end)
+    option = as_option(found)
+    if option is None:
+        return log, ()
+    if not automatic:
+        return log, tuple(offset_warning(topic, offset) for topic, offset in found.items() if offset.is_significant)
+    warnings = tuple(
+        RunWarning(
+            WarningCode.CLOCK_OFFSET_APPLIED,
+            f"the stamps of {topic} were {in_words(offset)} those of the odometry, which was corrected",
+        )
+        for topic, offset in found.items()
+        if offset.is_significant
+    )
+    return open_log(spec.logs, replace(spec.reading(), time_offset=option)), warnings
+
+
 def _mapped(history: RunHistory, mapping: MappingResult) -> tuple[Trajectory, NDArray[np.bool_]]:
     """The trajectory as it is known at the end: at the odometry messages, or at the scans if there are none."""
     stamps = history.odometry().stamps_ns
@@ -228,14 +281,14 @@ def _mapped(history: RunHistory, mapping: MappingResult) -> tuple[Trajectory, ND
     return Trajectory(stamps, poses), np.ones(len(stamps), dtype=np.bool_)
 
 
-def _events(spec: RunRequest, log: Log, lidar_only: bool, localise: bool) -> Iterable[Event]:
+def _events(request: RunRequest, log: Log, lidar_only: bool, localise: bool) -> Iterable[Event]:
     """The events of the log; its odometry watched, or left out, or replaced for a localiser by that of the scans."""
     if not lidar_only:
         # The point mapper cannot do without odometry, whatever that is like.
-        return log.events() if spec.config.mapper == "point" and not localise else OdometryWatch(log.events())
+        return log.events() if request.config.mapper == "point" and not localise else OdometryWatch(log.events())
     if localise:
-        rng = np.random.default_rng((spec.seed, 1))
-        return with_laser_odometry(log.events(), spec.config.graph_mapper.front_end, rng)
+        rng = np.random.default_rng((request.seed, 1))
+        return with_laser_odometry(log.events(), request.config.graph_mapper.front_end, rng)
     return (event for event in log.events() if not isinstance(event, Odometry))
 
 
@@ -245,20 +298,20 @@ def _share(progress: Callable[[Progress], None] | None, total: float, scans: int
     return lambda share: progress(Progress("refine", share * total, total, scans))
 
 
-def find_map(spec: RunRequest, log: Log) -> tuple[OccupancyGrid | None, tuple[RunWarning, ...]]:
+def find_map(request: RunRequest, log: Log) -> tuple[OccupancyGrid | None, tuple[RunWarning, ...]]:
     """The map that is given or that the log carries, and warnings."""
-    if spec.map_path is not None:
-        return load_grid(spec.map_path)
+    if request.map_path is not None:
+        return load_grid(request.map_path)
     grid = log.map()
     if grid is not None:
         return grid, ()
     unread = unread_maps(log.summary)
-    beside = maps_beside(spec.logs[0])
+    beside = maps_beside(request.logs[0])
     given = str(beside[0]) if beside else "map.yaml"
     what = f"cannot use {unread[0]}" if unread else "the log has no /map"
-    if spec.mode == "localise":
-        raise MapError(f"{spec.logs[0]}: {what}; give one with --map {given}")
-    if spec.mode == "slam" or spec.resume is not None or not (unread or beside):
+    if request.mode == "localise":
+        raise MapError(f"{request.logs[0]}: {what}; give one with --map {given}")
+    if request.mode == "slam" or request.resume is not None or not (unread or beside):
         return None, ()
     remedy = f"to localise on a map give it with --map {given}"
     remedy += "" if not beside[1:] else f" (also there: {', '.join(p.name for p in beside[1:])})"
@@ -272,38 +325,38 @@ def require_map(grid: OccupancyGrid | None) -> OccupancyGrid:
     return grid
 
 
-def require_matcher(spec: RunRequest) -> None:
+def require_matcher(request: RunRequest) -> None:
     """Raise ConfigError for a matcher that was asked for and that the graph mapper would not use."""
-    if spec.config.mapper == "graph" and spec.matcher_name != preset(spec.preset).matcher:
+    if request.config.mapper == "graph" and request.matcher_name != preset(request.preset).matcher:
         raise ConfigError(
-            f"the graph mapper has a matcher of its own and would not use {spec.matcher_name}; leave out --matcher, "
+            f"the graph mapper has a matcher of its own and would not use {request.matcher_name}; leave out --matcher, "
             "or use --mapper point"
         )
 
 
-def _mapper(spec: RunRequest, state: MapState | None, lidar_only: bool) -> Mapper | PointMapper:
-    if spec.config.mapper == "point":
+def _mapper(request: RunRequest, state: MapState | None, lidar_only: bool) -> Mapper | PointMapper:
+    if request.config.mapper == "point":
         if lidar_only:
             raise ConfigError("the point mapper predicts with odometry; leave out --no-odom, or use --mapper graph")
-        start = IDENTITY if spec.initial_pose is None else spec.initial_pose
-        return PointMapper(spec.matcher, spec.config.point_mapper, np.random.default_rng(spec.seed), start)
-    config = spec.config
+        start = IDENTITY if request.initial_pose is None else request.initial_pose
+        return PointMapper(request.matcher, request.config.point_mapper, np.random.default_rng(request.seed), start)
+    config = request.config
     resume = None
     if state is not None:
         field = LikelihoodField.from_grid(state.grid, config.likelihood_field.sigma, config.likelihood_field.margin)
-        begin = None if spec.unknown_start else spec.initial_pose
-        resume = Resume(state, field, spec.matcher, config.localiser.relocaliser, begin)
+        begin = None if request.unknown_start else request.initial_pose
+        resume = Resume(state, field, request.matcher, config.localiser.relocaliser, begin)
     return Mapper(
-        replace(spec.config.graph_mapper, use_odometry=not lidar_only), np.random.default_rng(spec.seed), resume
+        replace(request.config.graph_mapper, use_odometry=not lidar_only), np.random.default_rng(request.seed), resume
     )
 
 
-def _localiser(spec: RunRequest, grid: OccupancyGrid, likelihood: LikelihoodField, start: Pose2 | None) -> Estimator:
+def _localiser(request: RunRequest, grid: OccupancyGrid, likelihood: LikelihoodField, start: Pose2 | None) -> Estimator:
     from hsloc.localisation.localiser import Localiser
 
-    rng = np.random.default_rng(spec.seed)
-    _warm_up(spec.matcher, likelihood)
-    return Localiser(grid, likelihood, spec.matcher, spec.config.localiser, rng, start)
+    rng = np.random.default_rng(request.seed)
+    _warm_up(request.matcher, likelihood)
+    return Localiser(grid, likelihood, request.matcher, request.config.localiser, rng, start)
 
 
 def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:
@@ -327,8 +380,8 @@ def interrupts_held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _cut(spec: RunRequest) -> bool:
-    return spec.read.start_s is not None or spec.read.end_s is not None
+def _cut(request: RunRequest) -> bool:
+    return request.read.start_s is not None or request.read.end_s is not None
 
 
 def _reported(

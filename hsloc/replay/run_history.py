@@ -7,14 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.motion import predict_covariance
 from hsloc.model.estimate import ScanDiagnostics, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
-from hsloc.model.pose2 import compose_poses
+from hsloc.model.pose2 import Pose2, compose_poses
 from hsloc.model.trajectory import Trajectory
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
     from hsloc.model.estimate import Estimate
-    from hsloc.model.pose2 import Pose2
 
 
 class RunHistory:
@@ -32,6 +36,7 @@ class RunHistory:
         self._reason: list[str] = []
         self._fitness = array("d")
         self._sigma = array("d")
+        self._covariance = array("d")
         self._evaluations = array("q")
         self._believed = 0
         self._searching = False
@@ -63,8 +68,10 @@ class RunHistory:
         covariance = estimate.covariance
         if covariance is None:
             self._sigma.extend((float("nan"),) * 3)
+            self._covariance.extend((float("nan"),) * 9)
         else:
             self._sigma.extend(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+            self._covariance.extend(covariance.ravel())
         self._evaluations.append(estimate.evaluations)
         if estimate.revision:
             self._revisions.append((len(self._odometry_stamps), estimate.revision))
@@ -115,9 +122,37 @@ class RunHistory:
             sigma=np.array(self._sigma, dtype=np.float64).reshape(-1, 3),
             evaluations=np.array(self._evaluations, dtype=np.int64),
             reason=tuple(self._reason),
+            covariance=np.array(self._covariance, dtype=np.float64).reshape(-1, 3, 3),
         )
 
 
 def _trajectory(stamps: array[int], poses: array[float]) -> Trajectory:
     """A view of the columns, which can grow no more while it lives: an hour's would be large to copy."""
     return Trajectory(np.frombuffer(stamps, dtype=np.int64), np.frombuffer(poses, dtype=np.float64).reshape(-1, 3))
+
+
+def pose_covariances(
+    trajectory: Trajectory,
+    localised: NDArray[np.bool_],
+    scans: ScanDiagnostics,
+    motion_covariance: Callable[[Pose2], NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """Covariance (n, 3, 3) of each pose over (x, y, theta) in the map frame (m^2, m rad, rad^2).
+
+    That of the last scan before it whose covariance is known, propagated over the motion since, whose own covariance
+    is `motion_covariance`. NaN before the first such scan, and where the pose is not localised.
+    """
+    found = np.full((len(trajectory), 3, 3), np.nan)
+    known = np.flatnonzero(np.isfinite(scans.covariance[:, 0, 0]))
+    # Stamps may repeat and run backwards, where the log's do: a scan counts from its stamp on, in the order of time.
+    order = known[np.argsort(scans.stamps_ns[known], kind="stable")]
+    last = np.searchsorted(scans.stamps_ns[order], trajectory.stamps_ns, side="right") - 1
+    anchors: dict[int, Pose2] = {}
+    for row in np.flatnonzero(localised & (last >= 0)).tolist():
+        scan = int(order[last[row]])
+        pose = Pose2.from_array(trajectory.poses[row])
+        # The pose of the scan is not in the result: that of the first message after it is the nearest.
+        anchor = anchors.setdefault(scan, pose)
+        motion = anchor.between(pose)
+        found[row] = predict_covariance(scans.covariance[scan], anchor, motion, motion_covariance(motion))
+    return found

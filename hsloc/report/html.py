@@ -18,7 +18,7 @@ from hsloc.evaluation.metrics import format_json
 from hsloc.model import Status
 from hsloc.report.data import Curve, prepare, reason_counts, status_counts
 from hsloc.report.svg import Chart, chart_svg, map_svg, timeline_html
-from hsloc.report.table import DASH, STATUS_WORDS, error_statistics, summary, table_rows
+from hsloc.report.table import DASH, STATUS_WORDS, error_statistics, reason_text, summary, table_rows
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -90,6 +90,7 @@ def write_report_html(
         "headline": "" if metrics is None else _headline(metrics),
         "charts": "".join(_figure(chart, end) for chart in charts) + _convergence(convergence),
         "quality": "" if metrics is None else _quality(metrics),
+        "read": "" if metrics is None else _what_was_read(metrics),
         "scans": _scans(data, end),
         "statistics": "" if metrics is None else _statistics(metrics),
         "provenance": _provenance(provenance),
@@ -264,14 +265,19 @@ def _cell(value: float) -> str:
 
 
 def _quality(metrics: RunMetrics) -> str:
-    """The verdict's reasons, warnings and losses, and what was read of the log."""
-    reasons = {(reason.code, reason.text): reason for reason in metrics.verdict_reasons}
+    """The reasons of the verdict, and all other warnings."""
+    reasons = {(reason.code, reason.text) for reason in metrics.verdict_reasons}
     warnings = [str(each) for each in metrics.warnings if (each.code, each.text) not in reasons]
     warnings += [f"log: {line}" for line in metrics.losses.notes]
     if metrics.evaluation_error is not None:
         warnings.append(f"no comparison with the reference: {metrics.evaluation_error}")
-    lines = [f"{each.text}; {each.remedy}" if each.remedy else each.text for each in metrics.verdict_reasons]
-    verdict = f"<h2>Verdict: {metrics.verdict}</h2><ul>{_items(lines)}</ul>"
+    lines = [reason_text(each) for each in metrics.verdict_reasons]
+    verdict = f'<section class="warnings"><h2>Verdict: {metrics.verdict}</h2><ul>{_items(lines)}</ul></section>'
+    listed = f'<section class="warnings"><h2>Warnings</h2><ul>{_items(warnings)}</ul></section>'
+    return (verdict if lines else "") + (listed if warnings else "")
+
+
+def _what_was_read(metrics: RunMetrics) -> str:
     rows = [("scans", _laser(laser)) for laser in metrics.log.lasers]
     rows += [("odometry", metrics.log.odometry or "none"), ("reference", metrics.log.reference or "none")]
     run = metrics.run
@@ -279,11 +285,7 @@ def _quality(metrics: RunMetrics) -> str:
     table = "".join(
         f'<tr><th scope="row">{escape(name)}</th><td class="words">{escape(value)}</td></tr>' for name, value in rows
     )
-    return (
-        (f'<section class="warnings">{verdict}</section>' if lines else "")
-        + (f'<section class="warnings"><h2>Warnings</h2><ul>{_items(warnings)}</ul></section>' if warnings else "")
-        + f'<section><h2>What was read</h2><div class="scroll"><table>{table}</table></div></section>'
-    )
+    return f'<section><h2>What was read</h2><div class="scroll"><table>{table}</table></div></section>'
 
 
 def _items(lines: list[str]) -> str:

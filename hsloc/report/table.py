@@ -13,6 +13,7 @@ from hsloc.model import Status
 
 if TYPE_CHECKING:
     from hsloc.evaluation import PoseStatistics, Statistics
+    from hsloc.model.verdict import VerdictReason
     from hsloc.run_metrics import MapMetrics, RunMetrics, ScanCounts
 
 DASH = "–"
@@ -26,6 +27,8 @@ STATUS_WORDS: dict[str, str] = {
     Status.SEARCHING: "searching",
 }
 """What a scan's status is called."""
+_LISTED = 3
+"""Times and places of a reason that are listed in words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +97,17 @@ def _three_figures(value: float) -> str:
     size = abs(value)
     decimals = 2 if size < 9.995 else 1 if size < 99.95 else 0
     return f"{value:.{decimals}f}"
+
+
+def reason_text(reason: VerdictReason) -> str:
+    """What was found, when (in seconds since the first pose) and where (in the map frame), and what to do about it."""
+    times = [f"{begin:.1f} to {end:.1f} s" for begin, end in reason.times[:_LISTED]]
+    places = [f"({x:.1f}, {y:.1f}) m" for x, y in reason.places[:_LISTED]]
+    text = reason.text
+    for words, listed, count in (("from", times, len(reason.times)), ("near", places, len(reason.places))):
+        if listed:
+            text += f", {words} {', '.join(listed)}" + (f" and {count - _LISTED} more" if count > _LISTED else "")
+    return f"{text}; {reason.remedy}" if reason.remedy else text
 
 
 def error_statistics(metrics: RunMetrics) -> list[tuple[str, str, Statistics]]:

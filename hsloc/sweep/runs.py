@@ -47,7 +47,7 @@ class SweepRun:
     name: str
     log: str
     config: str
-    spec: RunRequest
+    request: RunRequest
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class Outcome:
     @property
     def limits(self) -> tuple[str, ...]:
         """The limits of the request that the result does not keep."""
-        return () if self.metrics is None else exceeded_limits(self.run.spec, self.metrics)
+        return () if self.metrics is None else exceeded_limits(self.run.request, self.metrics)
 
     @property
     def data_lost(self) -> bool:
@@ -98,8 +98,8 @@ def plan(
             preset, config = item if isinstance(item, tuple) else ("default", item)
             for seed in seeds:
                 values = {**common, "preset": preset, "config": config, "seed": seed}
-                spec = RunRequest.from_values(parts, values)
-                runs.append(SweepRun(f"{label}-{name}-seed{seed}".replace("/", "_"), label, name, spec))
+                request = RunRequest.from_values(parts, values)
+                runs.append(SweepRun(f"{label}-{name}-seed{seed}".replace("/", "_"), label, name, request))
     return runs
 
 
@@ -127,7 +127,7 @@ def sweep(
     try:
         for index, item in enumerate(runs):
             try:
-                key = run_key(item.spec, hashes)
+                key = run_key(item.request, hashes)
             except HslocError as error:
                 settle(index, Outcome(item, FAILED, folder / item.name, error=str(error)))
                 continue
@@ -164,7 +164,7 @@ def do_run(item: SweepRun, folder: Path, key: str) -> Outcome:
     """One run, in whatever process the executor chose; raises nothing but BaseException."""
     target = folder / item.name
     try:
-        result = run(item.spec, _heed_stop)
+        result = run(item.request, _heed_stop)
         # Only what looks like a run of ours is replaced.
         written = write_results(result, target, overwrite=(target / "metrics.json").exists(), progress=_heed_stop)
         (target / KEY_FILE).write_text(json.dumps({"key": key}) + "\n", encoding="utf-8")
@@ -196,7 +196,7 @@ def finished(item: SweepRun, folder: Path, key: str) -> Outcome | None:
     return Outcome(item, SKIPPED, target, metrics, timings)
 
 
-def run_key(spec: RunRequest, hashes: dict[Path, str] | None = None) -> str:
+def run_key(request: RunRequest, hashes: dict[Path, str] | None = None) -> str:
     """Hash of all that decides a run: version, options, and the bytes of log and map.
 
     `hashes` remembers those of files between calls. Raises HslocError where a file cannot be read.
@@ -204,21 +204,21 @@ def run_key(spec: RunRequest, hashes: dict[Path, str] | None = None) -> str:
     hashes = {} if hashes is None else hashes
     values: dict[str, Any] = {"hsloc": __version__}
     limits = {option.target for option in OPTIONS if option.place == "check"}
-    for item in fields(spec):
+    for item in fields(request):
         if item.name not in limits:  # They decide no file.
-            value = getattr(spec, item.name)
+            value = getattr(request, item.name)
             values[item.name] = to_dict(value) if item.name != "logs" else [path.name for path in value]
-    if spec.map_path is not None:
+    if request.map_path is not None:
         values["map_path"] = [
-            spec.map_path.name,
-            *(_digest(part, hashes) for part in _map_files(spec.map_path)),
+            request.map_path.name,
+            *(_digest(part, hashes) for part in _map_files(request.map_path)),
         ]
-    if spec.resume is not None:
-        values["resume"] = [spec.resume.name, _digest(state_file(spec.resume), hashes)]
-    for name, path in (("relations", spec.relations), ("reference", spec.reference)):
+    if request.resume is not None:
+        values["resume"] = [request.resume.name, _digest(state_file(request.resume), hashes)]
+    for name, path in (("relations", request.relations), ("reference", request.reference)):
         if path is not None and Path(path).is_file():
             values[name] = [Path(path).name, _digest(Path(path), hashes)]
-    values["input"] = [_log_digest(path, hashes) for path in spec.logs]
+    values["input"] = [_log_digest(path, hashes) for path in request.logs]
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 
 

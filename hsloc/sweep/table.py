@@ -52,7 +52,7 @@ def _row(outcome: Outcome) -> dict[str, Any]:
         "run": outcome.run.name,
         "log": outcome.run.log,
         "config": outcome.run.config,
-        "seed": outcome.run.spec.seed,
+        "seed": outcome.run.request.seed,
         "state": outcome.state,
         "data_lost": outcome.data_lost,
         "limits": "; ".join(outcome.limits),

@@ -1,4 +1,4 @@
-"""Who asks, and the tokens that say so."""
+"""Principals, and the bearer tokens that identify them."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ OPERATORS = "operator's"
 """Label of the token of HSLOC_TOKEN."""
 
 ANYBODY = Principal("local", frozenset(SCOPES))
-"""Who asks where no token is required: a server on loopback."""
+"""The principal where no token is required: a server on loopback."""
 
 
 class Tokens:
-    """Tokens: 256 random bits, of which only the SHA-256 is kept (so much entropy needs no slow hash)."""
+    """Tokens: 256 random bits, of which only the SHA-256 is kept (a random secret needs no slow hash)."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -81,7 +81,7 @@ class Tokens:
         return token
 
     def issue_operators(self, tenant: str, secret: str) -> None:
-        """The token that the operator chose; the one that he chose before is worth nothing from now on."""
+        """Accept the token that the operator chose, and revoke the one that the operator chose before."""
         self.issue(tenant, label=OPERATORS, secret=secret)
         digest = _sha256(secret)
         with self._database.write() as session:
@@ -89,7 +89,7 @@ class Tokens:
             session.execute(update(TokenRow).where(*older).values(revoked=time.time()))
 
     def revoke(self, ident: str) -> bool:
-        """Whether there was such a token."""
+        """Revoke a token; whether there was one with this id."""
         with self._database.write() as session:
             row = session.get(TokenRow, ident)
             if row is not None:
@@ -97,7 +97,7 @@ class Tokens:
             return row is not None
 
     def rows(self) -> Sequence[TokenRow]:
-        """All tokens, oldest first; the secrets are not among what is kept."""
+        """All tokens, oldest first; the secrets themselves are not stored."""
         with self._database.read() as session:
             return session.scalars(select(TokenRow).order_by(TokenRow.created)).all()
 
@@ -107,7 +107,7 @@ class Tokens:
             return session.scalar(select(TokenRow.id).limit(1)) is not None
 
     def principal(self, token: str) -> Principal | None:
-        """Who the token speaks for; None if it is unknown, revoked or expired."""
+        """The principal of a token; None if it is unknown, revoked or expired."""
         digest = _sha256(token)
         with self._database.read() as session:
             row = session.scalar(select(TokenRow).where(TokenRow.sha256 == digest))

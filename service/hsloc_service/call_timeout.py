@@ -1,7 +1,7 @@
-"""Calls that may never come back: a store that is slow or dead must hold up neither the event loop nor a worker.
+"""Calls that may never return: a store that is slow or dead must hold up neither the event loop nor a worker.
 
-Each call has a thread of its own. anyio's threads will not do: calls that hang would use up what all routes share, and
-keep the process from ending.
+Each call has a thread of its own. anyio's threads will not do: calls that hang would use up the shared ones,
+and would keep the process from ending.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-def begin(work: Callable[[], T]) -> Future[T]:
-    """Start `work` in a thread that dies with the process."""
+def start_call(work: Callable[[], T]) -> Future[T]:
+    """Start `work` in a daemon thread."""
     future: Future[T] = Future()
-    future.set_running_or_notify_cancel()  # from here on nobody can cancel it: it is done when the thread is
+    future.set_running_or_notify_cancel()  # it cannot be cancelled: it is done when the thread is
 
     def run() -> None:
         try:
@@ -37,32 +37,32 @@ def begin(work: Callable[[], T]) -> Future[T]:
     return future
 
 
-def wait(work: Callable[[], T], timeout_s: float) -> T:
-    """The result of `work`, in a thread that may block. Raises StoreError if it takes longer."""
+def call_within(timeout_s: float, work: Callable[[], T]) -> T:
+    """The result of `work`, for a thread that may block. Raises StoreError if it takes longer."""
     try:
-        return begin(work).result(timeout_s)
+        return start_call(work).result(timeout_s)
     except TimeoutError as error:
         raise StoreError(f"no answer within {timeout_s:g} s") from error
 
 
 class BoundedExecutor:
-    """Takes the calls of the routes: so many at a time, each for so long, the wait for its turn included."""
+    """Runs the calls of the routes: at most `max_calls` at a time, each with a time limit that includes its wait."""
 
-    def __init__(self, timeout_s: float, most: int = 64) -> None:
-        self._timeout_s, self._turns = timeout_s, asyncio.Semaphore(most)
+    def __init__(self, timeout_s: float, max_calls: int = 64) -> None:
+        self._timeout_s, self._free = timeout_s, asyncio.Semaphore(max_calls)
 
-    async def ask(self, work: Callable[[], T]) -> T:
-        """The result of `work`. Raises StoreError if it takes too long, or if too many others do."""
+    async def run(self, work: Callable[[], T]) -> T:
+        """The result of `work`. Raises StoreError if it takes too long, or if too many calls are running."""
         try:
             async with asyncio.timeout(self._timeout_s):
-                await self._turns.acquire()
-                loop, future = asyncio.get_running_loop(), begin(work)
-                # Its place is free when the thread has ended, not when nobody waits for it any more.
-                future.add_done_callback(lambda _: self._free(loop))
+                await self._free.acquire()
+                loop, future = asyncio.get_running_loop(), start_call(work)
+                # Its place is free when the thread has ended, not when the caller stops waiting.
+                future.add_done_callback(lambda _: self._release(loop))
                 return await asyncio.wrap_future(future)
         except TimeoutError as error:
             raise StoreError(f"no answer within {self._timeout_s:g} s") from error
 
-    def _free(self, loop: asyncio.AbstractEventLoop) -> None:
-        with suppress(RuntimeError):  # the loop has ended meanwhile, and nobody counts any more
-            loop.call_soon_threadsafe(self._turns.release)
+    def _release(self, loop: asyncio.AbstractEventLoop) -> None:
+        with suppress(RuntimeError):  # the loop has ended meanwhile
+            loop.call_soon_threadsafe(self._free.release)

@@ -42,5 +42,9 @@ def is_disk_full(error: OperationalError) -> bool:
     return getattr(error.orig, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
 
 
+class BrokenAnswer(Exception):
+    """An answer that had begun cannot be sent to its end; the connection has to be broken off."""
+
+
 class StoreError(Exception):
     """The store does not answer, or not as it must; the same may work later."""

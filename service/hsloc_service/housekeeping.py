@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 import time
@@ -13,17 +14,18 @@ from hsloc_service.db.tables import ENDED, FileRow, IdempotencyRow, JobRow
 from hsloc_service.errors import StoreError
 from hsloc_service.jobs.repository import base_job, delete_job
 from hsloc_service.logs import log
-from hsloc_service.results.deletion_queue import Removals
-from hsloc_service.uploads.repository import needed
+from hsloc_service.results.deletion_queue import delete_upload
+from hsloc_service.uploads.repository import needed_files
 
 if TYPE_CHECKING:
     from hsloc_service.db.database import Database
-    from hsloc_service.results.stores import ResultStores
+    from hsloc_service.results.deletion_queue import DeletionQueue
     from hsloc_service.settings import Settings
     from hsloc_service.storage import Storage
 
-EVERY_S = 60.0
 SWEEP_S = 3600.0
+BATCH = 100
+"""Rows that are deleted in one transaction."""
 KEY_S = 7 * 86400.0
 """An Idempotency-Key is remembered for a week."""
 
@@ -31,9 +33,8 @@ KEY_S = 7 * 86400.0
 class Housekeeping:
     """A thread that tidies up."""
 
-    def __init__(self, database: Database, storage: Storage, settings: Settings, stores: ResultStores) -> None:
-        self._database, self._storage, self._settings, self._stores = database, storage, settings, stores
-        self._removals = Removals(database, stores, settings.store_timeout_s)
+    def __init__(self, database: Database, storage: Storage, settings: Settings, deletions: DeletionQueue) -> None:
+        self._database, self._storage, self._settings, self._deletions = database, storage, settings, deletions
         self._swept = -math.inf
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="housekeeping", daemon=True)
@@ -50,7 +51,7 @@ class Housekeeping:
     def _run(self) -> None:
         pause = 0.0
         while not self._stop.wait(pause):
-            pause = EVERY_S
+            pause = self._settings.housekeeping_s
             try:
                 self.tidy(time.time())
             except Exception as error:
@@ -59,46 +60,66 @@ class Housekeeping:
     def tidy(self, now: float) -> None:
         """One round."""
         self._storage.restore_ballast()
-        paths = self._expired_uploads(now)
+        self._expire_uploads(now)
         if self._settings.retention_s is not None:
-            paths += self._old(now - self._settings.retention_s)
+            self._delete_old(now - self._settings.retention_s)
         with self._database.write() as session:
             session.execute(delete(IdempotencyRow).where(IdempotencyRow.created < now - KEY_S))
-        for file_id in paths:
-            self._storage.upload_path(file_id).unlink(missing_ok=True)
-        results = self._removals.clear()
-        if paths or results:
-            log("tidy", uploads=len(paths), results=results)
+        uploads, results = self._deletions.clear_uploads(), self._deletions.clear()
+        if uploads or results:
+            log("tidy", uploads=uploads, results=results)
         self._sweep(now)
 
     def _sweep(self, now: float) -> None:
-        """Leftovers in the object store: at the first round and then now and then. (The folder's go at start-up.)"""
-        store = self._stores.current
+        """Remove abandoned results from the object store: in the first round and then every SWEEP_S.
+
+        Those of the data folder are removed at the start, by `reconcile`.
+        """
+        store = self._deletions.stores.current
         if store.url is None or now - self._swept < SWEEP_S:
             return
         try:
-            self._removals.sweep(store)
+            unknown = self._deletions.sweep(store)
         except StoreError as error:
             log("store.error", what="sweep", error=str(error))
         else:
             self._swept = now
+            if unknown:
+                log("result.unknown", logging.WARNING, store=store.url, count=len(unknown), first=unknown[0])
 
-    def _expired_uploads(self, now: float) -> list[str]:
+    def _expire_uploads(self, now: float) -> None:
         with self._database.write() as session:
             rows = session.scalars(select(FileRow).where(FileRow.state == "receiving", FileRow.expires < now)).all()
             for row in rows:
-                session.delete(row)
-            return [row.id for row in rows]
+                delete_upload(session, row)
 
-    def _old(self, before: float) -> list[str]:
-        """Erase jobs that ended before and uploads of that age, but none that an active job needs; the uploads' ids."""
+    def _delete_old(self, before: float) -> None:
+        """Delete jobs that ended before `before` and uploads of that age, but none that an active job needs.
+
+        In batches of BATCH, a transaction each, so that other writes wait for one batch at most.
+        """
+        seq: int | None = 0
+        while seq is not None and not self._stop.is_set():
+            seq = self._delete_jobs(before, seq)
+        ident: str | None = ""
+        while ident is not None and not self._stop.is_set():
+            ident = self._delete_uploads(before, ident)
+
+    def _delete_jobs(self, before: float, after: int) -> int | None:
+        """Delete a batch of jobs; the `seq` of the last one, None if there are no more."""
+        query = select(JobRow).where(JobRow.state.in_(ENDED), JobRow.ended < before, JobRow.seq > after)
         with self._database.write() as session:
-            jobs = session.scalars(select(JobRow).where(JobRow.state.in_(ENDED), JobRow.ended < before)).all()
-            for job in jobs:
-                if not base_job(session, job.id):
-                    delete_job(session, job)
-            query = select(FileRow).where(FileRow.state == "complete", FileRow.created < before)
-            files = [row for row in session.scalars(query) if not needed(session, row.id)]
+            jobs = session.scalars(query.order_by(JobRow.seq).limit(BATCH)).all()
+            extended = base_job(session, *(job.id for job in jobs))
+            delete_job(session, *(job for job in jobs if job.id not in extended))
+            return jobs[-1].seq if jobs else None
+
+    def _delete_uploads(self, before: float, after: str) -> str | None:
+        """Delete a batch of uploads; the id of the last one, None if there are no more."""
+        query = select(FileRow).where(FileRow.state == "complete", FileRow.created < before, FileRow.id > after)
+        with self._database.write() as session:
+            files, needed = session.scalars(query.order_by(FileRow.id).limit(BATCH)).all(), needed_files(session)
             for row in files:
-                session.delete(row)
-            return [row.id for row in files]
+                if row.id not in needed:
+                    delete_upload(session, row)
+            return files[-1].id if files else None

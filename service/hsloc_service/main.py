@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import ipaddress
+import os
 import resource
 import signal
+import socket
 import sys
 import time
 from contextlib import contextmanager
@@ -14,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import uvicorn
 
 from hsloc_service.auth import SCOPES, Tokens
+from hsloc_service.backup import back_up
 from hsloc_service.db.database import Database
 from hsloc_service.http.app import create_app
 from hsloc_service.http.timeouts import protocol_class
@@ -23,14 +26,16 @@ from hsloc_service.storage import Storage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from fastapi import FastAPI
 
 SHUTDOWN_S = 10
+BACKLOG = 2048
 
 
 class Server(uvicorn.Server):
-    """Tells the event streams when it is asked to stop; else it would wait for them."""
+    """Ends the event streams when it is asked to stop; else it would wait for them."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
         super().__init__(config)
@@ -56,32 +61,54 @@ def serve(
     Without any token the service answers loopback only, unless `open_to_all`. `first_token` makes one on the first
     start and writes it to stdout; `secret` is a token that the operator chose. Raises SettingsError.
     """
-    app = create_app(settings := with_tokens(settings, host, open_to_all, first_token, secret))
+    listener = listen(host, port)  # before anything is recovered, by a server that cannot be reached
+    try:
+        app = create_app(settings := with_tokens(settings, host, open_to_all, first_token, secret))
+    except BaseException:
+        listener.close()
+        raise
     configure()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, 65536) if hard > 0 else 65536), hard))
     config = uvicorn.Config(
         app,
-        host=host,
-        port=port,
         http=protocol_class(
-            settings.header_timeout_s, settings.body_timeout_s, settings.write_timeout_s, settings.max_connections
+            settings.header_timeout_s,
+            settings.body_timeout_s,
+            settings.write_timeout_s,
+            settings.max_connections,
+            settings.min_body_bytes_per_s,
         ),
         ws="none",
         loop="asyncio",
         log_config=None,
         access_log=False,
         server_header=False,
+        proxy_headers=bool(settings.trusted_proxies),
+        forwarded_allow_ips=list(settings.trusted_proxies),
         timeout_keep_alive=5,
         timeout_graceful_shutdown=SHUTDOWN_S,
-        backlog=2048,
     )
     server = Server(config, app)
     for which in (signal.SIGTERM, signal.SIGINT):
         # uvicorn raises the signal once more when it is done; being asked to stop is no failure.
         signal.signal(which, lambda *_: None)
-    server.run()
+    try:
+        server.run(sockets=[listener])
+    finally:
+        listener.close()
     return 0 if server.started else 1
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket that listens at the address. Raises SettingsError where it cannot."""
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)[0]
+        return socket.create_server(address, family=family, backlog=BACKLOG)
+    except OSError as error:
+        number = error.errno or 0
+        cause = os.strerror(number) if number > 0 else error.strerror
+        raise SettingsError(f"{host}:{port}: cannot be listened at: {cause}; give another --host or --port") from error
 
 
 def with_tokens(settings: Settings, host: str, open_to_all: bool, first_token: bool, secret: str | None) -> Settings:
@@ -108,6 +135,15 @@ def with_tokens(settings: Settings, host: str, open_to_all: bool, first_token: b
         )
     hosts = settings.allowed_hosts if host in settings.allowed_hosts else (*settings.allowed_hosts, host)
     return dataclasses.replace(settings, require_token=required, allowed_hosts=hosts)
+
+
+def back_up_folder(settings: Settings, target: Path) -> int:
+    """Make a backup and show what it holds; works while the service runs. Raises SettingsError."""
+    report = back_up(settings.data, target)
+    lost = f"; {report.deleted} were deleted meanwhile" if report.deleted else ""
+    counts = f"{report.uploads} uploads, {report.jobs} jobs, {report.results} results, {report.bytes} bytes"
+    sys.stdout.write(f"{target}: {counts}{lost}\n")
+    return 0
 
 
 def new_token(settings: Settings, tenant: str, scopes: str = ",".join(SCOPES), days: float | None = None) -> int:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import math
 import os
 import re
-import shutil
 import uuid
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -17,12 +17,14 @@ from hsloc_service.errors import is_disk_full, no_space
 from hsloc_service.settings import SettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
 
 BALLAST = "ballast"
-"""A file that is given up when the disk is full, so that the database can delete."""
+"""A file that is deleted when the disk is full, so that the database has room to delete."""
 BALLAST_BYTES = 4 << 20
+MAX_DEPTH = 64
+"""Folders in folders that a job may make."""
 
 
 class Storage:
@@ -32,7 +34,7 @@ class Storage:
         self.root = root
         self.min_free_bytes = min_free_bytes
         self.uploads, self.work, self.results = root / "uploads", root / "work", root / "results"
-        self.cache = root / "cache"
+        self.cache, self.quarantine = root / "cache", root / "quarantine"
         try:
             for folder in (self.uploads, self.work, self.results, self.cache):
                 folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -48,7 +50,7 @@ class Storage:
         self.restore_ballast()
 
     def close(self) -> None:
-        """Let another server have the folder."""
+        """Release the lock of the folder."""
         os.close(self._lock)
 
     def _instance(self) -> str:
@@ -63,7 +65,7 @@ class Storage:
         return text
 
     def free_bytes(self) -> int:
-        """What the disk has left for us."""
+        """Free bytes of the disk."""
         found = os.statvfs(self.root)
         return found.f_bavail * found.f_frsize
 
@@ -105,17 +107,11 @@ class Storage:
 
     def remove_work(self, path: Path) -> None:
         """Remove the folder of an attempt."""
-        shutil.rmtree(path, ignore_errors=True)
-
-    def leftovers(self) -> Iterator[tuple[str, Path]]:
-        """Every upload and attempt on the disk, with its kind."""
-        for kind, folder in (("upload", self.uploads), ("work", self.work)):
-            for path in folder.iterdir():
-                yield kind, path
+        remove_tree(path)
 
 
 def hash_file(path: Path, sync: bool = False) -> tuple[int, str]:
-    """Size and SHA-256 of a file; with `sync` it is on the disk afterwards. Does not follow a link."""
+    """Size and SHA-256 of a file; with `sync` it is on the disk afterwards, and its owner's. Does not follow a link."""
     digest, size = hashlib.sha256(), 0
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     with os.fdopen(descriptor, "rb") as file:
@@ -123,6 +119,7 @@ def hash_file(path: Path, sync: bool = False) -> tuple[int, str]:
             digest.update(block)
             size += len(block)
         if sync:
+            os.fchmod(file.fileno(), 0o600)
             os.fsync(file.fileno())
     return size, digest.hexdigest()
 
@@ -136,14 +133,58 @@ def sync_folder(path: Path | str) -> None:
         os.close(descriptor)
 
 
-def folder_bytes(path: Path) -> int:
-    """What a folder takes on the disk; files that vanish meanwhile count nothing."""
-    total = 0
-    for base, _, names in os.walk(path):
-        for name in names:
-            with suppress(OSError):
-                total += os.lstat(os.path.join(base, name)).st_blocks * 512
+def folder_bytes(path: Path) -> float:
+    """What a folder takes on the disk, infinity if it is nested more than MAX_DEPTH deep.
+
+    Files that vanish meanwhile count nothing.
+    """
+    total, folders = 0, [(str(path), 0)]
+    while folders:
+        base, depth = folders.pop()
+        if depth > MAX_DEPTH:
+            return math.inf
+        with suppress(OSError), os.scandir(base) as entries:
+            for entry in entries:
+                with suppress(OSError):
+                    total += entry.stat(follow_symlinks=False).st_blocks * 512
+                    if entry.is_dir(follow_symlinks=False):
+                        folders.append((entry.path, depth + 1))
     return total
+
+
+def remove_tree(path: Path | str) -> None:
+    """Remove a file, or a folder with all that is in it, however deep it is nested; no error if it is gone.
+
+    Folders of folders are moved up first: a path of 20,000 names is too long for the kernel, and for recursion.
+    """
+    root = str(path)
+    with suppress(OSError):
+        if os.path.islink(root) or not os.path.isdir(root):
+            os.unlink(root)
+            return
+    with suppress(OSError):
+        while folders := _folders_of(root):
+            for folder in folders:
+                for inner in _folders_of(folder):
+                    os.rename(inner, os.path.join(root, uuid.uuid4().hex))
+                os.rmdir(folder)
+        os.rmdir(root)
+
+
+def _folders_of(path: str) -> list[str]:
+    """The folders in a folder, whose other entries are removed."""
+    if os.stat(path).st_mode & 0o700 != 0o700:
+        os.chmod(path, 0o700)
+    folders = []
+    with os.scandir(path) as entries:
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                if entry.stat().st_mode & 0o700 != 0o700:  # without, it cannot be moved
+                    os.chmod(entry.path, 0o700)
+                folders.append(entry.path)
+            else:
+                os.unlink(entry.path)
+    return folders
 
 
 def safe_name(label: str, default: str) -> str:

@@ -1,7 +1,7 @@
-"""Webhooks: an outbox in the database, signed, retried, and kept away from what is not public.
+"""Webhooks: their bodies, an outbox in the database, signed and retried delivery to public addresses.
 
 A receiver checks `Hsloc-Signature: t=<seconds>,v1=<hex>`: the HMAC-SHA256 of `<seconds>.<body>` with the tenant's key,
-and drops an `event_id` that it has seen: a delivery whose answer was lost comes again.
+and ignores an `event_id` that it has seen: a delivery whose answer was lost is repeated.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ import hashlib
 import hmac
 import http.client
 import ipaddress
+import json
 import secrets
 import socket
 import ssl
 import threading
 import time
+import uuid
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
@@ -23,16 +25,18 @@ from sqlalchemy import select
 
 from hsloc_service.db.tables import DeliveryRow, SecretRow
 from hsloc_service.logs import log
+from hsloc_service.storage import safe_name
 
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
 
     from hsloc_service.db.database import Database
+    from hsloc_service.db.tables import JobRow
     from hsloc_service.settings import Settings
 
 TIMEOUT_S = 5.0
 WITHIN_S = 15.0
-"""One delivery takes no longer, however slowly the receiver answers."""
+"""Time limit for one delivery, however slowly the receiver answers [s]."""
 LONGEST_WAIT_S = 3600.0
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 _RESERVED = [ipaddress.ip_network(text) for text in ("192.0.0.0/24", "64:ff9b:1::/48", "::ffff:0:0:0/96", "fec0::/10")]
@@ -42,7 +46,30 @@ _EMBEDDING = [ipaddress.IPv6Network(text) for text in ("64:ff9b::/96", "::/96")]
 
 
 class ForbiddenAddress(OSError):
-    """The name leads to a private address."""
+    """The host name resolves to an address that is not public."""
+
+
+def queue_webhook(session: Session, job: JobRow, event: str) -> None:
+    """Put an event of a job into the outbox, in the transaction that caused it; nothing if the job has no webhook.
+
+    A further event is one more call of this, with a name of its own. The body is the job's state at this moment.
+    """
+    if job.webhook is None:
+        return
+    ident, now = str(uuid.uuid4()), time.time()
+    body = {
+        "event": event,
+        "event_id": ident,
+        "job": job.id,
+        "state": job.state,
+        "reason": job.reason,
+        "message": job.message,
+        "log": safe_name(job.log_name, "log"),
+        "ended": job.ended,
+    }
+    row = DeliveryRow(id=ident, tenant=job.tenant, job_id=job.id, url=job.webhook, created=now, next_at=now, attempts=0)
+    row.body, row.state = json.dumps(body, separators=(",", ":")), "pending"
+    session.add(row)
 
 
 def secret_of(session: Session, tenant: str) -> str:
@@ -61,13 +88,13 @@ def sign(secret: str, stamp: int, body: bytes) -> str:
 
 
 class WebhookSender:
-    """A thread that empties the outbox."""
+    """A thread that delivers what is in the outbox."""
 
     def __init__(self, database: Database, settings: Settings) -> None:
         self._database, self._settings = database, settings
         self._stop = threading.Event()
         self._last = ""
-        """The tenant that had its turn."""
+        """The tenant of the last delivery."""
         self._thread = threading.Thread(target=self._run, name="webhooks", daemon=True)
 
     def start(self) -> None:
@@ -75,7 +102,7 @@ class WebhookSender:
         self._thread.start()
 
     def stop(self) -> None:
-        """End; what is in the outbox stays there."""
+        """End; what is in the outbox is kept."""
         self._stop.set()
         self._thread.join(TIMEOUT_S + 1.0)
 

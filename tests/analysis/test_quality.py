@@ -85,9 +85,9 @@ def test_odometry_that_begins_anew_goes_on_where_it_was_and_is_told(tmp_path: Pa
         return event
 
     start = Pose2(2.6, 8.1, 1.5708)
-    spec = RunRequest(logs=(rewritten(tmp_path / "run.mcap", begun_anew, end=14.0),), mode=mode, initial_pose=start)
-    found = run(spec)
-    whole = run(replace(spec, logs=(rewritten(tmp_path / "whole.mcap", lambda event: event, end=14.0),)))
+    request = RunRequest(logs=(rewritten(tmp_path / "run.mcap", begun_anew, end=14.0),), mode=mode, initial_pose=start)
+    found = run(request)
+    whole = run(replace(request, logs=(rewritten(tmp_path / "whole.mcap", lambda event: event, end=14.0),)))
     (warning,) = (each for each in found.warnings if each.code == WarningCode.ODOMETRY_RESET)
     assert warning.text.startswith("odometry (/odom) jumps (1 times, first by ")
     assert " at 10.000 s); it is continued" in warning.text

@@ -19,7 +19,7 @@ from hsloc.errors import HslocError
 from hsloc.evaluation.metrics import compare
 from hsloc.model import Trajectory
 from hsloc.model.verdict import Verdict, VerdictReason, verdict_of
-from hsloc.report.table import error_statistics, table_rows
+from hsloc.report.table import error_statistics, reason_text, table_rows
 from hsloc.run_metrics import RunMetrics, RunTimings, schema
 from hsloc.warnings import RunWarning, WarningCode
 from hsloc_service.execution.worker import summarise
@@ -148,6 +148,10 @@ def test_every_figure_is_the_same_on_the_terminal_in_the_report_and_on_the_page(
     assert f"verdict: {metrics.verdict}" in terminal
     assert f"Verdict: {metrics.verdict}" in report
     assert summary["metrics"]["verdict"] == metrics.verdict
+    (reason,) = metrics.verdict_reasons
+    assert summary["verdict_reasons"][0]["line"] == reason_text(reason)
+    assert reason_text(reason) in words(terminal)
+    assert reason_text(reason) in report
     for label, unit, values in error_statistics(metrics):
         assert f"{label} [{unit}] {values.rmse:.4f} {values.mean:.4f}" in report
 
@@ -174,6 +178,13 @@ def test_the_reasons_name_places_and_times(metrics: Any) -> None:
     ((begin, end),) = reason.times
     assert 9.0 < begin < end < 13.0
     assert len(reason.places) == 2
+    assert reason_text(replace(reason, remedy="look")) == (
+        f"{reason.text}, from {begin:.1f} to {end:.1f} s, "
+        f"near ({reason.places[0][0]:.1f}, {reason.places[0][1]:.1f}) m, "
+        f"({reason.places[1][0]:.1f}, {reason.places[1][1]:.1f}) m; look"
+    )
+    many = replace(reason, times=((0.0, 1.0),) * 5, places=(), remedy="")
+    assert reason_text(many).endswith(", from 0.0 to 1.0 s, 0.0 to 1.0 s, 0.0 to 1.0 s and 2 more")
 
 
 def test_a_job_keeps_all_warnings_of_the_run() -> None:

@@ -7,10 +7,10 @@ import json
 from pathlib import Path
 
 import pytest
+from paths import RECORDINGS
 
 from hsloc.cli.main import main
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 SLIP = str(RECORDINGS / "slip.mcap")
 
 

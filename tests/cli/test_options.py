@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from paths import RECORDINGS
 
 from hsloc.cli.main import COMMANDS, build_parser, main
 from hsloc.cli.submit import request_of
@@ -16,8 +16,8 @@ from hsloc.options import BY_NAME, OPTIONS, offered
 
 if TYPE_CHECKING:
     import argparse
+    from pathlib import Path
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 SLIP = str(RECORDINGS / "slip.mcap")
 
 

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pytest
+from paths import RECORDINGS
 
-from hsloc.cli.main import main
+from hsloc.cli.arguments import run_request
+from hsloc.cli.main import build_parser, main
 from hsloc.evaluation import write_tum
 from hsloc.export.provenance import command
 from hsloc.log import ReadOptions, open_log
 from hsloc.model import Trajectory, Truth
+from hsloc.options import OPTIONS
 from hsloc.request import RunRequest
 
 if TYPE_CHECKING:
-    import pytest
-
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
+    from hsloc.options import Option
 
 
 def paste(folder: Path, out: str) -> None:
@@ -107,3 +110,27 @@ def test_a_server_writes_no_folder(tmp_path: Path) -> None:
         {"map": "/srv/job/map/floor.yaml", "relations": "/srv/job/relations/r.txt", "bare_names": True},
     )
     assert command(request) == "hsloc replay run.mcap --map=floor.yaml --relations=r.txt"
+
+
+EXAMPLES: dict[str, Any] = {
+    "mode": "slam", "map": "maps/a floor.yaml", "resume": "results/first", "no_odometry": True,
+    "initial_pose": [-1.5, 2.0, 0.25], "unknown_start": True, "alignment": "origin", "reference": "/vicon",
+    "relations": "some.relations", "scan_topic": "/front,/rear", "laser_pose": [-0.1, 0.0, -3.0], "deskew": True,
+    "start_s": -2.5, "end_s": 60.125, "preset": "paper", "matcher": "icp", "mapper": "point", "seed": 77,
+    "set": ["hide.budget=400", "localiser.fuse=true"], "stamps": "log", "slice": "-0.2,0.5",
+    "scan_fix": "range_max=12", "time_offset": "/odom=-0.25",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("option", [option for option in OPTIONS if option.place != "check"], ids=lambda o: o.name)
+def test_every_option_survives_the_line(option: Option) -> None:
+    """Request, line, command line, request: nothing that decides the files is lost."""
+    if option.name in ("config", "duration_s"):  # written as --set and --end
+        return
+    value = EXAMPLES.get(option.name, "/some/topic")
+    request = RunRequest.from_values(["my logs/run.mcap"], {option.name: value})
+    words = shlex.split(command(request))
+    assert words[2] == "my logs/run.mcap"
+    assert any(word.startswith(option.flag) for word in words)
+    arguments = build_parser().parse(words[1:])
+    assert run_request(arguments) == request

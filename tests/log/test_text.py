@@ -287,3 +287,15 @@ def test_the_classic_logs(name: str, odometry: int, scans: int, backwards: dict[
                 assert last.stamp_ns == event.stamp_ns
             elif isinstance(event, Odometry):
                 last = event
+
+
+def test_a_gzip_that_unpacks_to_a_thousand_times_its_size_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.log.gz"
+    with gzip.open(path, "wb") as file:
+        file.write((odom("1.0") + "\n").encode())
+        block = b"#" * 999 + b"\n"
+        for _ in range(100):
+            file.write(block * 1000)
+    assert path.stat().st_size < 1 << 20
+    with pytest.raises(LogFormatError, match="unpacks to more than 100 times its size"):
+        list(open_log(path).events())

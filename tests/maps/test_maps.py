@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from math import pi
 from typing import TYPE_CHECKING
 
@@ -242,3 +243,34 @@ def test_an_unwritable_target_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"missing/map\.pgm: cannot be written"):
         save_map(grid, tmp_path / "missing" / "map")
     assert list(tmp_path.iterdir()) == []
+
+
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\nshowpage\n%%EOF\n"
+
+
+@pytest.mark.parametrize("kind", ["EPS", "GIF", "TIFF", "JPEG", "WEBP"])
+def test_an_image_of_another_format_is_refused_by_its_content(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "map.yaml").write_text(
+        "image: map.pgm\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    )
+    if kind == "EPS":
+        (tmp_path / "map.pgm").write_bytes(EPS)
+    else:
+        Image.new("L", (4, 4)).save(tmp_path / "map.pgm", format=kind)
+    with pytest.raises(MapError, match="no PGM, PNG or BMP image; convert it"):
+        load_map(tmp_path / "map.yaml")
+
+
+def yaml_bomb(levels: int = 22) -> str:
+    """Merge keys of merge keys: each level doubles what the loader copies."""
+    lines = ["a0: &a0 {k: 1}"]
+    lines += [f"a{k}: &a{k} {{<<: [*a{k - 1}, *a{k - 1}]}}" for k in range(1, levels)]
+    return "\n".join([*lines, "image: map.pgm", ""])
+
+
+def test_a_yaml_bomb_is_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "map.yaml").write_text(yaml_bomb())
+    begin = time.monotonic()
+    with pytest.raises(MapError, match="has a YAML alias"):
+        load_map(tmp_path / "map.yaml")
+    assert time.monotonic() - begin < 2.0

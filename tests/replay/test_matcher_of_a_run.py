@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from paths import RECORDINGS
 
 from hsloc.analysis.scan_statistics import ExtrinsicsCheck
 from hsloc.cli.main import main
@@ -22,9 +22,10 @@ from hsloc.replay.run import run
 from hsloc.request import RunRequest
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hsloc.matching import Match
 
-RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 SLIP = RECORDINGS / "slip.mcap"
 MAPPED = {"mode": "slam", "end_s": 4.0}
 

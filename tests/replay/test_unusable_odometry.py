@@ -128,6 +128,11 @@ def test_a_robot_that_moves_without_odometry_is_noticed_within_seconds() -> None
     assert len(passed) < 6 * 60
 
 
+def test_odometry_that_ends_before_the_scans_is_not_frozen() -> None:
+    events = [e for e in still(30.0, 0.95, True) if isinstance(e, Scan) or e.stamp_ns < 20_000_000_000]
+    assert list(OdometryWatch(events)) == events
+
+
 def test_the_watch_needs_no_pass_of_its_own_over_a_real_log() -> None:
     events = list(open_log(OFFICE).events())
     assert list(OdometryWatch(events)) == events

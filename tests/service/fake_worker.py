@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
+import socket
+import sqlite3
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hsloc_service.execution import limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 def main() -> int:
@@ -96,13 +103,63 @@ def main() -> int:
     output.mkdir()
     (output / "trajectory.tum").write_text(f"{job['request']['seed']} {rest}\n")
     (output / "metrics.json").write_text("{}\n")
+    if word == "attack":
+        (output / "report.json").write_text(json.dumps(attack(folder, rest)))
+    if word == "nest":
+        deep = folder
+        for _ in range(int(rest[0])):
+            (Path("d")).mkdir()
+            os.chdir("d")
+        os.chdir(deep)
+    if word == "large":
+        (output / "large.bin").write_bytes(os.urandom(1 << 20) * int(rest[0]))
     if word == "tricks":
         (output / "passwd").symlink_to("/etc/passwd")
         (output / "sub").mkdir()
         (output / "sub" / "x").write_text("x")
         (output / "<img src=x>").write_text("x")
-    tell({"done": {"metrics": {}, "data_lost": False, "warnings": [], "notes": [], "timings": {}}})
+    warning = {"code": "clocks_apart", "text": "the stamps are 3.0 s apart", "remedy": "check the clocks"}
+    figure = {"name": "APE rmse", "values": ["1.23 cm", "0.45°"]}
+    summary = {"metrics": {"verdict": "check"}, "figures": [figure], "warnings": [warning]}
+    tell({"done": {**summary, "data_lost": False, "notes": [], "timings": {}}})
     return 0
+
+
+def attack(folder: Path, rest: list[str]) -> dict[str, str]:
+    """What a hostile job may try, and what came of it; `rest` is the port of the server and its process."""
+    data, port, server = folder.parent.parent, int(rest[0]), rest[1]
+    found = {}
+
+    def attempt(name: str, work: Callable[[], object]) -> None:
+        try:
+            found[name] = f"done: {work()!r}"[:200]
+        except (OSError, ValueError, sqlite3.Error) as error:
+            found[name] = f"refused: {type(error).__name__}"
+
+    def connect(kind: int, address: tuple[str, int]) -> None:
+        with socket.socket(socket.AF_INET, kind) as line:
+            line.settimeout(1.0)
+            line.connect(address)
+            line.send(b"x")
+
+    def write_database() -> None:
+        with sqlite3.connect(f"file:{data / 'hsloc.db'}?mode=rw", uri=True) as database:
+            database.execute("INSERT INTO secret VALUES ('planted', 'x')")
+
+    attempt("read database", (data / "hsloc.db").read_bytes)
+    attempt("write database", write_database)
+    attempt("link database", lambda: os.link(data / "hsloc.db", folder / "output" / "stolen.db"))
+    attempt("list uploads", lambda: len(os.listdir(data / "uploads")) > 1 or os.listdir(data / "none"))
+    attempt("write elsewhere", lambda: (data / "results" / "planted").write_text("x"))
+    attempt("write input", lambda: next((folder / "input").iterdir()).write_bytes(b"changed"))
+    attempt("read outside", (data.parent / "server.log").read_bytes)
+    attempt("read password file", Path("/etc/passwd").read_bytes)
+    attempt("environment of the server", lambda: b"PATH" in Path(f"/proc/{server}/environ").read_bytes() or 1 / 0)
+    attempt("signal to the server", lambda: os.kill(int(server), 0))
+    attempt("tcp", lambda: connect(socket.SOCK_STREAM, ("127.0.0.1", port)))
+    with contextlib.suppress(OSError):  # in a network of its own it arrives nowhere
+        connect(socket.SOCK_DGRAM, ("127.0.0.1", int(rest[2])))
+    return found
 
 
 def spawn_sleeper(new_session: bool) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import socket
+import sqlite3
 import time
 import uuid
 from typing import TYPE_CHECKING, Any
@@ -15,6 +17,7 @@ from hsloc.cli.main import main as program
 from hsloc_service.auth import Tokens
 from hsloc_service.db.database import Database
 from hsloc_service.http.app import create_app
+from hsloc_service.http.openapi import describe
 from hsloc_service.main import with_tokens
 from hsloc_service.settings import SettingsError
 from hsloc_service.storage import Storage
@@ -38,6 +41,8 @@ READ = {
     ("get", "/v1/jobs/{job_id}/results/{name}"),
     ("get", "/v1/jobs/{job_id}/webhooks"),
     ("get", "/v1/options"),
+    ("get", "/v1/schemas"),
+    ("get", "/v1/schemas/{name}"),
     ("head", "/v1/tus/{file_id}"),
     ("options", "/v1/tus"),
 }
@@ -109,7 +114,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
 
 
 def test_no_route_is_forgotten(world: World) -> None:
-    schema = world.client.app.openapi()  # type: ignore[attr-defined]
+    schema = describe(world.client.app, complete=True)  # type: ignore[arg-type]
     routes = {(method, path) for path, operations in schema["paths"].items() for method in operations}
     assert routes == PUBLIC | READ | WRITE | ADMIN
     for path, operations in schema["paths"].items():
@@ -299,3 +304,79 @@ def test_made_up_methods_are_one_series(client: TestClient) -> None:
     lines = client.get("/metrics").text.splitlines()
     assert not [line for line in lines if "MADE" in line]
     assert [line for line in lines if 'hsloc_requests_total{method="other"' in line]
+
+
+def test_a_token_made_while_an_open_server_runs_closes_it(
+    make_live: Callable[..., Live], capsys: pytest.CaptureFixture[str]
+) -> None:
+    live = make_live()
+    with live.client() as client:
+        assert client.get("/v1/jobs").status_code == 200
+        assert program(["serve", "--data", str(live.data), "--new-token", "one"]) == 0
+        token = capsys.readouterr().out.split(": ")[1].strip()
+        assert client.get("/v1/jobs").status_code == 401
+        assert client.get("/v1/jobs", headers={"Authorization": f"Bearer {token}"}).status_code == 200
+
+
+def test_a_misspelt_query_is_refused(client: TestClient) -> None:
+    answer = client.get("/v1/jobs", params={"sate": "failed"})
+    assert (answer.status_code, answer.json()["code"]) == (422, "invalid")
+    assert "query.sate: is unknown here; known are before, limit, state" in answer.json()["message"]
+    assert client.get("/v1/info", params={"x": "1"}).status_code == 422
+    assert client.get("/v1/jobs", params={"state": "failed", "limit": 5}).status_code == 200
+
+
+def test_the_address_that_a_client_claims_does_not_count(make_live: Callable[..., Live]) -> None:
+    """Each refused request takes a token of the address; claimed ones would be a fresh bucket each."""
+    live = make_live(HSLOC_TOKEN="a-token-of-the-operator-0123456789", HSLOC_REFUSALS_PER_S="0.1")
+    with live.client() as client:
+        statuses = [client.get("/v1/jobs", headers={"X-Forwarded-For": f"10.0.0.{k}"}).status_code for k in range(5)]
+    assert statuses == [401, 401, 429, 429, 429]
+
+
+def test_metrics_and_logs_name_what_operators_ask_for(make_live: Callable[..., Live]) -> None:
+    live = make_live()
+    with live.client() as client:
+        wait(client, submit(client))
+        deadline = time.monotonic() + 10.0
+        while "hsloc_job_seconds_bucket" not in (text := client.get("/metrics").text) and time.monotonic() < deadline:
+            time.sleep(0.05)  # it is counted when the folder of the attempt is gone
+    for name in ("hsloc_job_seconds_bucket", "hsloc_job_wait_seconds_bucket", "process_resident_memory_bytes"):
+        assert name in text, name
+    assert re.search(r'hsloc_build_info\{version="[0-9.]+[^"]*"\} 1', text)
+    assert '"tenant": "local"' in live.log.read_text()
+
+
+def test_a_busy_port_is_found_before_anything_is_recovered(
+    make_live: Callable[..., Live], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    live = make_live()
+    other = tmp_path / "other"
+    assert program(["serve", "--data", str(other), "--port", str(live.port)]) == 1
+    assert f"127.0.0.1:{live.port}: cannot be listened at: Address already in use" in capsys.readouterr().err
+    assert not other.exists()
+
+
+def test_a_damaged_database_is_an_answer_and_a_line_in_the_log(make_live: Callable[..., Live]) -> None:
+    live = make_live()
+    with live.client() as client:
+        for _ in range(30):
+            upload(client, b"x")
+    live.end()
+    path = live.data / "hsloc.db"
+    with sqlite3.connect(path) as database:
+        size = int(database.execute("PRAGMA page_size").fetchone()[0])
+        (root,) = database.execute("SELECT rootpage FROM sqlite_master WHERE name = 'file'").fetchone()
+    with path.open("r+b") as file:
+        file.seek((root - 1) * size)
+        file.write(b"\xff" * size)
+    try:
+        live.start()
+    except RuntimeError as error:
+        assert "Traceback" not in str(error)  # noqa: PT017
+        assert "cannot be used as database" in str(error)  # noqa: PT017
+        return
+    with live.client() as client:
+        answer = client.get("/v1/files")
+        assert (answer.status_code, answer.json()["code"]) == (500, "database")
+    assert "Traceback" not in live.log.read_text()

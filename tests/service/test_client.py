@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -11,8 +12,12 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from live_service import free_port
+from paths import RECORDINGS
 
+from hsloc.cli.main import main
 from hsloc.client import Client, ClientError
+from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -69,11 +74,11 @@ def test_refusals_are_told_at_once(make_live: Callable[..., Live], log: Path) ->
     assert refused.value.status == 401
     with pytest.raises(ClientError, match="at most 1048576 are taken"):
         Client(live.url, "a-token-of-the-operator-0123456789").upload(log)
-    with pytest.raises(ClientError, match="cannot be reached"):
+    with pytest.raises(ClientError, match=r"cannot be reached"):
         Client("http://127.0.0.1:1", attempts=2).job("x")
     with pytest.raises(ClientError, match="begins with http"):
         Client("localhost:8000")
-    with pytest.raises(ClientError, match="cannot be read"):
+    with pytest.raises(ClientError, match=r"cannot be read"):
         Client(live.url).upload(log.parent / "not there")
 
 
@@ -88,6 +93,9 @@ def test_the_command(make_live: Callable[..., Live], log: Path, tmp_path: Path) 
     assert done.returncode == 0, done.stderr
     assert "succeeded" in done.stdout
     assert (tmp_path / "got" / "trajectory.tum").read_text().startswith("8 ")
+    assert "hsloc: warning: the stamps are 3.0 s apart; check the clocks\n" in done.stderr
+    assert "verdict: check\n" in done.stdout
+    assert " ".join(done.stdout.split()).endswith("APE rmse 1.23 cm 0.45°")
     log.write_bytes(b"bad-input")
     failed = submit(live, str(log), "--wait")
     assert failed.returncode == 1
@@ -126,9 +134,53 @@ def test_the_command_sends_what_replay_takes(make_live: Callable[..., Live], log
     assert client.request("GET", f"/v1/files/{request['relations']}").json()["name"] == "some.relations"
     assert (request["alignment"], request["no_odometry"], request["mode"]) == ("origin", True, "slam")
     read = {key: value for key, value in request["read"].items() if value is not None}
+    assert read.pop("stamps") == "header"
     assert read == {"scan_topic": "/a,/b", "start_s": 2.0, "laser_pose": [1.0, 2.0, 3.0], "deskew": True}
     assert client.wait(job["id"], every_s=0.1)["state"] == "succeeded"
     refused = submit(live, str(log), "--resume", job["id"])
     assert refused.returncode == 1
     assert "drew no map" in refused.stderr
     assert refused.stderr.count("\n") == 1
+
+
+def test_a_job_whose_result_does_not_keep_a_limit_is_below_threshold(
+    make_live: Callable[..., Live], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A limit, --duration and --set travel to the job; the answer is an outcome of the job and exit code 4."""
+    live = make_live(HSLOC_WORKER_COMMAND=",".join(Settings().worker_command), HSLOC_JOB_MEMORY_BYTES="4G")
+    argv = ["submit", str(RECORDINGS / "slip.mcap"), "--url", live.url, "--wait", "-q", "--duration", "4"]
+    assert main([*argv, "--set", "matcher.budget=150", "--max-ape", "0.0001", "--min-localised", "0.9"]) == 4
+    printed = capsys.readouterr()
+    assert [line[:40] for line in printed.err.splitlines()] == ["hsloc: limit not kept: --max-ape 0.0001:"]
+    job = Client(live.url).request("GET", f"/v1/jobs/{printed.out.strip()}").json()
+    assert (job["state"], job["outcome"]) == ("succeeded", "below_threshold")
+    assert job["summary"]["limits"][0].startswith("--max-ape 0.0001: the RMSE of the position is ")
+    assert job["request"]["read"]["end_s"] == 4.0
+    assert job["request"]["config"] == {"hide": {"budget": 150}}
+    assert main([*argv, "--max-ape", "1", "--matcher", "hs"]) == 0
+    job = Client(live.url).request("GET", f"/v1/jobs/{capsys.readouterr().out.strip()}").json()
+    assert job["outcome"] == "ok"
+    assert job["summary"]["metrics"]["run"]["matcher"] == "harmony_search"
+
+
+def test_a_reference_is_uploaded_and_named_without_the_servers_folders(
+    make_live: Callable[..., Live], tmp_path: Path
+) -> None:
+    live = make_live(HSLOC_WORKER_COMMAND=",".join(Settings().worker_command), HSLOC_JOB_MEMORY_BYTES="4G")
+    assert main(["replay", str(RECORDINGS / "slip.mcap"), "-q", "--end", "4", "--out", str(tmp_path / "here")]) == 0
+    argv = ["submit", str(RECORDINGS / "slip.mcap"), "--url", live.url, "-q", "--end", "4"]
+    argv += ["--reference", str(tmp_path / "here" / "reference.tum"), "--out", str(tmp_path / "there")]
+    assert main(argv) == 0
+    found, expected = (json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("there", "here"))
+    assert found["log"]["reference"] == "reference.tum"
+    assert found["ape"]["trans_part"]["rmse"] == pytest.approx(expected["ape"]["trans_part"]["rmse"], abs=1e-6)
+    for name in ("config.yaml", "report.html", "metrics.json"):
+        assert str(live.data) not in (tmp_path / "there" / name).read_text()
+    assert "--reference=reference.tum" in (tmp_path / "there" / "config.yaml").read_text()
+
+
+def test_a_dead_port_is_given_up_within_seconds(log: Path) -> None:
+    begin = time.monotonic()
+    with pytest.raises(ClientError, match=r"cannot be reached.*refused.*is the server running, and the address right"):
+        Client(f"http://127.0.0.1:{free_port()}").upload(log)
+    assert time.monotonic() - begin < 10.0

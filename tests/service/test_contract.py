@@ -21,6 +21,7 @@ from schemathesis.specs.openapi.checks import negative_data_rejection
 
 from hsloc_service.http import tus
 from hsloc_service.http.app import create_app
+from hsloc_service.http.openapi import describe
 from hsloc_service.http.schemas import UUID_PATTERN
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ def described() -> dict[str, Any]:
         app = create_app(settings(Path(folder)))
         app.state.context.database.close()
         app.state.context.storage.close()
-        found = app.openapi()
+        found = describe(app, complete=True)
     for model, names in FEW.items():
         known = found["components"]["schemas"][model]["properties"]
         found["components"]["schemas"][model]["properties"] = {name: known[name] for name in names}

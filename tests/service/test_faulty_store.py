@@ -18,7 +18,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from live_service import settings, submit, wait
 
 from hsloc_service.call_timeout import BoundedExecutor
-from hsloc_service.execution import retry as patience
+from hsloc_service.execution import retry
 from hsloc_service.http import results_routes
 from hsloc_service.http.app import create_app
 
@@ -75,8 +75,8 @@ fsspec.register_implementation("faulty", Faulty, clobber=True)
 
 @pytest.fixture(autouse=True)
 def _fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(patience, "FIRST_WAIT_S", 0.05)
-    monkeypatch.setattr(patience, "LONGEST_WAIT_S", 0.2)
+    monkeypatch.setattr(retry, "FIRST_WAIT_S", 0.05)
+    monkeypatch.setattr(retry, "MAX_WAIT_S", 0.2)
     monkeypatch.setattr(Faulty, "store", {})
     monkeypatch.setattr(Faulty, "pseudo_dirs", [""])
     monkeypatch.setattr(Faulty, "fault", "")
@@ -195,8 +195,8 @@ def test_many_readers_wait_for_their_turn() -> None:
         return k
 
     async def all_at_once() -> list[int]:
-        desk = BoundedExecutor(timeout_s=5.0, most=3)
-        return list(await asyncio.gather(*(desk.ask(functools.partial(read, k)) for k in range(30))))
+        executor = BoundedExecutor(timeout_s=5.0, max_calls=3)
+        return list(await asyncio.gather(*(executor.run(functools.partial(read, k)) for k in range(30))))
 
     assert asyncio.run(all_at_once()) == list(range(30))
     assert most == 3
@@ -273,7 +273,7 @@ def test_what_a_broken_attempt_left_behind_is_swept(client: TestClient) -> None:
     wait(client, job)
     Faulty.fault = ""
     context = client.app.state.context  # type: ignore[attr-defined]
-    assert context.removals.sweep(context.stores.current) == 1
+    assert context.deletions.sweep(context.stores.current) == []
     assert stored(job) == []
 
 
@@ -285,13 +285,13 @@ def test_deleting_does_not_wait_for_the_store_and_is_not_forgotten(client: TestC
     assert client.delete(f"/v1/jobs/{job}").status_code == 204
     assert time.monotonic() - begin < 2.0
     assert client.get(f"/v1/jobs/{job}/results/metrics.json").status_code == 404
-    removals = client.app.state.context.removals  # type: ignore[attr-defined]
-    assert removals.clear() == 0
+    deletions = client.app.state.context.deletions  # type: ignore[attr-defined]
+    assert deletions.clear() == 0
     assert len(stored(job)) == 2
     Faulty.fault = ""
-    assert removals.clear() == 1
+    assert deletions.clear() == 1
     assert stored(job) == []
-    assert removals.clear() == 0
+    assert deletions.clear() == 0
     Faulty.release.set()
 
 
@@ -318,11 +318,30 @@ def test_a_disk_that_is_not_mounted_is_away_and_nothing_is_gone(
     waiting = submit(client, seed=3)
     wait_for_store(client, waiting)
     assert client.delete(f"/v1/jobs/{doomed}").status_code == 204
-    removals = client.app.state.context.removals  # type: ignore[attr-defined]
-    assert removals.clear() == 0
+    deletions = client.app.state.context.deletions  # type: ignore[attr-defined]
+    assert deletions.clear() == 0
     assert not mounted.exists()  # made anew, it would be on another disk, and hidden when the right one is there again
     aside.rename(mounted)
     assert wait(client, waiting)["state"] == "succeeded"
     assert client.get(f"/v1/jobs/{first}/results/metrics.json").status_code == 200
-    assert removals.clear() == 1
+    assert deletions.clear() == 1
     assert sorted(path.name for path in next(mounted.iterdir()).iterdir()) == sorted([f"{first}.1", f"{waiting}.1"])
+
+
+def test_a_results_folder_that_is_not_mounted_at_the_start_is_waited_for(tmp_path: Path) -> None:
+    mounted, aside = tmp_path / "mounted", tmp_path / "aside"
+    chosen = settings(tmp_path, results_url=f"file://{mounted}", store_timeout_s=5.0)
+    with TestClient(create_app(chosen)) as client:
+        first = submit(client)
+        wait(client, first)
+    mounted.rename(aside)
+    with TestClient(create_app(chosen)) as client:
+        second = submit(client)
+        wait_for_store(client, second)
+        time.sleep(0.3)
+        assert not mounted.exists()  # it would be on the disk beneath, and hidden by the mount
+        assert client.get(f"/v1/jobs/{first}/results/metrics.json").status_code == 503
+        aside.rename(mounted)
+        assert wait(client, second)["state"] == "succeeded"
+        for job in (first, second):
+            assert client.get(f"/v1/jobs/{job}/results/metrics.json").status_code == 200

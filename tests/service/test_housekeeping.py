@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import sqlite3
+import threading
 import time
+import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 from live_service import settings, submit, wait
+from sqlalchemy import insert
 from sqlalchemy.exc import OperationalError
 
+from hsloc_service.db.tables import EventRow, FileRow, IdempotencyRow, JobRow
 from hsloc_service.housekeeping import Housekeeping
 from hsloc_service.settings import SettingsError, from_environment, parse_size
 from hsloc_service.storage import Storage
@@ -27,7 +31,7 @@ def test_old_jobs_go_with_results_and_uploads_but_active_ones_stay(make_client: 
     wait(client, old)
     active = submit(client, b"slow 30")
     context = client.app.state.context  # type: ignore[attr-defined]
-    tidy = Housekeeping(context.database, context.storage, context.settings, context.stores).tidy
+    tidy = Housekeeping(context.database, context.storage, context.settings, context.deletions).tidy
     tidy(time.time() + 50.0)
     assert client.get(f"/v1/jobs/{old}").status_code == 200
     tidy(time.time() + 150.0)
@@ -44,7 +48,7 @@ def test_without_retention_nothing_goes(make_client: Callable[..., TestClient]) 
     job = submit(client)
     wait(client, job)
     context = client.app.state.context  # type: ignore[attr-defined]
-    Housekeeping(context.database, context.storage, context.settings, context.stores).tidy(time.time() + 1e9)
+    Housekeeping(context.database, context.storage, context.settings, context.deletions).tidy(time.time() + 1e9)
     assert client.get(f"/v1/jobs/{job}/results").status_code == 200
 
 
@@ -58,6 +62,69 @@ def test_settings_from_variables(tmp_path: Path) -> None:
         with pytest.raises(SettingsError):
             from_environment({f"HSLOC_{name}": value})
     assert settings(tmp_path).retention_s is None
+
+
+@pytest.mark.parametrize(
+    ("variable", "value"),
+    [
+        ("RETENTION_S", "-5"),  # everything was deleted
+        ("RETENTION_S", "0"),
+        ("RETENTION_S", "nan"),
+        ("UPLOAD_TTL_S", "inf"),
+        ("JOB_WALL_S", "-1"),
+        ("JOB_WALL_S", "1e30"),
+        ("TENANT_BYTES", "0"),
+        ("MAX_CONNECTIONS", "-1"),
+        ("WEBHOOK_ATTEMPTS", "0"),
+        ("MIN_FREE_BYTES", "-1"),
+        ("FAULT_FAIL_JOBS", "1.5"),
+        ("FAULT_FAIL_JOBS", "nan"),
+        ("ALLOWED_HOSTS", ","),
+    ],
+)
+def test_a_setting_without_sense_is_refused(variable: str, value: str) -> None:
+    with pytest.raises(SettingsError, match=rf"^{variable.lower()} is .*(must|give)"):
+        from_environment({f"HSLOC_{variable}": value})
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"), [("HSLOC_RETENTON_S", "did you mean HSLOC_RETENTION_S"), ("HSLOC_XYZZY", "remove it")]
+)
+def test_a_misspelt_variable_is_refused(name: str, remedy: str) -> None:
+    with pytest.raises(SettingsError, match=remedy):
+        from_environment({name: "5"})
+    from_environment({"HSLOC_TOKEN": "x", "HSLOC_DATA": "/logs", "HSLOCATION": "x"})
+
+
+def test_retention_of_many_jobs_holds_up_nobody(make_client: Callable[..., TestClient]) -> None:
+    """Before, 8,000 jobs were one transaction: 66 s, in which no upload and no heartbeat was written."""
+    client = make_client(retention_s=100.0, tenant_bytes=1 << 40)
+    context = client.app.state.context  # type: ignore[attr-defined]
+    count = 6000
+    with context.database.write() as session:
+        ids = [str(uuid.uuid4()) for _ in range(count)]
+        file = {"tenant": "local", "name": "a", "state": "complete", "received": 1, "size": 1, "created": 1.0}
+        session.execute(insert(FileRow), [{"id": each, **file} for each in ids])
+        job = {"tenant": "local", "log_name": "a", "state": "succeeded", "created": 1.0, "ended": 2.0}
+        values = [{"id": each, "file_id": each, "request": {"log": each}, "folder": f"{each}.1", **job} for each in ids]
+        session.execute(insert(JobRow), values)
+        event = {"tenant": "local", "at": 1.0, "kind": "state", "data": {}}
+        session.execute(insert(EventRow), [{"job_id": each, **event} for each in ids for _ in range(3)])
+        key = {"tenant": "local", "sha256": "0", "created": time.time()}
+        session.execute(insert(IdempotencyRow), [{"key": each, "job_id": each, **key} for each in ids])
+    tidy = Housekeeping(context.database, context.storage, context.settings, context.deletions).tidy
+    thread = threading.Thread(target=tidy, args=(time.time(),))
+    waits = []
+    thread.start()
+    while thread.is_alive():
+        begin = time.monotonic()
+        with context.database.write():
+            waits.append(time.monotonic() - begin)
+        time.sleep(0.02)
+    thread.join()
+    assert client.get("/v1/jobs").json()["jobs"] == []
+    assert client.get("/v1/files").json()["files"] == []
+    assert max(waits) < 2.0  # 60 batches; one takes 0.1 s on an idle machine
 
 
 @pytest.mark.parametrize(

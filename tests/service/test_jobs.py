@@ -166,7 +166,10 @@ def test_a_one_shot_that_cannot_be_queued_leaves_no_file(client: TestClient) -> 
 
 def test_options_have_a_schema(client: TestClient) -> None:
     options = client.get("/v1/options").json()
-    assert options["config_schema"]["properties"]["matcher"]["enum"] == ["hide", "harmony_search", "icp"]
+    assert options["config_schema"]["properties"]["matcher"]["enum"] == ["hide", "harmony_search", "icp", "hs"]
+    assert {"name": "seed", "default": 0}.items() <= next(
+        each for each in options["run"] if each["name"] == "seed"
+    ).items()
     assert set(options["presets"]) == {"default", "paper", "paper-literal"}
     for values in options["presets"].values():  # a preset passes its own schema
         answer = client.post("/v1/jobs", json={"log": upload(client), "config": values})
@@ -180,3 +183,12 @@ def test_health_and_metrics(client: TestClient) -> None:
     text = client.get("/metrics").text
     assert 'hsloc_jobs{state="queued"}' in text
     assert "hsloc_request_seconds_bucket" in text
+
+
+def test_the_number_of_a_deleted_job_is_not_given_out_again(client: TestClient) -> None:
+    first, second = submit(client), submit(client)
+    wait(client, second)
+    wait(client, first)
+    number = client.get(f"/v1/jobs/{second}").json()["seq"]
+    assert client.delete(f"/v1/jobs/{second}").status_code == 204
+    assert client.get(f"/v1/jobs/{submit(client)}").json()["seq"] > number

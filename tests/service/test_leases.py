@@ -6,10 +6,12 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from live_service import settings
+from live_service import settings, submit, wait
+from sqlalchemy import update
 
 from hsloc_service.auth import ANYBODY, Principal
 from hsloc_service.db.database import Database
+from hsloc_service.db.tables import JobRow
 from hsloc_service.jobs.leases import Leases
 from hsloc_service.jobs.repository import Jobs
 from hsloc_service.results.store import Asset
@@ -17,8 +19,10 @@ from hsloc_service.storage import Storage
 from hsloc_service.uploads.repository import Files
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from fastapi.testclient import TestClient
 
 OTHER = Principal("other", ANYBODY.scopes)
 
@@ -151,3 +155,26 @@ def test_tenants_take_turns_in_a_single_slot(parts: Parts) -> None:
         order.append(claim.job_id)
         leases.succeed(claim, f"{claim.job_id}.1", ASSET, {})
     assert order == [many[0], others[0], many[1], others[1], many[2], many[3]]
+
+
+def test_a_lease_that_a_clock_ended_is_not_taken_from_the_worker_that_runs_the_job(
+    make_client: Callable[..., TestClient],
+) -> None:
+    client = make_client(slots=2)
+    job = submit(client, b"slow 3")
+    wait(client, job, states=("running",))
+    database = client.app.state.context.database  # type: ignore[attr-defined]
+    for _ in range(10):  # the other slot looks for work all the while
+        with database.write() as session:  # what a clock that is set forward does to every lease
+            session.execute(update(JobRow).values(lease_until=1.0))
+        time.sleep(0.2)
+    ended = wait(client, job)
+    assert (ended["state"], ended["attempt"]) == ("succeeded", 1)
+
+
+def test_leases_are_measured_by_the_database(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
+    parts.submit()
+    assert parts.leases().claim("a") is not None
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + 3600.0)
+    assert parts.leases().recover() == []

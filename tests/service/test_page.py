@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from live_service import upload
+from live_service import submit, upload, wait
 from paths import RECORDINGS
 
 from hsloc_service.settings import Settings
@@ -293,3 +293,75 @@ def test_an_upload_goes_on_after_a_broken_line_and_after_a_reload(
         (file,) = client.get("/v1/files").json()["files"]
     assert file["sha256"] == hashlib.sha256(log.read_bytes()).hexdigest()
     context.close()
+
+
+def test_the_form_offers_what_the_server_does(make_live: Callable[..., Live], open_page: Callable[..., Any]) -> None:
+    live = make_live()
+    page = open_page(live.url)
+    page.wait_for_selector("[data-option=seed]", state="attached")
+    with live.client() as client:
+        offered = {each["name"] for each in client.get("/v1/options", timeout=60.0).json()["run"]}
+    built = set(page.evaluate("() => [...document.querySelectorAll('[data-option]')].map((e) => e.dataset.option)"))
+    assert built == offered - {"relations", "reference", "resume"}
+    page.click("summary >> text=Map and options")
+    for group in ("reading the log", "algorithms"):
+        page.click(f"summary >> text={group}")
+    page.fill("[data-option=initial_pose]", "-1, 2, 0.5")
+    page.fill("[data-option='read.start_s']", "1.5")
+    page.fill("[data-option=seed]", "7")
+    page.select_option("[data-option=matcher]", "icp")
+    page.fill("[data-option=config]", '{"icp": {"iterations": 9}}')
+    page.set_input_files("#log", str(RECORDINGS / "slip.mcap"))
+    page.click("#go")
+    page.wait_for_selector("#jobs [data-job]")
+    with live.client() as client:
+        (job,) = client.get("/v1/jobs").json()["jobs"]
+    request = job["request"]
+    assert (request["initial_pose"], request["read"]["start_s"], request["seed"]) == ([-1.0, 2.0, 0.5], 1.5, 7)
+    assert (request["matcher"], request["config"]) == ("icp", {"icp": {"iterations": 9}})
+
+
+def test_a_page_goes_on_when_the_server_was_restarted(make_live: Callable[..., Live], browser: Any) -> None:
+    live = make_live()
+    with live.client() as client:
+        job = submit(client, b"slow 4")
+    context = browser.new_context()
+    page = context.new_page()  # refused connections are in the console, as they should be
+    page.goto(f"{live.url}/#job={job}")
+    page.wait_for_selector("#job-state .running")
+    assert live.end() == 0  # the stream ends in good order, and the job does not
+    page.wait_for_timeout(1000)
+    live.start()
+    page.wait_for_selector("#job-state .succeeded", timeout=30_000)
+    context.close()
+
+
+def test_an_idle_page_pulls_almost_nothing(make_live: Callable[..., Live], open_page: Callable[..., Any]) -> None:
+    live = make_live()
+    with live.client() as client:
+        for seed in range(30):
+            submit(client, seed=seed, config={"hide": {"budget": 250 + seed}})
+        for job in client.get("/v1/jobs").json()["jobs"]:
+            wait(client, job["id"])
+    page = open_page(live.url)
+    page.wait_for_function("() => document.querySelectorAll('#jobs .succeeded').length === 30")
+    page.wait_for_timeout(3500)
+    answers: list[Any] = []
+    page.on("response", lambda answer: answers.append(answer))
+    page.wait_for_timeout(7000)
+    assert len(answers) >= 2
+    assert {answer.status for answer in answers} == {304}
+
+
+SPARSE = """async () => {
+  const { plot } = await import("/web/plot.js"); const canvas = document.createElement("canvas");
+  canvas.style.width = "600px"; canvas.style.height = "200px"; document.body.append(canvas);
+  const t = [...Array(50).keys()], fill = (v) => t.map((k) => k % 10 ? null : v);
+  const seen = (position) => { plot(canvas, { errors: { t, position, heading: t.map(() => null) } }, NaN);
+    return canvas.toDataURL(); };
+  return seen(fill(0.5)) !== seen(fill(0.5).map((v, k) => k === 20 ? null : v)); }"""
+
+
+def test_a_curve_of_single_values_is_visible(make_live: Callable[..., Live], open_page: Callable[..., Any]) -> None:
+    page = open_page(make_live().url)
+    assert page.evaluate(SPARSE)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from live_service import free_port, submit, wait
 
-from hsloc_service.execution import supervisor
+from hsloc_service.execution import job_process
 from hsloc_service.execution.processes import marked
 from hsloc_service.storage import Storage
 
@@ -53,7 +53,7 @@ LIMITS: dict[str, Any] = {
 def test_ends_with_a_reason(
     make_client: Callable[..., TestClient], word: bytes, state: str, reason: str, attempts: int
 ) -> None:
-    client = make_client(**LIMITS)
+    client = make_client(**LIMITS | ({"job_wall_s": 60.0} if word == b"spin" else {}))
     job = submit(client, word)
     missed: list[float] = []
     stop = threading.Event()
@@ -207,7 +207,7 @@ def test_what_cannot_be_started_is_not_tried_again_at_once(client: TestClient, m
         tries.append(time.monotonic())
         raise OSError(errno.EAGAIN, "no more processes")
 
-    monkeypatch.setattr(supervisor, "start_job", refused)
+    monkeypatch.setattr(job_process, "start_job", refused)
     ended = wait(client, submit(client))
     assert (ended["state"], ended["reason"], len(tries)) == ("crashed", "attempts", 3)
     assert tries[2] - tries[0] > 1.5

@@ -162,3 +162,29 @@ def test_the_description_is_made_beside_all_else(make_live: Callable[..., Live])
         for thread in asking:
             thread.join()
     assert longest < 0.5 * took
+
+
+def test_a_body_in_drops_is_cut_off_and_a_slow_but_steady_one_is_not(live: Live) -> None:
+    head = f"POST /v1/files HTTP/1.1\r\nHost: 127.0.0.1:{live.port}\r\nContent-Length: 6000\r\n\r\n".encode()
+    ends: dict[int, bytes] = {}
+
+    def send(size: int) -> None:
+        with socket.create_connection(("127.0.0.1", live.port)) as line, contextlib.suppress(ConnectionError):
+            line.settimeout(10.0)
+            line.sendall(head)
+            for _ in range(0, 6000, size):
+                line.sendall(b"x" * size)
+                time.sleep(0.2)
+                if select.select([line], [], [], 0)[0]:
+                    break
+            ends[size] = line.recv(100)
+
+    threads = [threading.Thread(target=send, args=(size,)) for size in (10, 400)]  # 50 B/s, for two minutes; 2 kB/s
+    begin = time.monotonic()
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert time.monotonic() - begin < 15.0
+    assert ends.get(10, b"") == b""
+    assert ends[400].startswith(b"HTTP/1.1 201 ")

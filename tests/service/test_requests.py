@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 import subprocess
 import sys
 import time
 import uuid
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from live_service import submit, upload, wait
+from live_service import submit, upload, wait, without_command
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from paths import RECORDINGS
@@ -29,6 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from fastapi.testclient import TestClient
+    from live_service import Live
 
 OFFICE = RECORDINGS / "office.mcap"
 REAL = Settings().worker_command
@@ -74,15 +73,6 @@ def same_bytes(client: TestClient, job: str, folder: Path) -> None:
     for name in sorted(theirs - {"timings.json"}):
         found = client.get(f"/v1/jobs/{job}/results/{name}").content
         assert without_command(name, found) == without_command(name, (folder / name).read_bytes()), name
-
-
-def without_command(name: str, content: bytes) -> Any:
-    """A file of the results without the line "run it again with": the service names no folders in it."""
-    if name != "run.mcap":
-        return re.sub(rb"hsloc replay [^\n<]*", b"", content)
-    reader = make_reader(BytesIO(content))
-    config = [without_command(each.name, each.data) for each in reader.iter_attachments()]
-    return config, [(channel.topic, message.log_time, message.data) for _, channel, message in reader.iter_messages()]
 
 
 def test_two_parts_then_an_extended_map_scored_by_relations(
@@ -222,7 +212,7 @@ def test_what_an_active_job_reads_stays(make_client: Callable[..., TestClient]) 
         assert client.delete(f"/v1/files/{file}").json()["code"] == "in_use"
     assert client.delete(f"/v1/jobs/{drawn}").json()["code"] == "in_use"
     context = client.app.state.context  # type: ignore[attr-defined]
-    Housekeeping(context.database, context.storage, context.settings, context.stores).tidy(time.time() + 150.0)
+    Housekeeping(context.database, context.storage, context.settings, context.deletions).tidy(time.time() + 150.0)
     assert client.get(f"/v1/jobs/{drawn}/results/map.npz").content == b"a saved map"
     assert len(client.get("/v1/files").json()["files"]) == 3
     client.post(f"/v1/jobs/{job}/cancel")
@@ -285,3 +275,19 @@ def test_every_example_of_the_api_fits_it(client: TestClient) -> None:
         JobRequest.model_validate(example)
         named |= set(example)
     assert {"log", "logs", "relations", "resume"} <= named
+
+
+def test_what_has_not_changed_is_304_and_the_rest_is_compressed(make_live: Callable[..., Live]) -> None:
+    live = make_live()
+    with live.client() as client:
+        for seed in range(20):
+            wait(client, submit(client, seed=seed, config={"hide": {"budget": 300}}))
+        full = client.get("/v1/jobs", headers={"Accept-Encoding": "identity"})
+        packed = client.get("/v1/jobs", headers={"Accept-Encoding": "gzip"})
+        assert packed.headers["content-encoding"] == "gzip"
+        assert int(packed.headers["content-length"]) < len(full.content) / 5
+        assert packed.json() == full.json()
+        again = client.get("/v1/jobs", headers={"If-None-Match": packed.headers["etag"]})
+        assert (again.status_code, again.content) == (304, b"")
+        submit(client)
+        assert client.get("/v1/jobs", headers={"If-None-Match": packed.headers["etag"]}).status_code == 200

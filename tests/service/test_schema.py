@@ -161,12 +161,22 @@ def test_a_migration_that_fails_leaves_the_old_database(old: Path, monkeypatch: 
     assert version(old) == SCHEMA_VERSION
 
 
+STEPS = "; ".join((*migrations.STEPS[1], *migrations.STEPS[2]))
+
+
 @pytest.mark.parametrize(
     ("statements", "said"),
     [
         (f"PRAGMA user_version={SCHEMA_VERSION + 1}", f"newer hsloc .schema {SCHEMA_VERSION + 1}, known up to"),
         (
-            "; ".join((*migrations.STEPS[1], *migrations.STEPS[2], "DROP TABLE asset", "PRAGMA user_version=3")),
+            "; ".join(
+                (
+                    *migrations.STEPS[1],
+                    *migrations.STEPS[2],
+                    "DROP TABLE asset",
+                    f"PRAGMA user_version={SCHEMA_VERSION}",
+                )
+            ),
             "table asset has no column job_id, media_type, name",
         ),
         ("PRAGMA user_version=2", "table job has no column resume_of, store"),

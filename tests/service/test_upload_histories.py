@@ -129,7 +129,7 @@ class Histories(RuleBasedStateMachine):
     def time_goes_by(self, later: float) -> None:
         now = time.time() + later
         context = self.context
-        Housekeeping(context.database, context.storage, context.settings, context.stores).tidy(now)
+        Housekeeping(context.database, context.storage, context.settings, context.deletions).tidy(now)
         for model in self.models.values():
             if not model.whole and now > model.born + TTL + 60.0:
                 model.gone = True

@@ -15,11 +15,11 @@ import httpx2 as httpx
 import pytest
 from live_service import upload
 
-from hsloc_service.execution.dispatcher import sweep
+from hsloc_service.reconciliation import reconcile
 from hsloc_service.uploads.repository import Files
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from fastapi.testclient import TestClient
@@ -240,7 +240,7 @@ def test_an_unfinished_upload_expires(make_client: Callable[..., TestClient]) ->
     path, whole = begin(client, 10), upload(client)
     append(client, path, 0, b"12345")
     context = client.app.state.context  # type: ignore[attr-defined]
-    tidy = Housekeeping(context.database, context.storage, context.settings, context.stores).tidy
+    tidy = Housekeeping(context.database, context.storage, context.settings, context.deletions).tidy
     tidy(time.time())
     assert offset(client, path) == 5
     tidy(time.time() + 11.0)
@@ -337,7 +337,23 @@ def test_an_upload_that_an_older_server_left_whole_but_not_complete_goes_on(clie
     path.write_bytes(b"0123456789")
     path.chmod(0o400)
     context.files.advance(ident, 10)
-    sweep(context.database, context.storage)
+    reconcile(context.database, context.storage, context.deletions)
     assert (offset(client, place), path.stat().st_mode & 0o777) == (9, 0o600)
     assert client.patch(place, headers={**PATCH, "Upload-Offset": "9"}, content=b"9").status_code == 204
     assert client.get(f"/v1/files/{ident}").json()["sha256"] == hashlib.sha256(b"0123456789").hexdigest()
+
+
+def test_an_upload_does_not_expire_while_bytes_come(make_live: Callable[..., Live]) -> None:
+    live = make_live(HSLOC_UPLOAD_TTL_S="2", HSLOC_HOUSEKEEPING_S="0.2")
+
+    def slow() -> Iterator[bytes]:
+        for _ in range(20):
+            yield b"x" * 1000
+            time.sleep(0.3)
+
+    with live.client() as client:
+        answer = client.post("/v1/files", params={"name": "slow"}, content=slow())
+        assert (answer.status_code, answer.json()["size"]) == (201, 20_000)
+        place = client.post("/v1/tus", headers={**TUS, "Upload-Length": "10"}).headers["location"]
+        time.sleep(3.0)  # given up
+        assert client.head(place, headers=TUS).status_code == 404

@@ -135,5 +135,11 @@ def diagnostics_of(rng: Any, path: Any, *, every: int = 5, rejected: float = 0.0
     sigma[status == "searching"] = np.nan
     evaluations = np.where(np.isin(status, ["predicted"]), 0, rng.integers(270, 300, n))
     return ScanDiagnostics(
-        stamps, tuple(status), fitness, sigma, evaluations, tuple(reasons.get(name, "") for name in status)
+        stamps,
+        tuple(status),
+        fitness,
+        sigma,
+        evaluations,
+        tuple(reasons.get(name, "") for name in status),
+        np.full((n, 3, 3), np.nan),
     )

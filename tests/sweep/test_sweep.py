@@ -58,9 +58,9 @@ def test_a_plan_is_all_combinations_with_names_of_their_own() -> None:
     assert names[:4] == ["office-default-seed0", "office-default-seed1", "office-icp-seed0", "office-icp-seed1"]
     assert names[4] == "office-2-default-seed0"
     assert len(set(names)) == 12
-    assert runs[4].spec.logs == (OFFICE, HALL)
-    assert runs[3].spec.seed == 1
-    assert runs[3].spec.config.matcher == "icp"
+    assert runs[4].request.logs == (OFFICE, HALL)
+    assert runs[3].request.seed == 1
+    assert runs[3].request.config.matcher == "icp"
 
 
 def test_finished_runs_are_known_again_and_others_are_not(tmp_path: Path) -> None:
@@ -95,8 +95,8 @@ def test_finished_runs_are_known_again_and_others_are_not(tmp_path: Path) -> Non
 )
 def test_whatever_decides_a_run_is_in_its_key(changes: dict[str, Any]) -> None:
     (item,) = plan([OFFICE], DEFAULT, read=SHORT)
-    assert run_key(item.spec) == run_key(replace(item.spec))
-    assert run_key(replace(item.spec, **changes)) != run_key(item.spec)
+    assert run_key(item.request) == run_key(replace(item.request))
+    assert run_key(replace(item.request, **changes)) != run_key(item.request)
 
 
 def test_the_bytes_of_log_and_map_are_in_the_key(tmp_path: Path) -> None:
@@ -105,10 +105,10 @@ def test_the_bytes_of_log_and_map_are_in_the_key(tmp_path: Path) -> None:
     image.write_bytes(b"P5")
     yaml.write_text("image: map.pgm\n")
     (item,) = plan([log], DEFAULT, map=yaml)
-    keys = [run_key(item.spec)]
+    keys = [run_key(item.request)]
     for path in (log, image, yaml):
         path.write_bytes(path.read_bytes() + b"\n")
-        keys.append(run_key(item.spec))
+        keys.append(run_key(item.request))
     assert len(set(keys)) == 4
 
 
@@ -124,7 +124,7 @@ def test_what_goes_wrong_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "exists already" in outcomes[2].error
     assert (tmp_path / "out" / "hall-default-seed0" / "thesis.tex").exists()
 
-    def defect(spec: Any, progress: Any = None) -> None:
+    def defect(request: Any, progress: Any = None) -> None:
         raise ZeroDivisionError("a defect of ours")
 
     monkeypatch.setattr(sweeping, "run", defect)
@@ -136,7 +136,7 @@ def test_what_goes_wrong_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_a_run_that_ends_its_process_ends_no_other(tmp_path: Path) -> None:
     runs = plan([OFFICE], DEFAULT, range(3), read=SHORT)
-    runs[1] = replace(runs[1], spec=replace(runs[1].spec, labels=(Bomb(),)))  # type: ignore[arg-type]
+    runs[1] = replace(runs[1], request=replace(runs[1].request, labels=(Bomb(),)))  # type: ignore[arg-type]
     told: list[Any] = []
     outcomes = sweep_in_processes(runs, tmp_path, 2, told.append)
     assert states(outcomes) == [DONE, FAILED, DONE]

@@ -33,10 +33,10 @@ def test_wean_hall_from_an_unknown_start(data: Path, name: Any) -> None:
 @pytest.mark.parametrize("log", ["mcap_zstd/mcap_zstd.mcap", "macfirst_floor_take_2/macfirst_floor_take_2_0.db3"])
 def test_turtlebot_from_an_unknown_start(data: Path, log: Any) -> None:
     folder = data / "turtlebot4"
-    spec = RunRequest(
+    request = RunRequest(
         logs=(folder / log,), map_path=folder / "mac_1st_floor_final.yaml", read=ReadOptions(), unknown_start=True
     )
-    found = run(spec)
+    found = run(request)
     assert found.localised.all()
     metrics = analyse(found).metrics
     assert metrics.verdict == "good"

@@ -41,8 +41,8 @@ def test_a_map_is_drawn_and_the_way_is_right(tmp_path: Path, name: str) -> None:
 def test_a_drawn_map_is_a_map_to_localise_in(tmp_path: Path) -> None:
     drawn = run(RunRequest(logs=(RECORDINGS / "office.mcap",), mode="slam"))
     write_results(drawn, tmp_path / "out")
-    spec = RunRequest(logs=(RECORDINGS / "office.mcap",), map_path=tmp_path / "out" / "map.yaml", unknown_start=True)
-    found = run(spec)
+    request = RunRequest(logs=(RECORDINGS / "office.mcap",), map_path=tmp_path / "out" / "map.yaml", unknown_start=True)
+    found = run(request)
     assert ape(found).rmse < 0.03
     assert found.localised.all()
 

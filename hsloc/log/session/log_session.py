@@ -255,6 +255,7 @@ class LogSession:
             lasers=tuple(lasers),
             parts=self._parts,
             order="log" if converted else "stamp",
+            clocks_apart_s=self._clocks_apart_s,
             segments=max((found.segments for found in self.surveys.values()), default=1),
             metadata={name: dict(v) for c in self.containers for name, v in c.metadata.items()},
             warnings=tuple(dict.fromkeys(self._warnings + self.mountings.warnings)),
@@ -376,17 +377,21 @@ class LogSession:
         return []
 
     def _warn_of_clocks(self) -> None:
+        self._clocks_apart_s = 0.0
         if self.odom is None or not self.odom.stamp_ns:
             return
         for topic, first in self.scans.items():
             if first is None or not first.stamp_ns:
                 continue
             apart = (first.stamp_ns - first.log_time_ns) - (self.odom.stamp_ns - self.odom.log_time_ns)
+            if abs(apart) / 1e9 > abs(self._clocks_apart_s):
+                self._clocks_apart_s = apart / 1e9
             if abs(apart) > _CLOCKS_APART_NS:
                 self._warnings.append(
                     RunWarning(
                         WarningCode.CLOCKS_APART,
                         f"the stamps of {topic} and {self.choice.odom} are {apart / 1e9:.1f} s apart, measured by the "
                         "log's clock: they may come from different clocks",
+                        "try --time-offset auto, or --stamps log",
                     )
                 )

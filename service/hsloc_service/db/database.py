@@ -7,7 +7,7 @@ import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Engine, create_engine, event
+from sqlalchemy import Engine, create_engine, event, text
 from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.orm import Session
 
@@ -78,6 +78,12 @@ class Database:
         ):
             yield session
             session.commit()
+
+    def now(self, session: Session) -> float:
+        """Seconds since 1970 by the clock of the database, which all its clients share."""
+        if self._engine.dialect.name == "sqlite":
+            return float(session.execute(text("SELECT (julianday('now') - 2440587.5) * 86400.0")).scalar_one())
+        return float(session.execute(text("SELECT extract(epoch FROM clock_timestamp())")).scalar_one())
 
     def close(self) -> None:
         """Close all connections."""

@@ -29,6 +29,8 @@ STEPS: dict[int, tuple[str, ...]] = {
         "CREATE INDEX file_by_tenant ON file (tenant, size, received)",
         "CREATE INDEX file_by_state ON file (state, size, received)",
     ),
+    # Deleted uploads whose bytes are still on the disk, and the last `seq` (new tables); an index to delete jobs by.
+    3: ("CREATE INDEX ix_idempotency_job_id ON idempotency (job_id)",),
 }
 """What leads from a version to the next one; tables that are new are made afterwards, by `create_all`."""
 

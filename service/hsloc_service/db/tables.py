@@ -7,7 +7,7 @@ from typing import Any, Literal
 from sqlalchemy import JSON, Index, Text, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 """Stored in the database; what leads from one to the next is in `migrations`."""
 
 JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
@@ -125,6 +125,22 @@ class RemovalRow(Base):
     created: Mapped[float]
 
 
+class UploadDeletionRow(Base):
+    """An upload that was deleted, and whose bytes are still to be removed from the disk."""
+
+    __tablename__ = "upload_deletion"
+    id: Mapped[str] = mapped_column(primary_key=True)
+    created: Mapped[float]
+
+
+class CounterRow(Base):
+    """The last number that was given out under a name."""
+
+    __tablename__ = "counter"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    value: Mapped[int]
+
+
 class EventRow(Base):
     """What happened to a job; the id is the cursor of the event stream."""
 
@@ -146,7 +162,7 @@ class IdempotencyRow(Base):
     tenant: Mapped[str] = mapped_column(primary_key=True)
     key: Mapped[str] = mapped_column(primary_key=True)
     sha256: Mapped[str]
-    job_id: Mapped[str]
+    job_id: Mapped[str] = mapped_column(index=True)
     created: Mapped[float]
 
 

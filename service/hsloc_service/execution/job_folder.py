@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from typing import TYPE_CHECKING, Any
 
+from hsloc_service.execution.processes import linked_files
 from hsloc_service.results.store import BLOCK
 from hsloc_service.storage import safe_name
 from hsloc_service.stored_request import MAP_STATE, UPLOADS, logs_of
@@ -14,19 +14,20 @@ from hsloc_service.stored_request import MAP_STATE, UPLOADS, logs_of
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from hsloc_service.execution.sandbox import Sandbox
     from hsloc_service.jobs.leases import Claim, Source
     from hsloc_service.results.store import ResultStore
     from hsloc_service.settings import Settings
     from hsloc_service.storage import Storage
 
 
-def prepare(folder: Path, claim: Claim, storage: Storage, settings: Settings) -> None:
+def prepare(folder: Path, claim: Claim, storage: Storage, settings: Settings, sandbox: Sandbox) -> None:
     """`job.json`, the input under its own names (read-only), and an empty folder for temporary files.
 
-    The logs are in `input`, `input-2`, …: two parts of a run may have one name. A saved map is to be put beside
-    `job.json` as `map.npz`.
+    The logs are in `input`, `input-2`, and so on, because two parts of a run may have the same name. The saved map of a
+    job that is extended belongs beside `job.json`: see `download`.
     """
-    shutil.rmtree(folder, ignore_errors=True)
+    storage.remove_work(folder)
     for name in ("map", "tmp"):
         (folder / name).mkdir(parents=True, mode=0o700)
     request = claim.request
@@ -52,16 +53,17 @@ def prepare(folder: Path, claim: Claim, storage: Storage, settings: Settings) ->
     }
     if request.get("map") is not None:
         job["map"] = link("map", request["map"]["yaml"], "map.yaml")
-        # Any name but those that the YAML may ask for; the worker links the one it does ask for.
+        # A name that no YAML can ask for; the worker links the name that this YAML does ask for.
         (folder / "map" / ".image").symlink_to(storage.upload_path(request["map"]["image"]).absolute())
         job["map_image"] = ".image"
     job |= {name: link(name, request[name], name) for name in UPLOADS if request.get(name) is not None}
     if claim.source is not None:
         job["resume"] = MAP_STATE
+    job["limits"]["landlock"] = sandbox.landlock(folder.absolute(), linked_files(folder))
     (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
 
 
-def fetch(store: ResultStore, source: Source, folder: Path) -> None:
+def download(store: ResultStore, source: Source, folder: Path) -> None:
     """Copy the saved map of an earlier job into the folder. Raises OSError if it is not what its manifest says."""
     digest = hashlib.sha256()
     with (folder / MAP_STATE).open("wb") as file:

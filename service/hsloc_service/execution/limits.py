@@ -8,7 +8,9 @@ import os
 import resource
 import signal
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from hsloc_service.execution import landlock
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -17,8 +19,8 @@ PR_SET_PDEATHSIG = 1
 PR_SET_NO_NEW_PRIVS = 38
 
 
-def apply(limits: Mapping[str, float], parent: int) -> None:
-    """Die with the server, then bound memory, processor time, file size and open files.
+def apply(limits: Mapping[str, Any], parent: int) -> None:
+    """Die with the server, then bound memory, processor time, file size, open files and, by Landlock, what is visible.
 
     Raises SystemExit if the server died before the first of these.
     """
@@ -37,6 +39,8 @@ def apply(limits: Mapping[str, float], parent: int) -> None:
     with contextlib.suppress(OSError):
         os.nice(10)  # the API answers first
     os.umask(0o077)
+    if limits.get("landlock") is not None:
+        landlock.restrict(limits["landlock"]["read"], limits["landlock"]["write"])
 
 
 def _limit(which: int, soft: int, hard: int | None = None) -> None:

@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from hsloc_service.execution.sandbox import Sandbox
+
 MARK = "HSLOC_JOB"
 """Environment variable that every process of a job inherits: `<instance>:<job>.<attempt>`."""
-_KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "MPLCONFIGDIR", "PYTHONPATH", "VIRTUAL_ENV")
+_KEPT = ("PATH", "LANG", "LC_ALL", "TZ", "PYTHONPATH", "VIRTUAL_ENV")
 _KEPT_PREFIXES = ("OPENBLAS_", "OMP_", "MKL_", "NPY_", "NUMBA_")
 """What a job's process sees of the server's environment: no token, no password; but all that decides the last bits of
 its arithmetic, which are to be those of `hsloc replay` in the same environment."""
@@ -74,25 +76,29 @@ def marked(mark: str) -> Iterator[int]:
 
 
 def start_job(
-    command: tuple[str, ...], folder: Path, mark: str, threads: int, cache: Path
+    sandbox: Sandbox, folder: Path, mark: str, threads: int, cache: Path
 ) -> tuple[subprocess.Popen[bytes], int]:
     """The process of a job in a session and process group of its own; the reading end of its pipe. Raises OSError."""
+    folder = folder.absolute()
     environment = {k: v for k, v in os.environ.items() if k in _KEPT or k.startswith(_KEPT_PREFIXES)}
-    environment.setdefault("MPLCONFIGDIR", str(cache))
+    environment |= sandbox.caches(folder, cache)
     environment |= {
         MARK: mark,
-        "HOME": str((folder / "tmp").absolute()),
-        "TMPDIR": str((folder / "tmp").absolute()),
+        "HOME": str(folder / "tmp"),
+        "TMPDIR": str(folder / "tmp"),
         "PYTHONUNBUFFERED": "1",
         "NUMBA_NUM_THREADS": str(threads),
         "OMP_NUM_THREADS": str(threads),
         "OPENBLAS_NUM_THREADS": str(threads),
     }
     reading, writing = os.pipe()
+    # In a process namespace the worker's parent is number 1: bubblewrap's own process there.
+    parent = 1 if sandbox.kind == "bubblewrap" else os.getpid()
+    command = [*sandbox.command, str(folder), "--fd", str(writing), "--parent", str(parent)]
     try:
         with (folder / "log.txt").open("wb") as output:
             process = subprocess.Popen(
-                [*command, str(folder.absolute()), "--fd", str(writing), "--parent", str(os.getpid())],
+                sandbox.wrap(command, folder, linked_files(folder)),
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
@@ -108,3 +114,8 @@ def start_job(
         os.close(writing)
     os.set_blocking(reading, False)
     return process, reading
+
+
+def linked_files(folder: Path) -> list[Path]:
+    """The uploads that `prepare` linked into the folder of a job."""
+    return [Path(os.readlink(path)) for path in sorted(folder.glob("*/*")) if path.is_symlink()]

@@ -1,71 +1,81 @@
-"""A worker's calls to the store: tried until the store answers, while the job stays ours."""
+"""Calls of a worker to a store of results: repeated until the store answers, while the job is held."""
 
 from __future__ import annotations
 
+import math
 import time
 from typing import TYPE_CHECKING, TypeVar
 
-from hsloc_service.call_timeout import begin
+from hsloc_service.call_timeout import start_call
 from hsloc_service.errors import StoreError
 from hsloc_service.logs import log
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from hsloc_service.results.store import ResultStore
+
 T = TypeVar("T")
 TICK_S = 0.05
 FIRST_WAIT_S = 1.0
-LONGEST_WAIT_S = 30.0
-BYTES_PER_S = 1 << 18
-"""A store that is slower than this is taken for dead."""
+MAX_WAIT_S = 30.0
+MIN_BYTES_PER_S = 1 << 18
+"""A store that is slower than this counts as dead [B/s]."""
 
 
 class Interrupted(Exception):
-    """The job is not to go on; `why` is what `look` said."""
+    """The attempt has to stop; `reason` is the heartbeat's."""
 
-    def __init__(self, why: str) -> None:
-        super().__init__(why)
-        self.why = why
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
 
 
 class Retry:
-    """`look` is asked many times a second: it prolongs the job's lease, and says `go`, or why the job must end."""
+    """Repeats calls that fail. `cancel_reason` is asked many times a second; it also renews the job's lease."""
 
-    def __init__(self, look: Callable[[], str], job_id: str, failed: Callable[[], None]) -> None:
-        self._look, self._job_id, self._failed = look, job_id, failed
+    def __init__(self, cancel_reason: Callable[[], str | None], job_id: str, failed: Callable[[], None]) -> None:
+        self._cancel_reason, self._job_id, self._failed = cancel_reason, job_id, failed
 
     def retry(self, what: str, work: Callable[[], T], timeout_s: float) -> T:
-        """The result of `work`, which is begun anew after StoreError or `timeout_s`, for as long as it takes.
+        """The result of `work`, repeated after each StoreError and each `timeout_s`, without an end.
 
-        What is computed is not thrown away because a store is gone for an hour. Raises Interrupted where `look` says
-        so, and whatever else `work` raises.
+        A result that took hours to compute is not thrown away because a store is away for an hour. Raises Interrupted
+        where `cancel_reason` gives one, and whatever else `work` raises.
         """
-        wait = FIRST_WAIT_S
+        wait_s = FIRST_WAIT_S
         while True:
             try:
-                return self._once(work, timeout_s)
+                return self._run_once(work, timeout_s)
             except StoreError as error:
                 self._failed()
-                log("store.error", job=self._job_id, what=what, error=str(error), again_in_s=wait)
-            until = time.monotonic() + wait
+                log("store.error", job=self._job_id, what=what, error=str(error), again_in_s=wait_s)
+            until = time.monotonic() + wait_s
             while time.monotonic() < until:
-                self._run_once()
+                self._check()
                 time.sleep(TICK_S)
-            wait = min(2.0 * wait, LONGEST_WAIT_S)
+            wait_s = min(2.0 * wait_s, MAX_WAIT_S)
 
-    def _once(self, work: Callable[[], T], timeout_s: float) -> T:
-        future, until = begin(work), time.monotonic() + timeout_s
+    def _run_once(self, work: Callable[[], T], timeout_s: float) -> T:
+        future, until = start_call(work), time.monotonic() + timeout_s
         while True:
             try:
                 return future.result(TICK_S)
             except TimeoutError:
                 if future.done():
                     raise
-            self._run_once()
+            self._check()
             if time.monotonic() > until:
                 raise StoreError(f"no answer within {timeout_s:g} s")
 
-    def _run_once(self) -> None:
-        why = self._look()
-        if why != "go":
-            raise Interrupted(why)
+    def _check(self) -> None:
+        reason = self._cancel_reason()
+        if reason is not None:
+            raise Interrupted(reason)
+
+
+def transfer_timeout_s(store: ResultStore, sizes: list[int], call_timeout_s: float) -> float:
+    """Time limit for a transfer of files of these sizes; infinite for the data folder, a local disk."""
+    if store.url is None:
+        return math.inf
+    return call_timeout_s * (1 + len(sizes)) + sum(sizes) / MIN_BYTES_PER_S

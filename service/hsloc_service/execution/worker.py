@@ -67,14 +67,14 @@ def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, 
     from hsloc_service.results.preview import write_viewer
 
     report("open", 0.0, 1.0, 0)
-    spec = make_spec(job, folder)
-    if spec.relations is not None:
-        read_relations(spec.relations)  # what cannot be read is told now, not after an hour of replay
+    request = make_request(job, folder)
+    if request.relations is not None:
+        read_relations(request.relations)  # what cannot be read is told now, not after an hour of replay
 
     def replayed(progress: Progress) -> None:
         report(progress.phase, progress.done_s, progress.total_s, progress.scans)
 
-    result = run(spec, replayed)
+    result = run(request, replayed)
     # Warnings are a part of the results, which are to be the same in every folder.
     plain = tuple(dataclasses.replace(each, text=plain_names(each.text)) for each in result.warnings)
     result = dataclasses.replace(result, warnings=plain)
@@ -85,7 +85,7 @@ def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, 
         progress=lambda share: report("write", share, 1.0, scans),
     )
     write_viewer(result, written.analysis, folder / "output")
-    limits = exceeded_limits(spec, written.metrics)
+    limits = exceeded_limits(request, written.metrics)
     found = {"outcome": "below_threshold" if limits else "ok", "limits": [line[:500] for line in limits]}
     return found | summarise(written.metrics, written.timings)
 
@@ -98,13 +98,15 @@ _MOST_LINES = 50
 def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
     """The summary of a job: the figures as the reports show them, the verdict, and all warnings of the run."""
     from hsloc.dataclass_json import to_json
-    from hsloc.report.table import table_rows
+    from hsloc.report.table import reason_text, table_rows
 
     values = metrics.to_json()
     return {
         "metrics": {key: values[key] for key in _SUMMARISED if key in values},
         "figures": [{"name": row.label, "values": list(row.values)} for row in table_rows(metrics)],
-        "verdict_reasons": [_shortened(each) for each in values["verdict_reasons"]][:_MOST_LINES],
+        "verdict_reasons": [
+            {**_shortened(to_json(each)), "line": reason_text(each)[:500]} for each in metrics.verdict_reasons
+        ][:_MOST_LINES],
         "data_lost": metrics.losses.data_lost,
         "warnings": [_shortened(to_json(each)) for each in metrics.warnings][:_MOST_LINES],
         "notes": [line[:500] for line in metrics.losses.notes][:_MOST_LINES],
@@ -120,14 +122,12 @@ def _shortened(values: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def make_spec(job: Mapping[str, Any], folder: Path) -> RunRequest:
+def make_request(job: Mapping[str, Any], folder: Path) -> RunRequest:
     """The run that the job asks for. Raises ConfigError or MapError for what does not fit."""
     from hsloc.request import RunRequest
 
-    request = job["request"]
-    values = {name: request.get(name) for name in BY_NAME if name not in ("map", "resume")} | (
-        request.get("read") or {}
-    )
+    wanted = job["request"]
+    values = {name: wanted.get(name) for name in BY_NAME if name not in ("map", "resume")} | (wanted.get("read") or {})
     values |= {name: folder / name / job[name] for name in BY_NAME if BY_NAME[name].is_upload and job.get(name)}
     if job.get("map") is not None:
         values["map"] = linked_map(folder, job["map"], job["map_image"])
@@ -141,24 +141,19 @@ def linked_map(folder: Path, name: str, image: str) -> Path:
 
     Of a path the last name counts: a YAML that says `image: /etc/passwd` must not have us read what was not uploaded.
     """
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     from hsloc.errors import MapError
+    from hsloc.maps.metadata import load_yaml
 
     path = folder / "map" / name
-    if path.stat().st_size > 1 << 20:
-        raise MapError(f"{name}: larger than 1 MiB, which no map's YAML is")
-    try:
-        values = YAML(typ="safe", pure=True).load(path)
-        wanted = values["image"]
-    except (YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise MapError(f"{name}: not a map's YAML with an `image`") from error
+    values = load_yaml(path)
+    wanted = values.get("image")
     plain = wanted.replace("\\", "/").rpartition("/")[2] if isinstance(wanted, str) else ""
     if plain in ("", ".", "..") or "\0" in plain or len(plain) > 200:
         raise MapError(f"{name}: image is {wanted!r:.100}; it must name a file")
     if plain != wanted:
         # The path is of another machine: the image is the one that was uploaded, never a file of this machine.
+        from ruamel.yaml import YAML
+
         values["image"] = plain
         path.unlink()
         with path.open("w", encoding="utf-8") as file:

@@ -11,14 +11,15 @@ from fastapi import Depends, Request
 
 from hsloc_service.auth import Principal
 from hsloc_service.call_timeout import BoundedExecutor
+from hsloc_service.errors import ServiceError
 from hsloc_service.execution.dispatcher import Dispatcher
 from hsloc_service.http.schemas import Problem
 from hsloc_service.jobs.repository import Jobs
-from hsloc_service.results.deletion_queue import Removals
+from hsloc_service.results.deletion_queue import DeletionQueue
 from hsloc_service.results.stores import ResultStores
 from hsloc_service.settings import Settings
 from hsloc_service.uploads.repository import Files
-from hsloc_service.uploads.upload_stream import Receiver
+from hsloc_service.uploads.upload_stream import UploadReceiver
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,11 +37,11 @@ class Context:
     storage: Storage
     files: Files
     jobs: Jobs
-    receiver: Receiver
+    receiver: UploadReceiver
     dispatcher: Dispatcher
     stores: ResultStores
-    removals: Removals
-    desk: BoundedExecutor
+    deletions: DeletionQueue
+    store_calls: BoundedExecutor
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server begins to shut down: event streams end."""
     streams: Counter[str] = field(default_factory=Counter)
@@ -64,6 +65,20 @@ Ctx = Annotated[Context, Depends(_context)]
 Reader = Annotated[Principal, Depends(_principal("read"))]
 Writer = Annotated[Principal, Depends(_principal("write"))]
 Admin = Annotated[Principal, Depends(_principal("admin"))]
+
+
+def known_query(request: Request) -> None:
+    """Refuse a misspelt parameter of the query, which would be ignored."""
+    known, left = set[str](), [request.scope["route"].dependant]
+    while left:
+        dependant = left.pop()
+        known |= {each.alias for each in dependant.query_params}
+        left += dependant.dependencies
+    unknown = sorted(set(request.query_params) - known)
+    if unknown:
+        names = f"known are {', '.join(sorted(known))}" if known else "it takes none"
+        raise ServiceError(422, "invalid", f"query.{unknown[0][:60]}: is unknown here; {names}")
+
 
 _MEANINGS = {
     400: "the request cannot be understood",

@@ -58,7 +58,8 @@ class _Counted(StreamingResponse):
     """Counted from the moment it is granted: many that come at once would all be let in before the first has begun."""
 
     def __init__(self, content: AsyncIterator[str], ended: Callable[[], None]) -> None:
-        super().__init__(content, media_type="text/event-stream")
+        # nginx gathers answers into buffers of its own, unless it is asked not to.
+        super().__init__(content, media_type="text/event-stream", headers={"X-Accel-Buffering": "no"})
         self._ended = ended
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -57,7 +57,7 @@ async def put(
     """Upload under an id that you choose (a UUID), so that the request can be sent again.
 
     A finished upload stays what it is: with a `Repr-Digest` that fits the answer is 200, else 409. An unfinished one
-    begins anew.
+    starts again.
     """
     wanted = parse_digest(repr_digest)
     try:

@@ -1,4 +1,4 @@
-"""What every request passes before a byte of its body is read: host, origin, token, rate, size.
+"""Checks of every request before a byte of its body is read: host, origin, token, rate, size.
 
 Plain ASGI, around the whole application: FastAPI reads bodies before it asks its dependencies.
 """
@@ -6,6 +6,7 @@ Plain ASGI, around the whole application: FastAPI reads bodies before it asks it
 from __future__ import annotations
 
 import json
+import logging
 import random
 import secrets
 import time
@@ -17,7 +18,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import Message
 
 from hsloc_service.auth import ANYBODY
-from hsloc_service.errors import ServiceError, busy
+from hsloc_service.errors import BrokenAnswer, ServiceError, busy
 from hsloc_service.http import metrics
 from hsloc_service.logs import log, request_id
 
@@ -51,6 +52,8 @@ class Guard:
     def __init__(self, app: ASGIApp, settings: Settings, tokens: Tokens) -> None:
         self._app, self._settings, self._tokens = app, settings, tokens
         self._rates = Rates(settings.requests_per_s)
+        self._closed = settings.require_token
+        """Whether a token is required: by the settings, or because one was made meanwhile."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request pass, or answer it."""
@@ -58,7 +61,7 @@ class Guard:
             if scope["type"] == "lifespan":
                 await self._app(scope, receive, send)
             return
-        begin, status = time.perf_counter(), 0
+        begin, status, inner = time.perf_counter(), 0, scope
         ident = secrets.token_hex(8)
         request_id.set(ident)
 
@@ -79,9 +82,14 @@ class Guard:
             except ServiceError as error:
                 await refuse(error, answer)
                 return
-            await self._app(scope, self._counted(scope, receive), answer)
+            try:
+                inner, send_on = _without_head(scope, answer)
+                await self._app(inner, self._counted(scope, receive), send_on)
+            except BrokenAnswer as error:
+                # Returning before the end makes uvicorn close the connection.
+                log("answer.broken", logging.WARNING, route=scope["path"], error=str(error))
         finally:
-            route = getattr(scope.get("route"), "path", "other")
+            route = getattr(inner.get("route"), "path", "other")
             seconds = time.perf_counter() - begin
             # A method is any word that a client makes up: each would be a series of its own, kept for ever.
             method = scope["method"] if scope["method"] in METHODS else "other"
@@ -89,7 +97,15 @@ class Guard:
             if not route.endswith("/events"):
                 metrics.LATENCY.labels(route).observe(seconds)
             if status >= 400 or not route.startswith(("/healthz", "/readyz", "/metrics")):
-                log("request", method=scope["method"], route=route, status=status, ms=round(seconds * 1000, 1))
+                who = scope.get("state", {}).get("principal")
+                log(
+                    "request",
+                    method=scope["method"],
+                    route=route,
+                    status=status,
+                    ms=round(seconds * 1000, 1),
+                    tenant=None if who is None else who.tenant,
+                )
 
     async def _admit(self, scope: Scope) -> Principal | None:
         headers = Headers(scope=scope)
@@ -115,7 +131,7 @@ class Guard:
         return who
 
     def _need_host(self, scope: Scope, headers: Headers) -> None:
-        """A page of another site must not speak to us: not by rebinding its name, not by a form or a script."""
+        """Refuse requests that a page of another site makes: by rebinding its name, by a form or by a script."""
         host = headers.get("host", "")
         allowed = self._settings.allowed_hosts
         name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
@@ -131,9 +147,12 @@ class Guard:
         kind, _, token = headers.get("authorization", "").partition(" ")
         if kind.lower() == "bearer" and token:
             return await to_thread.run_sync(self._tokens.principal, token.strip())
-        if "authorization" in headers or self._settings.require_token:
+        if "authorization" in headers:
             return None
-        return ANYBODY
+        if not self._closed:
+            # `hsloc serve --new-token` writes to the database of a server that runs.
+            self._closed = await to_thread.run_sync(self._tokens.any)
+        return None if self._closed else ANYBODY
 
     def _counted(self, scope: Scope, receive: Receive) -> Receive:
         """Bodies other than uploads are small; counted as received, whatever Content-Length says."""
@@ -151,6 +170,23 @@ class Guard:
             return message
 
         return counted
+
+
+def _without_head(scope: Scope, send: Send) -> tuple[Scope, Send]:
+    """HEAD as a GET whose body is dropped (RFC 9110); tus has a HEAD of its own."""
+    if scope["method"] != "HEAD" or scope["path"].startswith("/v1/tus/"):
+        return scope, send
+    ended = False
+
+    async def headers_only(message: Message) -> None:
+        nonlocal ended
+        if message["type"] == "http.response.start":
+            await send(message)
+        elif not ended:
+            ended = True
+            await send({"type": "http.response.body", "body": b""})
+
+    return {**scope, "method": "GET", "hsloc_head": True}, headers_only
 
 
 class Rates:
@@ -173,7 +209,7 @@ class Rates:
 
 
 async def refuse(error: ServiceError, send: Send) -> None:
-    """Answer without reading the body; the connection ends, so that nobody has to read the rest of it."""
+    """Answer without reading the body; the connection ends, so that the rest of it need not be read."""
     body = problem(error.code, error.message)
     headers = {"content-type": "application/json", "content-length": str(len(body)), "connection": "close"}
     headers |= {name.lower(): value for name, value in error.headers.items()}

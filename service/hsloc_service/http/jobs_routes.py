@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Header, Path, Query, Response
 
+from hsloc.options import OPTIONS
 from hsloc_service import config_schema as options
 from hsloc_service.http.context import Ctx, Reader, Writer, problems
 from hsloc_service.http.schemas import (
@@ -87,9 +88,9 @@ def rerun(
     changed: dict[str, Any] = {} if changes is None else changes.model_dump(exclude_unset=True)
     if changed.get("config") is not None:
         changed["config"] = options.check(changed["config"])
-    for name in ("mode", "preset", "seed", "unknown_start"):
-        if changed.get(name, ...) is None:
-            del changed[name]
+    for option in OPTIONS:  # null leaves what cannot be null as it was
+        if option.default is not None and changed.get(option.name, ...) is None:
+            del changed[option.name]
     old = ctx.jobs.get(who, job_id)
     job = ctx.jobs.rerun(who, job_id, plain(checked(JobRequest, {**old.request, **changed}).model_dump()))
     ctx.dispatcher.enqueue(job.id)
@@ -104,7 +105,7 @@ def delete(ctx: Ctx, who: Writer, job_id: JobId) -> None:
     Results in an object store are unreachable at once, and removed within a minute, or when the store is there again.
     """
     ctx.storage.with_room(lambda: ctx.jobs.delete(who, job_id))
-    ctx.removals.clear_folder()
+    ctx.deletions.clear_folder()
 
 
 @router.get("/{job_id}/webhooks", responses=problems(404))

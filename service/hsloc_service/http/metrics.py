@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
+
+from hsloc.version import __version__
 
 REGISTRY = CollectorRegistry()
 REQUESTS = Counter("hsloc_requests", "Requests answered", ["method", "route", "status"], registry=REGISTRY)
@@ -16,9 +18,22 @@ LATENCY = Histogram(
 UPLOADED = Counter("hsloc_uploaded_bytes", "Bytes of completed uploads", registry=REGISTRY)
 ENDED = Counter("hsloc_jobs_ended", "Attempts at jobs by how they ended", ["state"], registry=REGISTRY)
 JOBS = Gauge("hsloc_jobs", "Jobs by state", ["state"], registry=REGISTRY)
+SECONDS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0, 10000.0)
+DURATION = Histogram("hsloc_job_seconds", "Time that an attempt took", ["state"], buckets=SECONDS, registry=REGISTRY)
+WAIT = Histogram("hsloc_job_wait_seconds", "Time that a job waited for a slot", buckets=SECONDS, registry=REGISTRY)
+BUILD = Gauge("hsloc_build_info", "Always 1; the version is in its label", ["version"], registry=REGISTRY)
+BUILD.labels(__version__).set(1)
+ProcessCollector(registry=REGISTRY)
 BUSY = Gauge("hsloc_slots_busy", "Slots that run a job", registry=REGISTRY)
 SLOTS = Gauge("hsloc_slots", "Slots", registry=REGISTRY)
 FREE = Gauge("hsloc_disk_free_bytes", "Free bytes of the data folder's disk", registry=REGISTRY)
 OLDEST = Gauge("hsloc_oldest_queued_seconds", "Age of the oldest job that waits", registry=REGISTRY)
 DELIVERIES = Gauge("hsloc_webhooks_pending", "Webhooks that wait for delivery", registry=REGISTRY)
 STORE_ERRORS = Counter("hsloc_store_errors", "Calls to the store of results that failed", registry=REGISTRY)
+
+
+def attempt_ended(state: str, seconds: float, waited_s: float) -> None:
+    """Count an attempt that ended in a state, after `seconds`, and after its job waited `waited_s` for a slot."""
+    ENDED.labels(state).inc()
+    DURATION.labels(state).observe(seconds)
+    WAIT.observe(waited_s)

@@ -11,7 +11,7 @@ from anyio import to_thread
 from fastapi import APIRouter, Header, HTTPException, Path, Query, Request
 from fastapi.responses import FileResponse, Response, StreamingResponse
 
-from hsloc_service.errors import ServiceError, not_found
+from hsloc_service.errors import BrokenAnswer, ServiceError, StoreError, not_found
 from hsloc_service.http.context import Context, Ctx, Reader, problems
 from hsloc_service.http.jobs_routes import JobId
 from hsloc_service.http.schemas import AssetView, Manifest
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from hsloc_service.auth import Principal
     from hsloc_service.db.tables import AssetRow, JobRow
-    from hsloc_service.results.store import ResultStore
+    from hsloc_service.results.store import AssetReader
 
 router = APIRouter(prefix="/v1/jobs", tags=["results"])
 AssetName = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$", examples=["trajectory.tum"])]
@@ -31,8 +31,12 @@ SANDBOX = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 )
 """A report may run its own script, but in an origin of its own and without the network."""
-_KINDS = sorted({kind.partition(";")[0] for kind in MEDIA_TYPES.values()} | {"application/octet-stream"})
-_BINARY: dict[str, Any] = {"description": "the bytes", "content": {kind: {"schema": {}} for kind in _KINDS}}
+_OCTETS = "application/octet-stream"
+"""First among the kinds: generated clients take the first that they know, and must not parse the bytes."""
+_KINDS = (_OCTETS, *sorted({kind.partition(";")[0] for kind in MEDIA_TYPES.values()} - {_OCTETS}))
+_BYTES: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
+_BINARY: dict[str, Any] = {"description": "the bytes", "content": dict.fromkeys(_KINDS, _BYTES)}
+_ZIP: dict[str, Any] = {"description": "the archive", "content": dict.fromkeys((_OCTETS, "application/zip"), _BYTES)}
 
 
 @router.get("/{job_id}/results", responses=problems(404, 409))
@@ -51,7 +55,7 @@ def manifest(ctx: Ctx, who: Reader, job_id: JobId) -> Manifest:
     "/{job_id}/results.zip",
     response_class=StreamingResponse,
     responses={
-        200: {"description": "the archive", "content": {"application/zip": {"schema": {"type": "string"}}}},
+        200: _ZIP,
         **problems(404, 409),
     },
 )
@@ -60,8 +64,9 @@ async def archive(ctx: Ctx, who: Reader, job_id: JobId) -> StreamingResponse:
     job, rows = await to_thread.run_sync(_assets, ctx, who, job_id)
     name = safe_name(job.log_name.rsplit(".", 1)[0], "results")
     headers = {"Content-Disposition": f'attachment; filename="{name}-results.zip"'}
-    parts = _paced(ctx, _zip(ctx.stores.of(job.store), job, rows))
-    return StreamingResponse(await _begun(parts, job_id), media_type="application/zip", headers=headers)
+    readers = await _open(ctx, job, rows, job_id)
+    parts = _paced(ctx, _zip(readers, rows))
+    return StreamingResponse(await _begun(parts, readers, job_id), media_type="application/zip", headers=headers)
 
 
 @router.get(
@@ -94,14 +99,6 @@ async def asset(
     if if_none_match is not None and (tag in if_none_match or if_none_match.strip() == "*"):
         return Response(status_code=304, headers=headers)
     kind = "attachment" if download else "inline"
-    store = ctx.stores.of(job.store)
-    path = store.path(job.folder or "", row.name)
-    if path is not None:
-        if not await to_thread.run_sync(path.is_file):
-            raise not_found("asset", name)
-        return FileResponse(
-            path, headers=headers, media_type=row.media_type, filename=row.name, content_disposition_type=kind
-        )
     headers |= {"Accept-Ranges": "bytes", "Content-Disposition": f'{kind}; filename="{row.name}"'}
     fits = request.headers.get("if-range") in (None, tag)
     span = parse_range(request.headers.get("range"), row.size) if fits else None
@@ -109,8 +106,11 @@ async def asset(
         headers["Content-Range"] = f"bytes {span.start}-{span.stop - 1}/{row.size}"
     status, wanted = (200, range(row.size)) if span is None else (206, span)
     headers["Content-Length"] = str(len(wanted))
-    parts = _paced(ctx, _blocks(store, job.folder or "", row.name, wanted))
-    return StreamingResponse(await _begun(parts, name), status, headers, row.media_type)
+    if request.scope.get("hsloc_head"):
+        return Response(None, status, headers, row.media_type)
+    readers = await _open(ctx, job, [row], name)
+    parts = _paced(ctx, _blocks(readers[0], wanted))
+    return StreamingResponse(await _begun(parts, readers, name), status, headers, row.media_type)
 
 
 def parse_range(text: str | None, size: int) -> range | None:
@@ -159,44 +159,73 @@ class _Sink(io.RawIOBase):
         return block
 
 
-def _zip(store: ResultStore, job: JobRow, rows: Sequence[AssetRow]) -> Iterator[bytes]:
+async def _open(ctx: Context, job: JobRow, rows: Sequence[AssetRow], what: str) -> list[AssetReader]:
+    """Readers of the assets: what is deleted from now on is still sent whole."""
+    store = ctx.stores.of(job.store)
+    readers: list[AssetReader] = []
+
+    def open_all() -> None:
+        readers.extend(store.open(job.folder or "", row.name) for row in rows)
+
+    try:
+        await to_thread.run_sync(open_all)
+    except FileNotFoundError as error:
+        _close(readers)
+        raise not_found("results", what) from error
+    return readers
+
+
+def _close(readers: Sequence[AssetReader]) -> None:
+    for reader in readers:
+        reader.close()
+
+
+def _zip(readers: Sequence[AssetReader], rows: Sequence[AssetRow]) -> Iterator[bytes]:
     sink = _Sink()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED, allowZip64=True) as target:
-        for row in rows:
+        for reader, row in zip(readers, rows, strict=True):
             info = zipfile.ZipInfo(row.name)
             info.external_attr = 0o644 << 16
             with target.open(info, "w", force_zip64=row.size > 1 << 31) as entry:
-                for block in _blocks(store, job.folder or "", row.name, range(row.size)):
+                for block in _blocks(reader, range(row.size)):
                     entry.write(block)
                     yield sink.take()
     yield sink.take()
 
 
-def _blocks(store: ResultStore, folder: str, name: str, span: range) -> Iterator[bytes]:
+def _blocks(reader: AssetReader, span: range) -> Iterator[bytes]:
     """The bytes of a span, some at a time; one empty block for an empty file."""
     for start in range(span.start, max(span.stop, span.start + 1), BLOCK):
-        yield store.read(folder, name, start, min(BLOCK, span.stop - start))
+        yield reader.read(start, min(BLOCK, span.stop - start))
 
 
 async def _paced(ctx: Context, blocks: Iterator[bytes]) -> AsyncIterator[bytes]:
     """The blocks, each waited for outside the event loop and not for ever."""
-    while (block := await ctx.desk.ask(lambda: next(blocks, None))) is not None:
+    while (block := await ctx.store_calls.run(lambda: next(blocks, None))) is not None:
         yield block
 
 
-async def _begun(parts: AsyncIterator[bytes], what: str) -> AsyncIterator[bytes]:
+async def _begun(parts: AsyncIterator[bytes], readers: Sequence[AssetReader], what: str) -> AsyncIterator[bytes]:
     """The same parts, the first of which is there: a store that does not answer is an error before the answer begins.
 
-    One that fails later breaks the connection off, so that the client sees that it has not got everything.
+    One that fails later breaks the connection off, so that the client sees that something is missing.
     """
     try:
         first = await anext(parts)
-    except FileNotFoundError as error:
-        raise not_found("asset", what) from error
+    except BaseException as error:
+        _close(readers)
+        if isinstance(error, FileNotFoundError):
+            raise not_found("asset", what) from error
+        raise
 
     async def all_parts() -> AsyncIterator[bytes]:
-        yield first
-        async for block in parts:
-            yield block
+        try:
+            yield first
+            async for block in parts:
+                yield block
+        except (StoreError, OSError) as error:
+            raise BrokenAnswer(f"{what}: {error}") from error
+        finally:
+            _close(readers)
 
     return all_parts()

@@ -205,7 +205,7 @@ State = Literal["queued", "running", "cancelling", "succeeded", "failed", "crash
 class ProgressView(BaseModel):
     """How far a running job is."""
 
-    phase: str = Field(description="fetch, open, prepare, replay, refine, write, store", examples=["replay"])
+    phase: str = Field(description="fetch, open, prepare, compile, replay, refine, write, store", examples=["replay"])
     done: float = Field(description="seconds of the log (replay), or the part of the work from 0 to 1 (others)")
     total: float
     fraction: float = Field(ge=0.0, le=1.0)

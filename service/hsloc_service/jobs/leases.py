@@ -2,12 +2,12 @@
 
 A worker owns a job by (owner, attempt) until its lease ends. Each of its writes names both; when another has taken the
 job meanwhile, the write finds no row and the worker must throw its work away. So a job may be started twice (a server
-was killed), but it ends once.
+was killed), but it ends once. Leases are measured by the clock of the database, and a worker never takes a job from
+itself, so that a clock that is set forward ends no lease of a job that runs.
 """
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,6 +19,8 @@ from hsloc_service.jobs.repository import finish_job
 from hsloc_service.stored_request import MAP_STATE, files_of
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from sqlalchemy.orm import Session
 
     from hsloc_service.db.database import Database
@@ -35,7 +37,7 @@ class Source(NamedTuple):
 
 
 class Claim(NamedTuple):
-    """A job in somebody's hands."""
+    """A job that a worker holds."""
 
     job_id: str
     tenant: str
@@ -46,10 +48,12 @@ class Claim(NamedTuple):
     names: dict[str, str]
     """Labels of the files of the request."""
     source: Source | None = None
+    waited_s: float = 0.0
+    """Time since the job was submitted [s]."""
 
 
 class HeartbeatReply(NamedTuple):
-    """What a worker learns when it says that it lives."""
+    """The answer to a heartbeat: whether the job is still the worker's, and whether it was cancelled."""
 
     mine: bool
     cancel: bool
@@ -69,22 +73,23 @@ class Leases:
             job = session.scalar(_next())
             if job is None:
                 return None
-            now = time.time()
+            now = self.database.now(session)
             job.state, job.owner, job.attempt = "running", owner, job.attempt + 1
             job.lease_until, job.heartbeat = now + self.lease_s, now
             job.started = job.started or now
             job.phase = job.done = job.total = job.scans = job.speed = job.progressed = None
             record(session, job, "state", {"state": "running", "attempt": job.attempt})
             names, source = _names(session, job.request), _source(session, job)
-            return Claim(job.id, job.tenant, owner, job.attempt, job.log_name, job.request, names, source)
+            waited_s = max(now - job.created, 0.0)
+            return Claim(job.id, job.tenant, owner, job.attempt, job.log_name, job.request, names, source, waited_s)
 
     def beat(self, claim: Claim, progress: dict[str, Any] | None) -> HeartbeatReply:
-        """Prolong the lease, and note the progress."""
+        """Renew the lease, and write the progress."""
         with self.database.write() as session:
             job = _held(session, claim)
             if job is None:
                 return HeartbeatReply(mine=False, cancel=False)
-            now = time.time()
+            now = self.database.now(session)
             job.lease_until, job.heartbeat = now + self.lease_s, now
             if progress is not None:
                 job.phase, job.done, job.total = progress["phase"], progress["done"], progress["total"]
@@ -95,7 +100,7 @@ class Leases:
     def succeed(
         self, claim: Claim, folder: str, assets: list[Asset], summary: dict[str, Any], store: str | None = None
     ) -> bool:
-        """End a job well; False if it was taken away or cancelled, and the results must go.
+        """End a job as succeeded; False if another attempt holds it or it was cancelled: its results must be removed.
 
         The results, which the store has already, become visible by this commit.
         """
@@ -136,17 +141,19 @@ class Leases:
             if job is not None:
                 self._again(session, job, reason, counts)
 
-    def recover(self, owner: str | None = None) -> list[str]:
-        """Requeue the jobs whose lease has ended; with `owner` also those of every other owner.
+    def recover(self, owner: str | None = None, held: Collection[str] = ()) -> list[str]:
+        """Requeue the jobs whose lease has ended, except those in `held`, which the caller runs itself; their ids.
 
-        At start-up the data folder's lock says that every other owner is dead.
+        With `owner` also those of every other owner: at the start, when the lock of the data folder proves that every
+        other owner is dead.
         """
-        now = time.time()
         with self.database.write() as session:
+            now = self.database.now(session)
             running = session.scalars(select(JobRow).where(JobRow.state.in_(("running", "cancelling")))).all()
             found = []
             for job in running:
-                if (job.lease_until or 0.0) <= now or (owner is not None and job.owner != owner):
+                ended = (job.lease_until or 0.0) <= now or (owner is not None and job.owner != owner)
+                if ended and job.id not in held:
                     self._again(session, job, "the server was gone", counts=True)
                     found.append(job.id)
             return found

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sqlalchemy import delete, func, select
 
-from hsloc_service.db.tables import ACTIVE, AssetRow, DeliveryRow, EventRow, FileRow, IdempotencyRow, JobRow
+from hsloc_service.db.tables import ACTIVE, AssetRow, CounterRow, DeliveryRow, EventRow, FileRow, IdempotencyRow, JobRow
 from hsloc_service.errors import ServiceError, busy, conflict, not_found
 from hsloc_service.jobs.events import record
 from hsloc_service.results.deletion_queue import removal_of
-from hsloc_service.storage import safe_name
 from hsloc_service.stored_request import MAP_STATE, UPLOADS, logs_of
 from hsloc_service.uploads.repository import need_quota
+from hsloc_service.webhooks import queue_webhook
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -124,7 +124,7 @@ class Jobs:
             return job
 
     def delete(self, who: Principal, job_id: str) -> None:
-        """Remove a job that has ended; its results are noted down for `Removals`.
+        """Remove a job that has ended; its results are noted down for `DeletionQueue`.
 
         Raises ServiceError 409 while it is active, or while an active job extends its map.
         """
@@ -156,6 +156,7 @@ class Jobs:
         if request.get("resume") is not None:
             _need_map(session, _job(session, who, request["resume"]))
         job = JobRow(
+            seq=_next_seq(session),
             id=str(uuid.uuid4()),
             tenant=who.tenant,
             file_id=logs[0].id,
@@ -175,53 +176,38 @@ class Jobs:
         return job
 
 
+def _next_seq(session: Session) -> int:
+    """A number that no job had, also none that was deleted: it is a cursor of clients. Needs a writing session."""
+    counter = session.get(CounterRow, "job.seq")
+    if counter is None:
+        counter = CounterRow(name="job.seq", value=0)
+        session.add(counter)
+    counter.value = max(counter.value, session.scalar(select(func.max(JobRow.seq))) or 0) + 1
+    return counter.value
+
+
 def finish_job(session: Session, job: JobRow, state: str, reason: str | None, message: str | None) -> None:
     """Put a job into a final state, and its webhook into the outbox, in one transaction."""
     job.state, job.reason, job.message = state, reason, message
     job.ended = time.time()
     job.owner = job.lease_until = None
     record(session, job, "state", {"state": state, "reason": reason, "message": message})
-    if job.webhook is not None:
-        ident = str(uuid.uuid4())
-        body = {
-            "event": "job.ended",
-            "event_id": ident,
-            "job": job.id,
-            "state": state,
-            "reason": reason,
-            "message": message,
-            "log": safe_name(job.log_name, "log"),
-            "ended": job.ended,
-        }
-        session.add(
-            DeliveryRow(
-                id=ident,
-                tenant=job.tenant,
-                job_id=job.id,
-                url=job.webhook,
-                body=json.dumps(body, separators=(",", ":")),
-                state="pending",
-                attempts=0,
-                next_at=job.ended,
-                created=job.ended,
-            )
-        )
+    queue_webhook(session, job, "job.ended")
 
 
-def delete_job(session: Session, job: JobRow) -> None:
-    """Remove the rows of a job, and note down that its results are to go."""
-    if job.folder is not None:
-        session.add(removal_of(job))
-    for table in (AssetRow, EventRow, DeliveryRow):
-        session.execute(delete(table).where(table.job_id == job.id))
-    session.execute(delete(IdempotencyRow).where(IdempotencyRow.job_id == job.id))
-    session.delete(job)
+def delete_job(session: Session, *jobs: JobRow) -> None:
+    """Delete jobs with all their rows, and record that their results are to be removed."""
+    session.add_all([removal_of(job) for job in jobs if job.folder is not None])
+    ids = [job.id for job in jobs]
+    for table in (AssetRow, EventRow, DeliveryRow, IdempotencyRow):
+        session.execute(delete(table).where(table.job_id.in_(ids)))
+    session.execute(delete(JobRow).where(JobRow.id.in_(ids)))
 
 
-def base_job(session: Session, job_id: str) -> bool:
-    """Whether a job that has not ended extends the map of this one."""
-    query = select(JobRow.id).where(JobRow.resume_of == job_id, JobRow.state.in_(ACTIVE)).limit(1)
-    return session.scalar(query) is not None
+def base_job(session: Session, *job_ids: str) -> set[str]:
+    """Those of the jobs whose map is extended by a job that has not ended."""
+    query = select(JobRow.resume_of).where(JobRow.resume_of.in_(job_ids), JobRow.state.in_(ACTIVE))
+    return {each for each in session.scalars(query) if each is not None}
 
 
 def _need_map(session: Session, job: JobRow) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from hsloc_service.results.store import Asset
+    from hsloc_service.results.store import Asset, AssetReader
 
 FLAT = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl")
 """Here no folder is made before its files: there is none, and s3fs would make a bucket of a name that was mistyped."""
@@ -65,6 +66,10 @@ class ObjectStore:
         """What the job's row says."""
         return self._url
 
+    def expect(self) -> None:
+        """Refuse to make the root folder again: it has held results."""
+        self._there = True
+
     def publish(self, output: Path, name: str, assets: list[Asset]) -> None:
         """Write every asset, and see that each is there with all its bytes."""
         folder = f"{self._root}/{checked_result(name)}"
@@ -95,8 +100,9 @@ class ObjectStore:
         for path in (folder, os.path.dirname(folder), os.path.dirname(os.path.dirname(folder))):
             sync_folder(path)
 
-    def path(self, name: str, asset: str) -> None:
-        """No file of this machine."""
+    def open(self, name: str, asset: str) -> AssetReader:
+        """A reader of one object; each range is a call to the store."""
+        return _ObjectReader(self, checked_result(name), checked_asset(asset))
 
     def read(self, name: str, asset: str, start: int, size: int) -> bytes:
         """One range of an object."""
@@ -136,6 +142,19 @@ class ObjectStore:
             found = self._fs.ls(self._root, detail=False)
         names = [str(path).rstrip("/").rsplit("/", 1)[-1] for path in found]
         return [name for name in names if _is_result(name)]
+
+
+@dataclass(frozen=True, slots=True)
+class _ObjectReader:
+    store: ObjectStore
+    name: str
+    asset: str
+
+    def read(self, start: int, size: int) -> bytes:
+        return self.store.read(self.name, self.asset, start, size)
+
+    def close(self) -> None:
+        """Nothing is open."""
 
 
 def _is_result(name: str) -> bool:

@@ -1,20 +1,20 @@
 """What a store of results must do, and the data folder as one.
 
 Law of a store: `publish` puts files under a name that was never used, which the job's row names in the commit that ends
-the job. Until then nobody can ask for them; so there is the whole result or none, whatever breaks in between, and what
-a broken attempt left behind is found by `names` and removed.
+the job. Until then they cannot be requested: there is the whole result or none, whatever fails in between, and what an
+abandoned attempt left behind is found by `names` and removed.
 """
 
 from __future__ import annotations
 
 import os
 import re
-import shutil
 import stat
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from hsloc_service.storage import hash_file, sync_folder
+from hsloc_service.storage import hash_file, remove_tree, sync_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,8 +50,20 @@ class Asset:
     media_type: str
 
 
+class AssetReader(Protocol):
+    """Reads ranges of one asset."""
+
+    def read(self, start: int, size: int) -> bytes:
+        """`size` bytes from `start` on. Raises as `ResultStore.read`."""
+        ...
+
+    def close(self) -> None:
+        """Give the file back."""
+        ...
+
+
 class ResultStore(Protocol):
-    """See the law above. Methods may block for as long as the store likes: see `waiting`.
+    """See the law above. Methods may block for as long as the store does: see `call_timeout`.
 
     All but `publish` raise StoreError for trouble that may pass, and FileNotFoundError for what is not there.
     """
@@ -61,6 +73,10 @@ class ResultStore(Protocol):
         """What the job's row says of where its results are; None for the data folder."""
         ...
 
+    def expect(self) -> None:
+        """The store has had results; where its folder is missing, its disk is not mounted."""
+        ...
+
     def publish(self, output: Path, name: str, assets: list[Asset]) -> None:
         """Make the files of `output`, which `collect` has seen, the results `name`.
 
@@ -68,8 +84,8 @@ class ResultStore(Protocol):
         """
         ...
 
-    def path(self, name: str, asset: str) -> Path | None:
-        """The file, if it is one of this machine."""
+    def open(self, name: str, asset: str) -> AssetReader:
+        """A reader of one asset; where it is a file, it stays readable when the results are removed meanwhile."""
         ...
 
     def read(self, name: str, asset: str, start: int, size: int) -> bytes:
@@ -93,6 +109,9 @@ class FolderStore:
     def __init__(self, root: Path) -> None:
         self._root = root
 
+    def expect(self) -> None:
+        """The data folder is always there."""
+
     def publish(self, output: Path, name: str, assets: list[Asset]) -> None:
         """Rename the output to `<root>/<name>`; its files were synced when they were hashed."""
         del assets
@@ -100,40 +119,56 @@ class FolderStore:
         output.rename(self._root / checked_result(name))
         sync_folder(self._root)
 
-    def path(self, name: str, asset: str) -> Path:
-        """The path of an asset that the manifest names."""
-        return self._root / checked_result(name) / checked_asset(asset)
+    def open(self, name: str, asset: str) -> AssetReader:
+        """A reader of the file of an asset. Raises FileNotFoundError."""
+        return _FileReader(self._root / checked_result(name) / checked_asset(asset))
 
     def read(self, name: str, asset: str, start: int, size: int) -> bytes:
         """Bytes of an asset. Raises OSError if they are not there: that does not pass."""
-        with self.path(name, asset).open("rb") as file:
-            file.seek(start)
-            block = file.read(size)
-        if len(block) != size:
-            raise OSError(f"{asset} of {name} is shorter than its manifest says")
-        return block
+        with closing(self.open(name, asset)) as reader:
+            return reader.read(start, size)
 
     def remove(self, name: str) -> None:
         """Remove the results `name`."""
-        shutil.rmtree(self._root / checked_result(name), ignore_errors=True)
+        remove_tree(self._root / checked_result(name))
 
     def names(self) -> list[str]:
         """The folders with the names of results; anything else is somebody's, and left alone."""
         return [entry.name for entry in os.scandir(self._root) if _RESULT_NAME.match(entry.name)]
 
 
+class _FileReader:
+    """An open file. Does not follow a link."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+
+    def read(self, start: int, size: int) -> bytes:
+        block = os.pread(self._descriptor, size, start)
+        while 0 < len(block) < size and (more := os.pread(self._descriptor, size - len(block), start + len(block))):
+            block += more
+        if len(block) != size:
+            raise OSError(f"{self._path}: shorter than its manifest says")
+        return block
+
+    def close(self) -> None:
+        os.close(self._descriptor)
+
+
 def collect(output: Path) -> list[Asset]:
     """The manifest of a job's output: each file hashed, and on the disk.
 
-    Only regular files with plain names are taken; what else a job leaves behind is dropped.
+    Only regular files with plain names and no second one are taken; what else a job leaves behind is removed.
     """
     assets: list[Asset] = []
     for path in sorted(output.iterdir()):
-        mode = path.lstat().st_mode
-        if not stat.S_ISREG(mode) or not _ASSET_NAME.match(path.name) or len(assets) >= MAX_ASSETS:
-            _remove(path)
+        found = path.lstat()
+        # A second name of a file could be one of the server's own, such as its database.
+        plain = stat.S_ISREG(found.st_mode) and found.st_nlink == 1 and _ASSET_NAME.match(path.name) is not None
+        if not plain or len(assets) >= MAX_ASSETS:
+            remove_tree(path)
             continue
-        path.chmod(0o600)
         size, digest = hash_file(path, sync=True)
         media = MEDIA_TYPES.get(path.suffix.lower(), "application/octet-stream")
         assets.append(Asset(path.name, size, digest, media))
@@ -152,10 +187,3 @@ def checked_result(name: str) -> str:
     if not _RESULT_NAME.match(name):
         raise ValueError(f"{name!r} is not the name of results")
     return name
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from sqlalchemy import select
+
+from hsloc_service.db.tables import JobRow, RemovalRow
 from hsloc_service.errors import StoreError
 from hsloc_service.results.store import FolderStore
 
 if TYPE_CHECKING:
+    from hsloc_service.db.database import Database
     from hsloc_service.results.store import ResultStore
     from hsloc_service.settings import Settings
     from hsloc_service.storage import Storage
@@ -24,6 +28,17 @@ class ResultStores:
             from hsloc_service.results.object_store import ObjectStore
 
             self.current = ObjectStore(settings.results_url, storage.instance)
+
+    def expect(self, database: Database) -> None:
+        """Take the folder of the current store for away, not for new, if the database names results in it."""
+        url = self.current.url
+        if url is None:
+            return
+        with database.read() as session:
+            found = session.scalar(select(JobRow.id).where(JobRow.store == url).limit(1))
+            found = found or session.scalar(select(RemovalRow.folder).where(RemovalRow.store == url).limit(1))
+        if found is not None:
+            self.current.expect()
 
     def of(self, url: str | None) -> ResultStore:
         """The store that a job's row names. Raises StoreError if the settings do not name it any more."""

@@ -1,4 +1,4 @@
-"""Uploads: rows with an offset that is true, bytes that are on the disk before the offset says so."""
+"""Uploads: their rows, whose offset counts only bytes that are on the disk."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from sqlalchemy import case, func, select, tuple_
 
 from hsloc_service.db.tables import ACTIVE, FileRow, JobRow
 from hsloc_service.errors import ServiceError, conflict, no_space, not_found
+from hsloc_service.results.deletion_queue import delete_upload
 from hsloc_service.stored_request import files_of
 
 if TYPE_CHECKING:
@@ -92,12 +93,13 @@ class Files:
                 query = query.where(tuple_(FileRow.created, FileRow.id) < tuple_(last.created, last.id))
             return session.scalars(query.order_by(FileRow.created.desc(), FileRow.id.desc())).all()
 
-    def advance(self, file_id: str, received: int) -> None:
-        """So many bytes are on the disk."""
+    def advance(self, file_id: str, received: int | None = None) -> None:
+        """Write the number of bytes that are on the disk, if it has changed, and put off the upload's expiry."""
         with self.database.write() as session:
             row = session.get(FileRow, file_id)
             if row is not None:
-                row.received = received
+                row.received = row.received if received is None else received
+                row.expires = time.time() + self.settings.upload_ttl_s
 
     def complete(self, file_id: str, size: int, sha256: str) -> FileRow:
         """The file is whole. Raises ServiceError 404 if it was deleted meanwhile."""
@@ -109,7 +111,7 @@ class Files:
             return row
 
     def restart(self, who: Principal, file_id: str, size: int | None) -> None:
-        """Begin an unfinished upload anew, of `size` bytes, for which the same holds as for a new one."""
+        """Start an unfinished upload again, of `size` bytes; the same checks as for a new one."""
         if size is not None:
             self.need_size(size)
         with self.database.write() as session:
@@ -125,9 +127,9 @@ class Files:
         """Remove an upload. Raises ServiceError 409 while an active job needs it."""
         with self.database.write() as session:
             row = _file(session, who, file_id)
-            if needed(session, file_id):
+            if file_id in needed_files(session):
                 raise conflict("in_use", "an active job needs this file; cancel it first")
-            session.delete(row)
+            delete_upload(session, row)
         self.storage.upload_path(file_id).unlink(missing_ok=True)
 
 
@@ -144,10 +146,10 @@ def need_quota(session: Session, who: Principal, most: int, size: int = 0) -> No
         raise no_space(f"your uploads take {uploads} and your results {results} of {most} bytes; delete some")
 
 
-def needed(session: Session, file_id: str) -> bool:
-    """Whether a job that has not ended reads the file."""
+def needed_files(session: Session) -> set[str]:
+    """Ids of the files that jobs read which have not ended."""
     active = session.scalars(select(JobRow.request).where(JobRow.state.in_(ACTIVE)))
-    return any(file_id in files_of(request) for request in active)
+    return {file_id for request in active for file_id in files_of(request)}
 
 
 def _file(session: Session, who: Principal, file_id: str) -> FileRow:

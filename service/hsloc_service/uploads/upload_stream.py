@@ -1,4 +1,4 @@
-"""Bytes from a client onto the disk: bounded memory, one writer an upload, no byte counted that is not safe."""
+"""Writes the body of an upload to the disk: bounded memory, one writer for each upload, only synced bytes count."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import errno
 import hashlib
 import os
 import random
+import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +32,7 @@ SAFE_EVERY = 32 << 20
 _MAX_HASHES = 1024
 
 
-class Receiver:
+class UploadReceiver:
     """Takes the bodies of uploads. Lives on the event loop; files and database are touched in threads."""
 
     def __init__(self, files: Files, settings: Settings) -> None:
@@ -69,16 +70,16 @@ class Receiver:
         if offset != row.received:
             raise ServiceError(409, "offset", f"the offset is {row.received}, not {offset}")
         limit = self._settings.max_upload_bytes if row.size is None else row.size
-        taking = _Taking(self._files, who, row, limit, self._hash(file_id, offset), checksum)
+        append = _Append(self._files, who, row, limit, self._hash(file_id, offset), checksum)
         try:
-            await taking.run(body, drop=random.random() < self._settings.fault_drop_uploads)
+            await append.run(body, drop=random.random() < self._settings.fault_drop_uploads)
         except ClientDisconnect:
-            if taking.safe != row.size:
+            if append.safe != row.size:
                 raise
         finally:
-            self._hashes[file_id] = (taking.digest, taking.safe)
-        row.received = taking.safe
-        if taking.safe == row.size:
+            self._hashes[file_id] = (append.digest, append.safe)
+        row.received, row.expires = append.safe, time.time() + self._settings.upload_ttl_s
+        if append.safe == row.size:
             return await self.finish(file_id)
         return row
 
@@ -104,7 +105,7 @@ class Receiver:
         return row
 
     def forget(self, file_id: str) -> None:
-        """The upload is gone or begins anew."""
+        """Forget the running hash: the upload was deleted or starts again."""
         self._hashes.pop(file_id, None)
 
     def _hash(self, file_id: str, offset: int) -> Any:
@@ -117,11 +118,11 @@ class Receiver:
         return digest if counted == offset else None
 
 
-class _Taking:
+class _Append:
     """One body being appended. `safe` is the offset that is on the disk and in the database.
 
     The offset of the last byte comes into the database by `Files.complete` alone: an upload that says that it has all
-    bytes, and is not complete, would be finished to its client, and to nobody else.
+    bytes, and is not complete, would look finished to its client, and to no job.
     """
 
     def __init__(
@@ -132,6 +133,9 @@ class _Taking:
         self.safe = self._at = row.received
         self.digest = digest
         self._running = None if digest is None else digest.copy()
+        self._alive_s = files.settings.upload_ttl_s / 4.0
+        """While bytes come, the expiry is put off this often: it is for uploads that were given up."""
+        self._alive_until = time.monotonic()
         self._check = None if checksum is None else hashlib.new(checksum[0])
         self._wanted = None if checksum is None else checksum[1]
 
@@ -143,6 +147,9 @@ class _Taking:
             try:
                 async for block in body:
                     buffer += block
+                    if time.monotonic() > self._alive_until:
+                        await to_thread.run_sync(self._files.advance, self._row.id)
+                        self._alive_until = time.monotonic() + self._alive_s
                     if self._at + len(buffer) > self._limit:
                         raise ServiceError(413, "too_large", f"more than the {self._limit} bytes that are expected")
                     if len(buffer) >= BLOCK:

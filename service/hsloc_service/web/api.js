@@ -8,6 +8,7 @@ export const hasToken = () => token !== "";
 
 export function useToken(text) {
   token = text.trim();
+  seen.clear();
   sessionStorage.setItem(KEY, token);
 }
 
@@ -30,7 +31,18 @@ export async function request(path, options = {}) {
   throw new Refused(answer.status, problem);
 }
 
-export const get = async (path) => (await request(path)).json();
+const seen = new Map(); // what polled paths answered last, with its ETag; in memory only
+
+export async function get(path) {
+  const known = seen.get(path);
+  const answer = await request(path, known ? { headers: { "If-None-Match": known.tag } } : {});
+  if (answer.status === 304) return known.value;
+  const value = await answer.json(), tag = answer.headers.get("ETag");
+  seen.delete(path);
+  if (tag && !path.includes("/results")) seen.set(path, { tag, value });
+  if (seen.size > 50) seen.delete(seen.keys().next().value);
+  return value;
+}
 
 export async function post(path, body, headers = {}) {
   const answer = await request(path, {
@@ -40,17 +52,20 @@ export async function post(path, body, headers = {}) {
   return answer.json();
 }
 
-// Server-sent events by fetch: EventSource cannot carry a token. Ends when the job has ended or `signal` says so.
+const ENDED = ["succeeded", "failed", "crashed", "cancelled"];
+
+// Server-sent events by fetch, because EventSource cannot carry a token. Ends when the job has ended, when it is gone,
+// when the token is refused, or by `signal`; a stream that ends otherwise, as of a server that restarts, is opened again.
 export async function* events(path, signal) {
   let cursor = 0;
-  for (let failures = 0; failures < 8;) {
+  for (let failures = 0; !signal.aborted;) {
     try {
       const answer = await request(`${path}?after=${cursor}`, { signal });
       const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
       let text = "";
       for (;;) {
         const { done, value } = await reader.read();
-        if (done) return;
+        if (done) break;
         failures = 0;
         text += value;
         const blocks = text.split("\n\n");
@@ -61,13 +76,16 @@ export async function* events(path, signal) {
             return [line.slice(0, at), line.slice(at + 2)];
           }));
           if (lines.id) cursor = Number(lines.id);
-          if (lines.data) yield { kind: lines.event, data: JSON.parse(lines.data) };
+          if (!lines.data) continue;
+          const data = JSON.parse(lines.data);
+          yield { kind: lines.event, data };
+          if (lines.event === "state" && ENDED.includes(data.state)) return;
         }
       }
     } catch (error) {
       if (signal.aborted || error.status === 404 || error.status === 401) return;
-      failures += 1;
-      await new Promise((resolve) => setTimeout(resolve, Math.min(500 * 2 ** failures, 10000)));
     }
+    failures += 1;
+    await new Promise((resolve) => setTimeout(resolve, Math.min(500 * 2 ** failures, 10000)));
   }
 }

@@ -1,6 +1,7 @@
 // The page. Whatever comes from a log or a person goes in as text, never as markup.
 
 import { Refused, events, get, hasToken, onToken, post, request, useToken } from "./api.js";
+import { build, chosen as chosenOptions } from "./options.js";
 import { plot } from "./plot.js";
 import { upload } from "./upload.js";
 import { Viewer } from "./viewer.js";
@@ -49,11 +50,13 @@ $("token-form").addEventListener("submit", (event) => {
   notice("");
   refresh();
   about();
+  if (chosen) show(chosen, false);
 });
 
 async function about() {
   const info = await guarded(() => get("/v1/info"));
   if (info) $("server").textContent = `version ${info.version}, ${bytes(info.free_bytes)} free, ${info.tenant}`;
+  if (info && !$("options").children.length) build($("options"), (await guarded(() => get("/v1/options")))?.run ?? []);
 }
 
 // --- new job ---------------------------------------------------------------------------------------------------------
@@ -74,16 +77,8 @@ for (const kind of ["dragover", "dragleave", "drop"]) {
 }
 
 function options() {
-  const found = { mode: $("mode").value, preset: $("preset").value, seed: Number($("seed").value), unknown_start: $("unknown").checked };
-  if ($("matcher").value) found.matcher = $("matcher").value;
+  const found = chosenOptions($("options"));
   if ($("resume").value) found.resume = $("resume").value;
-  if ($("pose").value.trim()) {
-    found.initial_pose = $("pose").value.trim().split(/[\s,]+/).map(Number);
-    if (found.initial_pose.length !== 3 || found.initial_pose.some(Number.isNaN)) throw new SyntaxError("start: three numbers are needed: x, y (metres) and yaw (radians)");
-  }
-  if ($("config").value.trim()) {
-    try { found.config = JSON.parse($("config").value); } catch (error) { throw new SyntaxError(`parameters are not JSON: ${error.message}`); }
-  }
   return found;
 }
 
@@ -104,12 +99,13 @@ async function submit() {
     if (!yaml || !image || files.length !== 2) throw new SyntaxError("a map is two files: its YAML and its image");
     wanted.map = { yaml: await send(yaml), image: await send(image) };
   }
-  if ($("relations").files.length) wanted.relations = await send($("relations").files[0]);
+  const others = ["relations", "reference"].filter((name) => $(name).files.length);
+  for (const name of others) wanted[name] = await send($(name).files[0]);
   const logs = [];
   for (const file of $("log").files) logs.push(await send(file));
   if (logs.length === 1) [wanted.log] = logs; else wanted.logs = logs;
   const job = await post("/v1/jobs", wanted, { "Idempotency-Key": crypto.randomUUID ? crypto.randomUUID() : String(Math.random()) });
-  for (const file of [...$("log").files, ...files, ...$("relations").files]) sent.delete(file);
+  for (const file of [...$("log").files, ...files, ...others.map((name) => $(name).files[0])]) sent.delete(file);
   await refresh();
   show(job.id, true);
 }
@@ -220,7 +216,7 @@ function render(job) {
     $("job-bar").value = progress.fraction;
     const speed = progress.phase === "replay" && progress.speed ? `, ${progress.speed.toFixed(0)} times real time` : "";
     const amount = progress.phase === "replay" ? `${progress.done.toFixed(0)} of ${progress.total.toFixed(0)} s` : `${Math.round(100 * progress.fraction)} %`;
-    state.append(`: ${progress.phase}, ${amount}${speed}, told ${progress.age_s.toFixed(0)} s ago`);
+    state.append(`: ${progress.phase}, ${amount}${speed}, ${progress.age_s.toFixed(0)} s ago`);
   } else {
     $("job-bar").removeAttribute("value");
   }
@@ -319,9 +315,9 @@ function metrics(job) {
   if (found.run) row("Run", `hsloc ${found.run.hsloc}, ${found.run.matcher}, preset ${found.run.preset}, seed ${found.run.seed}`);
   if (found.run) row("SHA-256 of the log", found.run.input_sha256);
   $("metrics").tBodies[0].replaceChildren(...rows);
-  const reasons = (job.summary?.verdict_reasons ?? []).map(warningText);
-  const warnings = (job.summary?.warnings ?? []).map(warningText).filter((text) => !reasons.includes(text));
-  const lines = [...reasons, ...warnings, ...(job.summary?.notes ?? [])];
+  const reasons = job.summary?.verdict_reasons ?? [], known = new Set(reasons.map((reason) => reason.text));
+  const warnings = (job.summary?.warnings ?? []).filter((warning) => !known.has(warning.text)).map(warningText);
+  const lines = [...reasons.map((reason) => reason.line), ...warnings, ...(job.summary?.notes ?? [])];
   $("notes").replaceChildren(...lines.map((text) => element("p", text, "quiet")));
 }
 
@@ -371,6 +367,6 @@ guarded(refresh).then(() => {
 });
 setInterval(async () => {
   if (!document.hidden && $("token-form").hidden) {
-    try { await refresh(); } catch { /* the next round will tell */ }
+    try { await refresh(); } catch { /* the next round tries again */ }
   }
 }, 3000);

@@ -39,13 +39,17 @@ export function plot(canvas, data, now) {
     c.strokeStyle = ink(style);
     c.lineWidth = 1.5 * ratio;
     c.beginPath();
-    let open = false;
+    const alone = [];
     values.forEach((v, k) => {
-      if (v === null) { open = false; return; }
-      if (open) c.lineTo(px(columns.t[k]), py(v)); else c.moveTo(px(columns.t[k]), py(v));
-      open = true;
+      if (v === null) return;
+      const before = k > 0 && values[k - 1] !== null, after = k + 1 < values.length && values[k + 1] !== null;
+      if (before) c.lineTo(px(columns.t[k]), py(v)); else c.moveTo(px(columns.t[k]), py(v));
+      if (!before && !after) alone.push(k);
     });
     c.stroke();
+    // A value between two gaps has no line: the reference of some logs is a sample now and then.
+    c.fillStyle = ink(style);
+    for (const k of alone) { c.beginPath(); c.arc(px(columns.t[k]), py(values[k]), 2 * ratio, 0, 2 * Math.PI); c.fill(); }
   });
   if (Number.isFinite(now)) {
     c.strokeStyle = ink("robot");

@@ -2,7 +2,8 @@
 
 import { request } from "./api.js";
 
-const BLOCK = 8 << 20;
+const MIN_BLOCK = 64 << 10;
+let block = 8 << 20; // halved where a proxy takes smaller bodies only: nginx 1 MiB, unless it is configured
 const TUS = { "Tus-Resumable": "1.0.0" };
 const remembered = (file) => `hsloc-upload:${file.name}:${file.size}:${file.lastModified}`;
 const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
@@ -37,12 +38,13 @@ export async function upload(file, report, signal) {
     report(offset, file.size, failures ? `the line broke; attempt ${failures + 1}` : "");
     try {
       const answer = await request(place, {
-        method: "PATCH", signal, body: file.slice(offset, offset + BLOCK),
+        method: "PATCH", signal, body: file.slice(offset, offset + block),
         headers: { ...TUS, "Upload-Offset": String(offset), "Content-Type": "application/offset+octet-stream" },
       });
       offset = Number(answer.headers.get("Upload-Offset"));
       failures = 0;
     } catch (error) {
+      if (error.status === 413 && !error.code && block > MIN_BLOCK) { block /= 2; continue; } // not our answer
       const final = error.status && ![408, 409, 423, 429, 500, 502, 503, 504].includes(error.status);
       if (signal.aborted || final || ++failures > 10) throw error;
       await pause(Math.min(300 * 2 ** failures, 15000));

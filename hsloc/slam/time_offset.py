@@ -1,0 +1,260 @@
+"""How far the stamps of the scans are from those of the odometry, from the data alone.
+
+A driver that stamps a scan when it arrives, a lidar with a clock of its own: the odometry at the scan's stamp is then
+that of another moment, and every turn bends the pose. The offset is found where the heading that the scans show agrees
+best with the heading of the odometry, as in Censi et al. (T-RO 2013) for the rotation alone; a robot that never turns
+does not determine it. What the odometry gets wrong about each turn averages out over many of them, and is counted in
+the uncertainty.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import isfinite, sqrt
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from hsloc.log import open_log
+from hsloc.model.events import Odometry, Scan
+from hsloc.options import AUTO
+from hsloc.slam.laser_odometry import with_laser_odometry
+from hsloc.warnings import RunWarning, WarningCode
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.random import Generator
+    from numpy.typing import NDArray
+
+    from hsloc.log import ReadOptions
+    from hsloc.model.events import Event
+    from hsloc.slam.front_end import FrontEndParameters
+
+    F64 = NDArray[np.float64]
+    I64 = NDArray[np.int64]
+
+NANOSECONDS = 1e9
+RANGE_S = 40.0
+"""Offsets that are searched (s), either way; clocks that are farther apart are of different epochs."""
+_GRID_S = 0.05
+"""Step of the coarse search (s): a lidar turns at 5 to 40 Hz, and headings are interpolated between."""
+_NEAR_S = 0.5
+"""Half-width of the search where nothing is known of the clocks but that the run did not get lost (s)."""
+_LEAST_TURNED = 1.0
+"""Sum of rotation (rad) without which the offset is not determined."""
+_MIN_STEPS = 20
+_HUBER = 1.345
+"""Scale of the robust weights in standard deviations (Huber 1981): 95 % efficient on Gaussian errors."""
+SIGNIFICANT = 4.0
+"""An offset counts if it is so many of its standard deviations from zero; under Gaussian errors once in 16,000 runs."""
+HINT_S = 0.15
+"""Difference of stamps and log times between scans and odometry (s) from which on the offset is estimated before a run:
+drivers and networks delay messages by less."""
+LARGE_S = 0.1
+"""From here on (s) poses are wrong by 10 cm at 1 m/s and by 6 degrees at 1 rad/s: nobody would call that right."""
+SMALLEST_S = 0.02
+"""Offsets below this (s) are not worth a word: they move a beam by 2 cm at 1 m/s."""
+
+
+class Offset(NamedTuple):
+    """The scans' stamps are `seconds` later than the odometry's; `sigma` is the standard deviation (s).
+
+    0.1 means that a scan stamped t shows the robot where the odometry has it at t - 0.1 s.
+    """
+
+    seconds: float
+    sigma: float
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether it is neither chance nor too small to matter."""
+        return isfinite(self.sigma) and abs(self.seconds) > max(SIGNIFICANT * self.sigma, SMALLEST_S)
+
+
+UNKNOWN = Offset(0.0, float("inf"))
+"""What is known of a robot that does not turn."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Headings:
+    """Headings (n,) in radians, unwrapped, at stamps (n,) in nanoseconds that do not run backwards."""
+
+    stamps_ns: I64
+    theta: F64
+
+    @staticmethod
+    def of(stamps_ns: I64, theta: F64) -> Headings:
+        """Sorted by time, and of each stamp the first."""
+        order = np.argsort(stamps_ns, kind="stable")
+        stamps, first = np.unique(stamps_ns[order], return_index=True)
+        return Headings(stamps, np.unwrap(theta[order])[first])
+
+
+def find_offset(scans: Headings, odometry: Headings, near_s: float = _NEAR_S, start_s: float = 0.0) -> Offset:
+    """The offset at which steps of the scans' heading agree best with those of the odometry.
+
+    Searched within `near_s` of `start_s`: first on a grid, then by robust least squares on the steps, whose residuals
+    give the standard deviation.
+    """
+    if len(scans.theta) < _MIN_STEPS or len(odometry.theta) < _MIN_STEPS:
+        return UNKNOWN
+    origin = int(odometry.stamps_ns[0])
+    t_odom = (odometry.stamps_ns - origin) / NANOSECONDS
+    t_scan = (scans.stamps_ns - origin) / NANOSECONDS
+    seen = np.diff(scans.theta)
+
+    def steps(offset: float) -> tuple[F64, NDArray[np.bool_]]:
+        """The odometry's steps between the scans, and which of them lie within its time."""
+        at = t_scan - offset
+        inside = (at >= t_odom[0]) & (at <= t_odom[-1])
+        return np.diff(np.interp(at, t_odom, odometry.theta)), inside[1:] & inside[:-1]
+
+    def cost(offset: float) -> float:
+        told, inside = steps(offset)
+        if inside.sum() < max(_MIN_STEPS, len(seen) // 4):
+            return float("inf")
+        return float(np.mean(np.minimum(np.abs(seen - told)[inside], 0.5)))
+
+    if float(np.abs(seen).sum()) < _LEAST_TURNED:
+        return UNKNOWN
+    # Steps are taken between scans, wherever these are; a grid finer than they are finds the valley.
+    grid = start_s + np.arange(-near_s, near_s + _GRID_S / 2.0, _GRID_S)
+    costs = np.array([cost(float(offset)) for offset in grid])
+    if not np.isfinite(costs).any():
+        return UNKNOWN
+    best = float(grid[int(np.argmin(costs))])
+    return _refined(best, seen, steps)
+
+
+def _refined(best: float, seen: F64, steps: Callable[[float], tuple[F64, NDArray[np.bool_]]]) -> Offset:
+    """Gauss-Newton on the offset, with Huber's weights; the standard deviation from the spread of the residuals."""
+    half = 0.5 * _GRID_S
+    sigma = float("inf")
+    for _ in range(20):
+        told, inside = steps(best)
+        later, earlier = steps(best + half)[0], steps(best - half)[0]
+        slope = ((later - earlier) / (2.0 * half))[inside]
+        residual = (seen - told)[inside]
+        scale = max(1.4826 * float(np.median(np.abs(residual - np.median(residual)))), 1e-5)
+        weight = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(residual), 1e-12))
+        information = float(np.sum(weight * slope**2))
+        if information <= 0.0:
+            return UNKNOWN
+        change = float(np.sum(weight * slope * residual)) / information
+        change = min(max(change, -_GRID_S), _GRID_S)
+        best += change
+        # Sandwich estimate: steps that follow each other share the error of the scan between them.
+        moments = weight * slope * residual
+        spread = float(np.sum(moments**2) + 2.0 * np.sum(moments[1:] * moments[:-1]))
+        sigma = sqrt(max(spread, float(np.sum(moments**2)))) / information
+        if abs(change) < 1e-5:
+            break
+    return Offset(best, sigma)
+
+
+def estimate_offset(
+    events: Iterable[Event], parameters: FrontEndParameters, rng: Generator, most_scans: int = 1500
+) -> Offset:
+    """The offset of a log: its scans are matched one to the next without odometry, up to `most_scans` of them.
+
+    The whole range of `RANGE_S` is searched; where two offsets fit nearly alike, the smaller one counts.
+    """
+    odometry: list[tuple[int, float]] = []
+
+    def kept() -> Iterable[Event]:
+        count, last_ns = 0, 0
+        for event in events:
+            if isinstance(event, Odometry):
+                odometry.append((event.stamp_ns, event.T_odom_base.theta))
+                if count >= most_scans and event.stamp_ns > last_ns + RANGE_S * NANOSECONDS:
+                    return
+            elif isinstance(event, Scan):
+                count += 1
+                if count <= most_scans:
+                    last_ns = event.stamp_ns
+                    yield event
+
+    matched = with_laser_odometry(kept(), parameters, rng)
+    scans = [(event.stamp_ns, event.T_odom_base.theta) for event in matched if isinstance(event, Odometry)]
+    if not scans or not odometry:
+        return UNKNOWN
+    seen, told = _headings(scans), _headings(odometry)
+    # By steps of half a second and more the rotation stands out of the noise of single scans.
+    near = find_offset(_thinned(seen), told)
+    whole = find_offset(_thinned(seen), told, near_s=RANGE_S)
+    if not isfinite(whole.sigma):
+        return near
+    if isfinite(near.sigma) and _misfit(seen, told, near.seconds) <= 1.2 * _misfit(seen, told, whole.seconds):
+        return near
+    return whole
+
+
+def _headings(pairs: list[tuple[int, float]]) -> Headings:
+    return Headings.of(np.array([stamp for stamp, _ in pairs], dtype=np.int64), np.array([theta for _, theta in pairs]))
+
+
+def _thinned(headings: Headings, step_s: float = 0.2) -> Headings:
+    """Headings at least `step_s` apart."""
+    kept = [0]
+    for k, stamp in enumerate(headings.stamps_ns.tolist()):
+        if stamp - int(headings.stamps_ns[kept[-1]]) >= step_s * NANOSECONDS:
+            kept.append(k)
+    return Headings(headings.stamps_ns[kept], headings.theta[kept])
+
+
+def _misfit(scans: Headings, odometry: Headings, offset_s: float) -> float:
+    """Mean difference of the steps (rad), large ones bounded."""
+    at = scans.stamps_ns - round(offset_s * NANOSECONDS)
+    inside = (at >= odometry.stamps_ns[0]) & (at <= odometry.stamps_ns[-1])
+    if inside.sum() < _MIN_STEPS:
+        return float("inf")
+    told = np.interp(at[inside].astype(np.float64), odometry.stamps_ns.astype(np.float64), odometry.theta)
+    return float(np.mean(np.minimum(np.abs(np.diff(scans.theta[inside]) - np.diff(told)), 0.5)))
+
+
+def offsets_of_log(paths: Sequence[Path], options: ReadOptions, parameters: FrontEndParameters) -> dict[str, Offset]:
+    """The offset of each scan topic that is read, those that are determined; the whole log counts.
+
+    What the options add to the stamps is part of them.
+
+    Raises LogError and TopicError as `open_log` does.
+    """
+    given = None if options.time_offset == AUTO else options.time_offset
+    options = replace(options, time_offset=given, deskew=False, start_s=None, end_s=None)
+    topics = (open_log(paths, options).summary.scan_topic or "").split(",")
+    found = {}
+    for topic in topics if options.stamps == "header" else ():
+        # A text log has no topics to choose from.
+        named = replace(options, scan_topic=topic) if len(topics) > 1 else options
+        offset = estimate_offset(open_log(paths, named).events(), parameters, np.random.default_rng(0))
+        if isfinite(offset.sigma):
+            found[topic] = offset
+    return found
+
+
+def in_words(offset: Offset) -> str:
+    """An offset with its uncertainty, to be followed by what it is counted from."""
+    word = "later than" if offset.seconds > 0.0 else "earlier than"
+    return f"{abs(offset.seconds):.3f} +- {offset.sigma:.3f} s {word}"
+
+
+def offset_warning(topic: str, offset: Offset, given_s: float = 0.0) -> RunWarning:
+    """The warning of an offset that was not removed; `given_s` is what the user adds to the stamps already (s)."""
+    return RunWarning(
+        WarningCode.CLOCK_OFFSET_LARGE if abs(offset.seconds) >= LARGE_S else WarningCode.CLOCK_OFFSET,
+        f"the stamps of {topic} are {in_words(offset)} those of the odometry, by their headings",
+        f"--time-offset {_first(topic)}={given_s - offset.seconds:.3f} removes it, or --time-offset auto",
+    )
+
+
+def as_option(offsets: Mapping[str, Offset]) -> str | None:
+    """The value of `--time-offset` that removes the offsets that are significant; None where none is."""
+    items = [f"{_first(topic)}={-offset.seconds:.3f}" for topic, offset in offsets.items() if offset.is_significant]
+    return ",".join(items) or None
+
+
+def _first(topic: str) -> str:
+    """The topic; of the kinds of lines of a text log, which are joined by plus signs, the first."""
+    return topic.partition(" + ")[0]

@@ -1,0 +1,147 @@
+"""An online backup of a data folder: a copy of the database, and of every upload and result that it names.
+
+A plain copy of the folder is no backup while a server runs: what is in the database's write-ahead log is missing in a
+copy of `hsloc.db`. The backup is a data folder itself: to restore it, copy it to where `--data` points.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sqlite3
+from contextlib import closing, suppress
+from typing import TYPE_CHECKING, NamedTuple
+
+from sqlalchemy import select
+
+from hsloc_service.db.database import Database
+from hsloc_service.db.tables import AssetRow, FileRow, JobRow
+from hsloc_service.jobs.repository import delete_job
+from hsloc_service.settings import SettingsError
+from hsloc_service.storage import sync_folder
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from sqlalchemy.orm import Session
+
+BLOCK = 1 << 20
+
+
+class BackupReport(NamedTuple):
+    """What a backup holds."""
+
+    uploads: int
+    jobs: int
+    results: int
+    """Jobs whose results were copied; those in an object store stay there."""
+    bytes: int
+    deleted: int
+    """Uploads and jobs that somebody deleted while the backup was made, and that are not in it."""
+
+
+def back_up(data: Path, target: Path) -> BackupReport:
+    """Copy the data folder `data` to the new folder `target`, while a server may run on it; each file is verified.
+
+    Raises SettingsError where `data` is no data folder, `target` is there already, the copy fails, or a file does not
+    have the SHA-256 that the database names.
+    """
+    if not (data / "hsloc.db").is_file():
+        raise SettingsError(f"{data}: no data folder of hsloc; name it with --data")
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise SettingsError(f"{target}: exists already; name a new folder for the backup")
+    partial = target.with_name(f".{target.name}.partial")
+    try:
+        if partial.exists():
+            shutil.rmtree(partial)
+        for name in ("uploads", "results"):
+            (partial / name).mkdir(parents=True, mode=0o700)
+        partial.chmod(0o700)
+        _copy_database(data / "hsloc.db", partial / "hsloc.db")
+        with suppress(FileNotFoundError):
+            shutil.copyfile(data / "instance", partial / "instance")
+        report = _copy_files(data, partial)
+        for base, _, _ in os.walk(partial):
+            sync_folder(base)
+        if target.exists():
+            target.rmdir()
+        partial.rename(target)
+        sync_folder(target.absolute().parent)
+    except (OSError, sqlite3.Error) as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise SettingsError(f"{target}: the backup failed: {error}") from error
+    except SettingsError:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    return report
+
+
+def _copy_database(source: Path, target: Path) -> None:
+    """SQLite's own online backup: one consistent state, with what is in the write-ahead log."""
+    with (
+        closing(sqlite3.connect(f"file:{source}?mode=ro", uri=True, timeout=15.0)) as reading,
+        closing(sqlite3.connect(target)) as writing,
+    ):
+        reading.backup(writing, pages=4096)
+        problem = writing.execute("PRAGMA integrity_check(1)").fetchone()[0]
+    if problem != "ok":
+        raise SettingsError(f"{source}: the database is damaged: {problem}; restore an earlier backup")
+    target.chmod(0o600)
+
+
+def _copy_files(data: Path, target: Path) -> BackupReport:
+    """Copy what the copied database names; what was deleted meanwhile is deleted from it, too."""
+    database = Database(target / "hsloc.db")
+    size = deleted = 0
+    try:
+        with database.write() as session:
+            files = session.scalars(select(FileRow)).all()
+            for row in files:
+                source = data / "uploads" / row.id
+                if not source.exists() and row.received > 0:
+                    session.delete(row)
+                    deleted += 1
+                elif source.exists():
+                    size += _copy(source, target / "uploads" / row.id, row.sha256)
+                    (target / "uploads" / row.id).chmod(0o400 if row.state == "complete" else 0o600)
+            jobs = session.scalars(select(JobRow)).all()
+            stored = [job for job in jobs if job.folder is not None and job.store is None]
+            for job in stored:
+                copied = _copy_result(session, job, data, target)
+                size += copied or 0
+                deleted += copied is None
+            return BackupReport(len(files), len(jobs), len(stored), size, deleted)
+    finally:
+        database.close()
+
+
+def _copy_result(session: Session, job: JobRow, data: Path, target: Path) -> int | None:
+    """Bytes that were copied; None if the job was deleted meanwhile."""
+    source, place = data / "results" / (job.folder or ""), target / "results" / (job.folder or "")
+    size = 0
+    place.mkdir(mode=0o700)
+    try:
+        for row in session.scalars(select(AssetRow).where(AssetRow.job_id == job.id)):
+            size += _copy(source / row.name, place / row.name, row.sha256)
+    except FileNotFoundError:
+        shutil.rmtree(place)
+        job.folder = None
+        delete_job(session, job)
+        return None
+    return size
+
+
+def _copy(source: Path, target: Path, sha256: str | None) -> int:
+    """Copy a file onto the disk; its size. Raises SettingsError if it is not what the database says."""
+    digest, size = hashlib.sha256(), 0
+    with source.open("rb") as reading, target.open("xb") as writing:
+        while block := reading.read(BLOCK):
+            digest.update(block)
+            writing.write(block)
+            size += len(block)
+        writing.flush()
+        os.fsync(writing.fileno())
+    if sha256 is not None and digest.hexdigest() != sha256:
+        raise SettingsError(f"{source}: damaged: its SHA-256 is not the one in the database; delete it first")
+    return size

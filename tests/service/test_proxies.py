@@ -1,0 +1,128 @@
+"""Behind nginx and Caddy with their defaults and the lines of the README: uploads, live events, the page."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import socket
+import subprocess
+import time
+from typing import TYPE_CHECKING, Any
+
+import httpx2 as httpx
+import pytest
+from live_service import free_port, submit
+
+from hsloc.client import Client
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from live_service import Live
+
+NGINX = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")
+CADDY = shutil.which("caddy")
+NGINX_CONFIG = """
+daemon off; pid {folder}/nginx.pid; error_log {folder}/error.log; worker_processes 1; {user}
+events {{}}
+http {{
+  access_log off; client_body_temp_path {folder}/body; proxy_temp_path {folder}/proxy;
+  fastcgi_temp_path {folder}/f; uwsgi_temp_path {folder}/u; scgi_temp_path {folder}/s;
+  server {{
+    listen 127.0.0.1:{port};
+    location / {{
+      proxy_pass {upstream};
+      proxy_set_header Host $http_host;
+    }}
+  }}
+}}
+"""
+
+
+def wait_for_port(port: int) -> None:
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        with socket.socket() as line:
+            if line.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        time.sleep(0.05)
+    raise AssertionError("the proxy did not start")
+
+
+@pytest.fixture(params=["nginx", "caddy"])
+def proxied(
+    request: pytest.FixtureRequest, make_live: Callable[..., Live], tmp_path: Path
+) -> Iterator[tuple[Live, str]]:
+    """A server, and the URL of a proxy before it."""
+    program = NGINX if request.param == "nginx" else CADDY
+    if program is None:
+        pytest.skip(f"{request.param.upper()} IS NOT TESTED: apt-get install {request.param}")
+    live, port = make_live(), free_port()
+    if request.param == "nginx":
+        config = tmp_path / "nginx.conf"
+        user = "user root;" if os.getuid() == 0 else ""
+        config.write_text(NGINX_CONFIG.format(folder=tmp_path, port=port, upstream=live.url, user=user))
+        command = [program, "-c", str(config), "-p", str(tmp_path), "-e", str(tmp_path / "error.log")]
+    else:
+        config = tmp_path / "Caddyfile"
+        config.write_text(
+            f"{{\n admin off\n auto_https off\n}}\nhttp://127.0.0.1:{port} {{\n reverse_proxy {live.url[7:]}\n}}\n"
+        )
+        command = [program, "run", "--config", str(config), "--adapter", "caddyfile"]
+    environment = {**os.environ, "HOME": str(tmp_path), "XDG_DATA_HOME": str(tmp_path)}
+    with (tmp_path / "proxy.log").open("wb") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
+    try:
+        wait_for_port(port)
+        yield live, f"http://127.0.0.1:{port}"
+    finally:
+        process.terminate()
+        process.wait(10.0)
+
+
+def test_a_large_upload_passes(proxied: tuple[Live, str], tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    log.write_bytes(b"ok " + os.urandom(5_000_000))
+    client = Client(proxied[1])
+    job = client.submit(client.upload(log))
+    assert client.wait(job["id"])["state"] == "succeeded"
+    with proxied[0].client() as direct:
+        (file,) = direct.get("/v1/files").json()["files"]
+    assert file["sha256"] == hashlib.sha256(log.read_bytes()).hexdigest()
+
+
+def test_events_come_while_the_job_runs(proxied: tuple[Live, str]) -> None:
+    live, url = proxied
+    with live.client() as direct:
+        job = submit(direct, b"slow 4")
+    states, moments = [], []
+    with httpx.stream("GET", f"{url}/v1/jobs/{job}/events", timeout=20.0) as answer:
+        for line in answer.iter_lines():
+            if line.startswith("data: "):
+                states.append(json.loads(line[6:]).get("state", "progress"))
+                moments.append(time.monotonic())
+    assert states[-1] == "succeeded"
+    assert moments[-1] - moments[0] > 2.0  # else the proxy kept them until the end
+
+
+def test_the_page_works(proxied: tuple[Live, str], tmp_path: Path) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="THE PAGE IS NOT TESTED: playwright is not installed")
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("THE PAGE IS NOT TESTED: no chromium (apt-get install chromium)")
+    log = tmp_path / "run.mcap"
+    log.write_bytes(b"slow 3 " + bytes(3_000_000))
+    with sync_api.sync_playwright() as playwright:
+        browser: Any = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        page = browser.new_page()
+        page.set_default_timeout(30_000)
+        page.goto(proxied[1])
+        page.set_input_files("#log", str(log))
+        page.click("#go")
+        page.wait_for_selector("#job-state .running")
+        page.wait_for_function("() => document.querySelector('#job-state').textContent.includes('replay')")
+        page.wait_for_selector("#job-state .succeeded")
+        browser.close()

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from hsloc.errors import ConfigError
 from hsloc.localisation.localiser import LocaliserParameters
+from hsloc.localisation.place_check import PlaceCheckParameters
+from hsloc.matching.exact import Exact
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.hide import Hide
 from hsloc.matching.icp import Icp
@@ -48,6 +50,7 @@ class Config(Parameters):
     hide: Hide = field(default_factory=Hide)
     harmony_search: HarmonySearch = field(default_factory=HarmonySearch)
     icp: Icp = field(default_factory=Icp)
+    exact: Exact = field(default_factory=Exact)
     likelihood_field: FieldParameters = field(default_factory=FieldParameters)
     localiser: LocaliserParameters = field(default_factory=LocaliserParameters)
     mapper: Annotated[str, OneOf(MAPPERS)] = "graph"
@@ -84,7 +87,15 @@ def preset(name: str) -> Config:
         hide=replace(hide, improvisations_per_pass=4, budget=20, count_improvisations=True),
         harmony_search=replace(harmony_search, budget=20, count_improvisations=True),
         likelihood_field=FieldParameters(sigma=1.0, margin=3.0),
-        localiser=LocaliserParameters(update_min_d=0.0, update_min_a=0.0, min_points=6, window_sigmas=1.0, fuse=False),
+        localiser=LocaliserParameters(
+            update_min_d=0.0,
+            update_min_a=0.0,
+            min_points=6,
+            window_sigmas=1.0,
+            refine_first=False,
+            fuse=False,
+            place_check=PlaceCheckParameters(interval=0.0),
+        ),
     )
 
 

@@ -28,7 +28,7 @@ EVERYWHERE: frozenset[Door] = COMMANDS | {"http"}
 ONE_RUN: frozenset[Door] = EVERYWHERE - {"sweep"}
 
 MODES = ("auto", "localise", "slam")
-MATCHERS = ("hide", "harmony_search", "icp")
+MATCHERS = ("hide", "harmony_search", "icp", "exact")
 MATCHER_ALIASES = {"hs": "harmony_search"}
 MAPPERS = ("graph", "point")
 PRESETS = ("default", "paper", "paper-literal")
@@ -190,6 +190,10 @@ OPTIONS: tuple[Option, ...] = (
         name="matcher", flag="--matcher", kind="choice", choices=(*MATCHERS, *MATCHER_ALIASES), place="config",
         group=_ALGORITHMS, varied=True,
         help="Scan matcher; hs is short for harmony_search (default: hide).",
+    ),
+    Option(
+        name="certify", flag="--certify", kind="switch", default=False, place="config", group=_ALGORITHMS,
+        help="Prove of each match on a map that no pose of its window is fitter: localiser.certify.",
     ),
     Option(
         name="mapper", flag="--mapper", kind="choice", choices=MAPPERS, place="config", group=_ALGORITHMS, varied=True,

@@ -112,17 +112,18 @@ class RunRequest:
         matcher = values.get("matcher")
         if matcher is not None and not isinstance(matcher, str):
             values["own_matcher"] = values.pop("matcher")
+        settings = [*values.get("set", ()), *(["localiser.certify=true"] if values.get("certify") else [])]
         config = values.get("config")
         if not isinstance(config, Config):
             config = combined(
                 preset(values.get("preset", "default")),
                 config,
-                values.get("set", ()),
+                settings,
                 {name: values[name] for name in ("matcher", "mapper") if name in values},
                 warnings,
             )
-        elif rest := [name for name in ("matcher", "mapper", "set") if name in values]:
-            config = combined(config, None, values.get("set", ()), {n: values[n] for n in rest if n != "set"})
+        elif settings or "matcher" in values or "mapper" in values:
+            config = combined(config, None, settings, {n: values[n] for n in ("matcher", "mapper") if n in values})
         run: dict[str, Any] = {"logs": tuple(Path(log) for log in logs), "config": config}
         read: dict[str, Any] = {}
         for name, value in values.items():

@@ -141,6 +141,22 @@ class FitnessMetrics:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class CertificateMetrics:
+    """What was proven about the matches (docs/certificates.md)."""
+
+    scans: int
+    """Number of scans with a certificate."""
+    optimal: float
+    """Fraction of them for which no pose of the window is fitter by more than epsilon, from 0 to 1."""
+    distinct: float
+    """Fraction of them for which every other place in the window is worse by the margin, from 0 to 1."""
+    median_gap: float
+    """Median of the fitness by which another pose of the window may be fitter at most, from 0 to 1."""
+    max_gain: float
+    """Largest fitness by which a proof improved on the pose that the search found, from 0 to 1."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LaserResiduals:
     """Distances from scan points to the nearest occupied cell of the map, for scans with a known pose."""
 
@@ -228,6 +244,8 @@ class RunMetrics:
     """What of the log could not be read."""
     warnings: tuple[RunWarning, ...]
     """Warnings about log, map and result, each with a stable code."""
+    certificates: CertificateMetrics | None = None
+    """Proofs about the matches; left out where none was asked for."""
     errors: ErrorMetrics | None = field(default=None, metadata={"inline": True})
     """Errors against the reference; left out without a reference."""
     evaluation_error: str | None = None

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.analysis.metrics import (
+    certificate_metrics,
     evaluation_counts,
     fitness_metrics,
     localised_metrics,
@@ -97,6 +98,7 @@ def analyse(
         scans=scan_counts(result),
         evaluations=evaluation_counts(result),
         fitness=fitness_metrics(result),
+        certificates=certificate_metrics(result),
         map=map_metrics(result, residuals.metrics(), errors.whole),
         localised=localised_metrics(result),
         losses=loss_metrics(result),

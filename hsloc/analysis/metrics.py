@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,9 @@ from hsloc.errors import EvaluationError
 from hsloc.evaluation.map_quality import compare_maps, crispness
 from hsloc.evaluation.metrics import compare_run
 from hsloc.log import LaserSummary
+from hsloc.matching import summarise
 from hsloc.run_metrics import (
+    CertificateMetrics,
     EvaluationCounts,
     FitnessMetrics,
     LaserMetrics,
@@ -99,6 +102,12 @@ def fitness_metrics(result: Result) -> FitnessMetrics:
     """Fitness of the matches."""
     fitness = result.diagnostics.fitness[np.isfinite(result.diagnostics.fitness)]
     return FitnessMetrics(median=_median(fitness), p05=float(np.percentile(fitness, 5)) if len(fitness) else None)
+
+
+def certificate_metrics(result: Result) -> CertificateMetrics | None:
+    """What was proven about the matches; None where none was certified."""
+    summary = summarise(result.diagnostics.certificates)
+    return None if summary is None else CertificateMetrics(**asdict(summary))
 
 
 def map_metrics(result: Result, residuals: ResidualMetrics, comparison: Comparison | None) -> MapMetrics:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.verdict import localisation_reasons
 from hsloc.model.estimate import Status
 from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.slam.time_offset import Headings, find_offset, offset_warning, offsets_of_log
@@ -74,9 +75,9 @@ def offset_warnings(result: Result) -> list[RunWarning]:
     if not offset.is_significant:
         return []
     # Poses are weighed with the odometry, which hides a part of the offset: the scans alone show the whole of it.
-    spec = result.request
-    found = offsets_of_log(spec.logs, spec.reading(), spec.config.graph_mapper.front_end)
-    given = spec.read.offsets_s()
+    request = result.request
+    found = offsets_of_log(request.logs, request.reading(), request.config.graph_mapper.front_end)
+    given = request.read.offsets_s()
     return [
         offset_warning(topic, each, given.get(topic.lstrip("/"), 0.0))
         for topic, each in found.items()
@@ -94,7 +95,9 @@ def verdict_reasons(result: Result, warnings: Sequence[RunWarning]) -> tuple[Ver
         elif warning.code in _VERDICTS:
             verdict = _VERDICTS[WarningCode(warning.code)]
             reasons.append(VerdictReason(verdict, warning.code, warning.text, warning.remedy))
-    if 0.0 < _share(result) < 1.0:
+    if result.states is not None:
+        reasons += localisation_reasons(result.states, result.trajectory)
+    elif 0.0 < _share(result) < 1.0:
         reasons.append(_not_localised(result))
     return tuple(reasons)
 

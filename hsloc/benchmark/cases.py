@@ -115,10 +115,10 @@ def run_method(method: Method, cases: Cases, progress: Callable[[float], None]) 
     for level, half in LEVELS.items():
         starts = cases.starts[level]
         for index in range(min(3, len(cases))):
-            method.match(cases.scans[index], _window(starts[index], half), index)
+            method.match(cases.scans[index], window_at(starts[index], half), index)
         rows = []
         for index, scan in enumerate(cases.scans):
-            window = _window(starts[index], half)
+            window = window_at(starts[index], half)
             begin = perf_counter()
             pose, evaluations = method.match(scan, window, index)
             seconds = perf_counter() - begin
@@ -143,5 +143,6 @@ def run_method(method: Method, cases: Cases, progress: Callable[[float], None]) 
     return tuple(results)
 
 
-def _window(start: F64, half: tuple[float, float]) -> Window:
+def window_at(start: F64, half: tuple[float, float]) -> Window:
+    """The window of a level (`LEVELS`) around a start (3,)."""
     return Window(Pose2.from_array(start), half[0], half[0], half[1])

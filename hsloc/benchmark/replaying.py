@@ -17,7 +17,8 @@ from hsloc.localisation.localiser import Localiser
 from hsloc.log import open_log
 from hsloc.matching import LikelihoodField
 from hsloc.replay.engine import replay
-from hsloc.replay.run import find_map, run
+from hsloc.replay.map_sources import find_map
+from hsloc.replay.run import run
 from hsloc.replay.run_history import RunHistory
 from hsloc.request import RunRequest
 
@@ -115,7 +116,9 @@ def _parts(request: RunRequest) -> dict[str, float]:
     stated = log.initial_pose()
     matcher = _Timed(config.make_matcher())
     rng = np.random.default_rng(0)
-    localiser = Localiser(grid, field, matcher, config.localiser, rng, None if stated is None else stated[1])
+    localiser = Localiser.from_parameters(
+        grid, field, matcher, config.localiser, rng, None if stated is None else stated[1]
+    )
     history = RunHistory()
     reading = 0.0
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.benchmark.cases import read_cases, run_method
+from hsloc.benchmark.certificates import measure_certificates
 from hsloc.benchmark.kernel import time_kernel, time_matches
 from hsloc.benchmark.memory import measure_memory
 from hsloc.benchmark.methods import our_methods, peers
@@ -18,6 +19,7 @@ from hsloc.benchmark.replaying import fixture, time_replay
 from hsloc.benchmark.scene import office_scene
 from hsloc.benchmark.sub_cell import measure_sub_cell
 from hsloc.benchmark.targets import Bench
+from hsloc.benchmark.whole_map import AREAS, measure_whole_map
 from hsloc.simulation.presets import OFFICE
 from hsloc.simulation.recorder import record
 from hsloc.version import __version__
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
 
     Progress = Callable[[str, float], None]
 
-PARTS = ("kernel", "match", "replay", "memory", "sub-cell", "cases")
+PARTS = ("kernel", "match", "replay", "memory", "sub-cell", "cases", "certificates", "whole-map")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +47,8 @@ class Sizes:
     """Of the short log; None: a lap of the office, 113 s."""
     sub_cell_matches: int = 100
     cases: int = 10**9
+    floor_areas: tuple[float, ...] = AREAS
+    floor_scans: int = 20
 
 
 QUICK = Sizes(
@@ -55,6 +59,8 @@ QUICK = Sizes(
     memory_seconds=3.0,
     sub_cell_matches=10,
     cases=10,
+    floor_areas=(300.0,),
+    floor_scans=3,
 )
 """A look at whether all works; the figures mean little."""
 
@@ -66,14 +72,16 @@ def run_bench(
     quick: bool = False,
     progress: Progress = lambda phase, share: None,
 ) -> Bench:
-    """Run `parts` (of `PARTS`), one after the other on one core; "cases" only where `cases` names a file.
+    """Run `parts` (of `PARTS`) in turn on one core; "cases" and "certificates" only where `cases` names a file.
 
     Raises ConfigError for a file of cases that cannot be used.
     """
     sizes = QUICK if quick else Sizes()
     bench = Bench(machine=machine(), load_after=None, quick=quick)
     # First of all: a wrong file is reported before minutes of work.
-    given = None if cases is None or "cases" not in parts else read_cases(cases).first(sizes.cases)
+    given = (
+        None if cases is None or not {"cases", "certificates"} & set(parts) else read_cases(cases).first(sizes.cases)
+    )
     if "kernel" in parts or "match" in parts:
         progress("kernel", 0.0)
         scene = office_scene()
@@ -91,7 +99,13 @@ def run_bench(
     if "sub-cell" in parts:
         progress("sub-cell", 0.0)
         bench = replace(bench, sub_cell=measure_sub_cell(sizes.sub_cell_matches))
-    if given is not None:
+    if given is not None and "certificates" in parts:
+        proofs = measure_certificates(given, lambda share: progress("certificates", share))
+        bench = replace(bench, cases_name=given.name, certificates=proofs)
+    if "whole-map" in parts:
+        searches = measure_whole_map(sizes.floor_areas, sizes.floor_scans, lambda share: progress("whole-map", share))
+        bench = replace(bench, whole_map=searches)
+    if given is not None and "cases" in parts:
         methods, notes = peers(given.grid)
         methods = our_methods(given.grid) + methods
         rows: list[CaseResult] = []

@@ -9,13 +9,20 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from hsloc.benchmark.cases import CaseResult
+    from hsloc.benchmark.certificates import CertificateResult
     from hsloc.benchmark.kernel import KernelTiming, MatchTiming
     from hsloc.benchmark.memory import Memory
     from hsloc.benchmark.replaying import ReplayTiming
     from hsloc.benchmark.sub_cell import SubCell
+    from hsloc.benchmark.whole_map import WholeMapTiming
 
 CASES = {"track": (1.0, None), "small": (1.0, 1.0), "large": (0.99, 4.0)}
 """Least success of HIDE, and most milliseconds (median)."""
+
+CERTIFICATES = {"small": (0.98, 5.0, 100.0), "large": (0.98, 20.0, 100.0)}
+"""Least share of gaps closed, most milliseconds: median and 95th percentile."""
+WHOLE_MAP = {2_000.0: 0.3, 10_000.0: 1.0, 40_000.0: 4.0}
+"""Most seconds for one scan on a floor of so many square metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +66,8 @@ class Bench:
     sub_cell: tuple[SubCell, ...] = ()
     cases_name: str = ""
     cases: tuple[CaseResult, ...] = ()
+    certificates: tuple[CertificateResult, ...] = ()
+    whole_map: tuple[WholeMapTiming, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -81,6 +90,8 @@ class Bench:
                 if self.cases
                 else {}
             ),
+            **({"certificates": [row.to_dict() for row in self.certificates]} if self.certificates else {}),
+            **({"whole_map": [row.to_dict() for row in self.whole_map]} if self.whole_map else {}),
             "targets": [target.to_dict() for target in self.targets],
             "notes": list(self.notes),
         }
@@ -112,3 +123,14 @@ def _targets(bench: Bench) -> Iterator[Target]:
             yield Target(f"HIDE on {bench.cases_name} {row.level}", 100.0 * row.success, 100.0 * success, "%", True)
             if milliseconds is not None:
                 yield Target(f"HIDE on {bench.cases_name} {row.level}, median", row.median_ms, milliseconds, "ms")
+    for certified in bench.certificates:
+        if certified.seed == "HIDE" and certified.level in CERTIFICATES:
+            optimal, median, p95 = CERTIFICATES[certified.level]
+            what = f"certificates of {bench.cases_name} {certified.level}"
+            yield Target(f"{what}, gap closed", 100.0 * certified.optimal, 100.0 * optimal, "%", True)
+            yield Target(f"{what}, median", certified.median_ms, median, "ms")
+            yield Target(f"{what}, 95 %", certified.p95_ms, p95, "ms")
+    for timing in bench.whole_map:
+        if timing.blocked == 0.0 and timing.area in WHOLE_MAP:
+            limit = WHOLE_MAP[timing.area]
+            yield Target(f"one scan on {timing.area:,.0f} m2, median", timing.median_s, limit, "s")

@@ -13,7 +13,7 @@ EXAMPLES = """
   hsloc bench kernel --json
 """
 
-_PARTS = ("kernel", "match", "replay", "memory", "sub-cell", "cases")
+_PARTS = ("kernel", "match", "replay", "memory", "sub-cell", "cases", "certificates", "whole-map")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,8 +39,9 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.evaluation.metrics import format_json
 
     parts = arguments.parts or list(_PARTS)
-    if "cases" in arguments.parts and arguments.cases is None:
-        raise ConfigError("the part cases needs a file; name an .npz with --cases")
+    for part in ("cases", "certificates"):
+        if part in arguments.parts and arguments.cases is None:
+            raise ConfigError(f"the part {part} needs a file; name an .npz with --cases")
     with ProgressLine(arguments.quiet) as line:
         bench = run_bench(parts, arguments.cases, quick=arguments.quick, progress=line.show)
     if arguments.json:
@@ -48,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     print(markdown(bench))
     if arguments.cases is None:
-        print("No --cases FILE.npz: the matching table was left out.")
+        print("No --cases FILE.npz: the tables of matching and of certificates were left out.")
     return 0
 
 

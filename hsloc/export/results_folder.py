@@ -18,6 +18,7 @@ from hsloc.errors import OutputError
 from hsloc.evaluation import write_json, write_tum
 from hsloc.export.provenance import config_text, provenance
 from hsloc.export.run_mcap import RunRecording
+from hsloc.export.states_csv import write_states
 from hsloc.maps import save_map
 from hsloc.report.html import write_report_html
 from hsloc.report.png import draw_report
@@ -96,6 +97,8 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
     seconds = {"analyse": time.perf_counter() - begin - recording.seconds, "run_mcap": recording.seconds}
     begin = time.perf_counter()
     write_tum(folder / "trajectory.tum", result.trajectory)
+    if result.states is not None:
+        write_states(folder / "states.csv", result.trajectory.stamps_ns, result.states)
     if len(result.odometry):
         write_tum(folder / "odometry.tum", result.odometry)
     if result.reference is not None:

@@ -7,23 +7,34 @@ While the pose is unknown the relocaliser has the word.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import radians
-from typing import TYPE_CHECKING
+from math import hypot, radians
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from hsloc.localisation.motion import OdometryNoise, fuse, predict_covariance
-from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters, Verdict
+from hsloc.localisation.match_gate import MatchGate, MatchLimits
+from hsloc.localisation.motion import normalised_innovation, predict_covariance, update_with_information
+from hsloc.localisation.motion_gate import MotionGate
+from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, OdometryNoise, OmnidirectionalNoise
+from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
+from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
+from hsloc.localisation.track_monitor import TrackMonitor
+from hsloc.matching.certificate import CertificateParameters, certify
+from hsloc.matching.exact import heuristic
+from hsloc.matching.local_refinement import refine
+from hsloc.matching.observability import match_information
 from hsloc.matching.window import Window
-from hsloc.model.estimate import Estimate, Status
+from hsloc.model.estimate import Estimate, Evidence, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY, Pose2
-from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive, Ratio
+from hsloc.parameters import Angle, Count, NonNegative, OneOf, Parameters, Positive, Ratio
 
 if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
+    from hsloc.localisation.global_search import GlobalSearch, RelocaliserResult
+    from hsloc.localisation.motion_models import MotionModel
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Match, Matcher
     from hsloc.model.occupancy_grid import OccupancyGrid
@@ -59,36 +70,76 @@ class LocaliserParameters(Parameters):
     """Half-width in heading of the window that is searched after a refused match [rad]."""
     max_consecutive_rejections: Count = 5
     """Number of refused matches in a row after which the pose counts as lost and the whole map is searched."""
+    refine_first: bool = True
+    """Whether the optimum next to the prediction is taken where it fits as well as usual; otherwise always a search."""
     fuse: bool = True
     """Whether match and prediction are weighted by their covariances (EKF); otherwise the match is taken, as in [P]."""
     initial_sigma: Positive = 0.5
     """Standard deviation of a given initial pose in x and y [m]."""
     initial_sigma_angle: Positive = radians(15.0)
     """Standard deviation of a given initial pose in heading [rad]."""
+    certify: bool = False
+    """Whether each match is followed by a proof that no pose of its window is fitter."""
+    certificate: CertificateParameters = field(default_factory=CertificateParameters)
+    motion_model: Annotated[str, OneOf(MOTION_MODELS)] = "differential"
+    """How the base moves, which chooses its odometry noise: differential drive, car-like, or in any direction."""
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
+    ackermann_noise: AckermannNoise = field(default_factory=AckermannNoise)
+    omnidirectional_noise: OmnidirectionalNoise = field(default_factory=OmnidirectionalNoise)
     relocaliser: RelocaliserParameters = field(default_factory=RelocaliserParameters)
+    place_check: PlaceCheckParameters = field(default_factory=PlaceCheckParameters)
+    lost_probability: Ratio = 0.99
+    """Probability of having gone astray from which the whole map is searched, where another place fits as well."""
+
+    def noise(self) -> MotionModel:
+        """The noise of the motion model that is chosen."""
+        models: dict[str, MotionModel] = {
+            "differential": self.odometry_noise,
+            "ackermann": self.ackermann_noise,
+            "omnidirectional": self.omnidirectional_noise,
+        }
+        return models[self.motion_model]
+
+    def match_limits(self) -> MatchLimits:
+        """The limits of the match gate."""
+        return MatchLimits(
+            min_fitness=self.min_fitness,
+            min_fitness_ratio=self.min_fitness_ratio,
+            recovery_fitness_ratio=self.recovery_fitness_ratio,
+        )
 
 
-_BETTER = 0.1
-"""So much fitter must a match outside the window of the prediction be: ambiguous places look alike."""
-_FORGET = 0.05
-"""Weight of a new match in the usual fitness."""
+_AS_USUAL = 0.98
+"""Ratio to the usual fitness from which the optimum next to the prediction is taken without a search."""
+_EXCESS_GAIN = 0.1
+"""Gain of the running mean of squared innovations by their expected ones: it follows within about ten matches."""
+_MOST_EXCESS = 10.0
+"""One innovation counts for at most this multiple of its expected square: a slip is not noise."""
 
 
 class Localiser:
-    """State: `T_map_odom`, the covariance, and the odometry at the last match. An `Estimator`."""
+    """State: `T_map_odom`, the covariance, and the odometry at the last match. An `Estimator`.
+
+    Matcher, motion model and global search are what their protocols ask for; `from_parameters` makes the usual ones.
+    """
 
     def __init__(
         self,
-        grid: OccupancyGrid,
         likelihood: LikelihoodField,
         matcher: Matcher,
+        search: GlobalSearch,
+        motion_model: MotionModel,
         parameters: LocaliserParameters,
         rng: Generator,
         initial_pose: Pose2 | None = None,
+        *,
+        place_check: PlaceCheck | None = None,
     ) -> None:
+        self._monitor = None if place_check is None else TrackMonitor(place_check)
         self._field = likelihood
         self._matcher = matcher
+        self._global_search = search
+        self._motion_model = motion_model
         self._parameters = parameters
         self._rng = rng
         self._count = 0
@@ -99,13 +150,32 @@ class Localiser:
         self._covariance = np.diag(
             (parameters.initial_sigma**2, parameters.initial_sigma**2, parameters.initial_sigma_angle**2)
         )
-        self._usual: float | None = None
-        self._rejected = 0
-        self._start_given = initial_pose is not None
-        self._relocaliser = Relocaliser(
-            grid, likelihood, matcher, parameters.relocaliser, parameters.odometry_noise, rng
-        )
+        self._excess = 1.0
+        # Where a proof is asked for, the optimum next to the prediction has none.
+        proves = parameters.certify or heuristic(matcher) is not matcher
+        self._refines = parameters.refine_first and not proves
+        self._motion_gate = MotionGate(parameters.update_min_d, parameters.update_min_a)
+        self._match_gate = MatchGate(parameters.match_limits())
         self._searching = initial_pose is None
+
+    @classmethod
+    def from_parameters(
+        cls,
+        grid: OccupancyGrid,
+        likelihood: LikelihoodField,
+        matcher: Matcher,
+        parameters: LocaliserParameters,
+        rng: Generator,
+        initial_pose: Pose2 | None = None,
+    ) -> Localiser:
+        """With the relocaliser and the motion model that the parameters name; `initial_pose` None is unknown."""
+        noise = parameters.noise()
+        p = parameters.place_check
+        check = PlaceCheck(grid, likelihood, p) if p.interval > 0.0 else None
+        search = Relocaliser(
+            grid, likelihood, heuristic(matcher), parameters.relocaliser, noise, rng, place_check=check
+        )
+        return cls(likelihood, matcher, search, noise, parameters, rng, initial_pose, place_check=check)
 
     @property
     def T_map_odom(self) -> Pose2:
@@ -138,55 +208,101 @@ class Localiser:
         p = self._parameters
         motion = (self._T_odom_match or T_odom_base).between(T_odom_base)
         predicted = self._T_map_match @ motion
-        first = self._usual is None and self._rejected == 0
-        if not first and np.hypot(motion.x, motion.y) < p.update_min_d and abs(motion.theta) < p.update_min_a:
+        if not self._match_gate.is_fresh and not self._motion_gate.is_open(motion):
             return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
-        covariance = predict_covariance(
-            self._covariance, self._T_map_match, motion, p.odometry_noise.covariance(motion)
-        )
+        noise = self._motion_model.covariance(motion)
+        covariance = predict_covariance(self._covariance, self._T_map_match, motion, noise)
         points = paired.points_base()
+        if self._monitor is not None:
+            self._monitor.move(hypot(motion.x, motion.y))
         if len(points) < p.min_points:
             self._take(predicted, covariance, T_odom_base)
-            return Estimate(scan.stamp_ns, predicted, Status.NO_RETURNS, covariance, reason=f"{len(points)} returns")
+            reason = f"{len(points)} returns"
+            evidence = None if self._monitor is None else self._monitor.skipped()
+            covariance = self._reported(covariance)
+            return Estimate(scan.stamp_ns, predicted, Status.NO_RETURNS, covariance, reason=reason, evidence=evidence)
         match, evaluations = self._match(points, predicted, covariance)
-        reason = self._refusal(match)
+        reason = self._match_gate.refusal(match.fitness)
         if reason:
             return self._refuse(paired, predicted, covariance, match, evaluations, reason)
-        pose, covariance = (
-            fuse(predicted, covariance, match.pose, match.covariance) if p.fuse else (match.pose, match.covariance)
-        )
-        self._rejected = 0
-        self._usual = match.fitness if self._usual is None else self._usual + _FORGET * (match.fitness - self._usual)
+        information = match_information(points, self._field, match.pose)
+        if p.fuse:
+            self._weigh_innovation(predicted, covariance, match.pose, information)
+            pose, covariance = update_with_information(predicted, covariance, match.pose, information)
+        else:
+            pose, covariance = match.pose, match.covariance
+        self._match_gate.accept(match.fitness)
         self._take(pose, covariance, T_odom_base)
-        return Estimate(scan.stamp_ns, pose, Status.MATCHED, covariance, match.fitness, evaluations)
+        evidence = None if self._monitor is None else self._monitor.matched(paired, pose, points)
+        status, reason = Status.MATCHED, ""
+        if self._monitor is not None and evidence is not None and self._monitor.is_astray(evidence, p.lost_probability):
+            status = Status.SEARCHING
+            reason = f"lost: the map explains {evidence.explained:.2f}, another place fits {evidence.rival:.2f} times"
+            self._lose()
+        return Estimate(
+            scan.stamp_ns,
+            pose,
+            status,
+            self._reported(covariance),
+            match.fitness,
+            evaluations,
+            reason,
+            evidence=evidence,
+            certificate=match.certificate,
+        )
+
+    def _lose(self) -> None:
+        """The pose is unknown from now on: search."""
+        self._searching = True
+        self._search_began = self._count
+        self._global_search.start(None if self._monitor is None else self._monitor.usual_explained)
+
+    def _weigh_innovation(self, predicted: Pose2, covariance: F64, measured: Pose2, information: F64) -> None:
+        """Follow how large innovations really are; covariances that are reported grow with them.
+
+        What grows is not the weight of the odometry or of the match: which of the two is worse than assumed, an
+        innovation does not tell. (Where the odometry's noise was scaled, the matches pulled the pose from door to door
+        in the corridors of Wean Hall.)
+        """
+        squared, freedom = normalised_innovation(predicted, covariance, measured, information)
+        if freedom > 0.0:
+            self._excess += _EXCESS_GAIN * (min(squared / freedom, _MOST_EXCESS) - self._excess)
+
+    def _reported(self, covariance: F64) -> F64:
+        """A covariance with the scale of the innovations; never smaller than the filter's."""
+        return max(self._excess, 1.0) * covariance
 
     def _match(self, points: F64, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
         """Match in the window of the prediction; a refused match may give way to one in a wider window."""
         p = self._parameters
         window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
-        best = self._matcher.match(points, self._field, window, self._rng)
-        evaluations = best.evaluations
-        if self._usual is not None and self._refusal(best):
+        usual = self._match_gate.usual
+        evaluations = 0
+        if self._refines and usual is not None:
+            refined = refine(points, self._field, window)
+            if refined.fitness >= _AS_USUAL * usual and self._match_gate.refusals == 0:
+                return refined, refined.evaluations
+            evaluations = refined.evaluations
+        best = self._match_in(points, window)
+        evaluations += best.evaluations
+        if usual is not None and self._match_gate.refusal(best.fitness):
             wide = Window(
                 predicted,
                 max(window.half_x, p.wide_window),
                 max(window.half_y, p.wide_window),
                 max(window.half_theta, p.wide_window_angle),
             )
-            match = self._matcher.match(points, self._field, wide, self._rng)
+            match = self._match_in(points, wide)
             evaluations += match.evaluations
-            if match.fitness >= max(best.fitness + _BETTER, p.recovery_fitness_ratio * self._usual):
+            if self._match_gate.is_recovered(best.fitness, match.fitness):
                 best = match
         return best, evaluations
 
-    def _refusal(self, match: Match) -> str:
-        """Why a match is not believed; empty if it is."""
-        p = self._parameters
-        if match.fitness < p.min_fitness:
-            return f"fitness {match.fitness:.2f} below {p.min_fitness:.2f}"
-        if self._usual is not None and match.fitness < p.min_fitness_ratio * self._usual:
-            return f"fitness {match.fitness:.2f} far below the usual {self._usual:.2f}"
-        return ""
+    def _match_in(self, points: F64, window: Window) -> Match:
+        match = self._matcher.match(points, self._field, window, self._rng)
+        if self._parameters.certify and match.certificate is None:
+            return certify(match, points, self._field, window, self._parameters.certificate)
+        return match
 
     def _refuse(
         self,
@@ -198,44 +314,52 @@ class Localiser:
         reason: str,
     ) -> Estimate:
         """The prediction stands; after too many refusals the pose is lost."""
-        self._rejected += 1
+        refusals = self._match_gate.refuse()
+        p = self._parameters
+        # The window for slip is taken for three standard deviations of a slip.
+        covariance = covariance + np.diag((p.wide_window**2, p.wide_window**2, p.wide_window_angle**2)) / 9.0
         self._take(predicted, covariance, paired.T_odom_base)
         status = Status.REJECTED
-        if self._rejected >= self._parameters.max_consecutive_rejections:
-            self._searching = True
-            self._search_began = self._count
-            self._relocaliser.start()
+        if refusals >= self._parameters.max_consecutive_rejections:
+            self._lose()
             status, reason = Status.SEARCHING, f"lost: {reason}"
-        return Estimate(paired.scan.stamp_ns, predicted, status, covariance, match.fitness, evaluations, reason)
+        covariance = self._reported(covariance)
+        evidence = None if self._monitor is None else self._monitor.refused()
+        return Estimate(
+            paired.scan.stamp_ns, predicted, status, covariance, match.fitness, evaluations, reason, evidence=evidence
+        )
 
     def _search(self, paired: PairedScan) -> Estimate:
         """Let the relocaliser see the scan; take its answer when it is sure."""
         scan, T_odom_base = paired.scan, paired.T_odom_base
-        verdict = self._relocaliser.update(paired, self._count)
-        pose = self._T_map_odom @ T_odom_base if verdict.pose is None else verdict.pose
+        result = self._global_search.update(paired, self._count)
+        pose = self._T_map_odom @ T_odom_base if result.pose is None else result.pose
         status = Status.SEARCHING
-        if verdict.is_sure:
+        if result.is_sure:
             self._searching = False
-            self._rejected = 0
-            self._usual = verdict.fitness
+            self._match_gate.restart(result.fitness)
+            if self._monitor is not None:
+                self._monitor.begin()
             status = Status.RELOCALISED
-        self._take(pose, self._covariance if verdict.covariance is None else verdict.covariance, T_odom_base)
+        self._take(pose, self._covariance if result.covariance is None else result.covariance, T_odom_base)
         return Estimate(
             scan.stamp_ns,
             pose,
             status,
-            verdict.covariance,
-            verdict.fitness,
-            verdict.evaluations,
-            verdict.reason,
-            self._revision(verdict),
+            result.covariance,
+            result.fitness,
+            result.evaluations,
+            result.reason,
+            self._revision(result),
+            None if result.is_sure else result.state,
+            None if self._monitor is None else result.evidence or Evidence(0.0),
         )
 
-    def _revision(self, verdict: Verdict) -> tuple[tuple[int, Pose2], ...]:
+    def _revision(self, result: RelocaliserResult) -> tuple[tuple[int, Pose2], ...]:
         """The winner's way since the search began; its first pose holds back to that moment, if it goes back so far."""
-        if not verdict.track or not verdict.track_is_whole:
-            return verdict.track
-        (_, first), *rest = verdict.track
+        if not result.track or not result.track_is_whole:
+            return result.track
+        (_, first), *rest = result.track
         return ((self._search_began, first), *rest)
 
     def _take(self, pose: Pose2, covariance: F64, T_odom_base: Pose2) -> None:

@@ -1,61 +1,21 @@
-"""How uncertain a motion is that odometry tells: the prediction step of the EKF."""
+"""The covariances of an extended Kalman filter over poses: prediction and update."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import atan2, cos, hypot, pi, sin
+from math import cos, sin
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.model.pose2 import Pose2, wrap_angle
-from hsloc.parameters import NonNegative, Parameters
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     F64 = NDArray[np.float64]
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OdometryNoise(Parameters):
-    """The odometry motion model of *Probabilistic Robotics* (Thrun, Burgard, Fox; 5.4), names as in AMCL.
-
-    A motion is a turn, a straight line and a turn; their variances are `alpha1 rot^2 + alpha2 trans^2` (both turns)
-    and `alpha3 trans^2 + alpha4 (rot1^2 + rot2^2)`. The defaults mean a robot that nobody calibrated: 10 % of the way,
-    20 % of a turn. (With 20 % of the way the matches pull the pose from door to door in the corridors of Wean Hall.)
-    """
-
-    alpha1: NonNegative = 0.04
-    """Variance of a rotation per squared rotation [rad^2 / rad^2]."""
-    alpha2: NonNegative = 0.02
-    """Variance of a rotation per squared translation [rad^2 / m^2]."""
-    alpha3: NonNegative = 0.01
-    """Variance of a translation per squared translation [m^2 / m^2]."""
-    alpha4: NonNegative = 0.01
-    """Variance of a translation per squared rotation [m^2 / rad^2]."""
-
-    def covariance(self, motion: Pose2) -> F64:
-        """Covariance (3, 3) of a motion, in the frame in which it began.
-
-        For a robot that drove backwards the first turn is taken from its back, as in AMCL.
-        """
-        trans = hypot(motion.x, motion.y)
-        rot1 = atan2(motion.y, motion.x) if trans > 0.01 else 0.0
-        rot2 = wrap_angle(motion.theta - rot1)
-        turn1, turn2 = _shortest(rot1), _shortest(rot2)
-        var1 = self.alpha1 * turn1**2 + self.alpha2 * trans**2
-        var2 = self.alpha1 * turn2**2 + self.alpha2 * trans**2
-        var_trans = self.alpha3 * trans**2 + self.alpha4 * (turn1**2 + turn2**2)
-        c, s = cos(rot1), sin(rot1)
-        jacobian = np.array(((-s * trans, c, 0.0), (c * trans, s, 0.0), (1.0, 0.0, 1.0)))
-        covariance: F64 = jacobian @ np.diag((var1, var_trans, var2)) @ jacobian.T
-        return covariance
-
-
-def _shortest(turn: float) -> float:
-    """A turn, or what it lacks to half a turn: driving backwards is no turn."""
-    return min(abs(turn), abs(pi - abs(turn)))
+__all__ = ["OdometryNoise", "fuse", "predict_covariance"]
 
 
 def predict_covariance(covariance: F64, pose: Pose2, motion: Pose2, motion_covariance: F64) -> F64:
@@ -82,3 +42,33 @@ def fuse(prediction: Pose2, covariance: F64, measured: Pose2, measured_covarianc
     pose = Pose2.from_array(prediction.to_array() + gain @ innovation)
     updated = (np.eye(3) - gain) @ covariance
     return pose, 0.5 * (updated + updated.T)
+
+
+def update_with_information(prediction: Pose2, covariance: F64, measured: Pose2, information: F64) -> tuple[Pose2, F64]:
+    """The EKF's update with a measured pose of which `information` (3, 3) is known: `K = (I + P L)^-1 P L`.
+
+    Where the information is zero the prediction stays as it is, and so does its variance.
+    """
+    updated = np.linalg.solve(np.eye(3) + covariance @ information, covariance)
+    updated = 0.5 * (updated + updated.T)
+    pose = Pose2.from_array(prediction.to_array() + updated @ information @ difference(measured, prediction))
+    return pose, updated
+
+
+def normalised_innovation(prediction: Pose2, covariance: F64, measured: Pose2, information: F64) -> tuple[float, float]:
+    """Squared innovation by its expected covariance, and its degrees of freedom.
+
+    Directions that are not measured count for none.
+
+    With `P` the covariance of the prediction and `L` the information of the measurement the innovation's covariance is
+    `P + L^-1`, its inverse `L (I + P L)^-1`, and the degrees of freedom are the trace of the gain.
+    """
+    gain = np.linalg.solve(np.eye(3) + covariance @ information, covariance @ information)
+    weight = information @ np.linalg.inv(np.eye(3) + covariance @ information)
+    innovation = difference(measured, prediction)
+    return float(innovation @ weight @ innovation), float(np.trace(gain))
+
+
+def difference(pose: Pose2, other: Pose2) -> F64:
+    """x, y and theta (wrapped) of a pose less those of another, shape (3,)."""
+    return np.array((pose.x - other.x, pose.y - other.y, wrap_angle(pose.theta - other.theta)))

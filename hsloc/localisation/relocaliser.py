@@ -14,14 +14,20 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
-from math import floor, hypot, pi, radians
+from itertools import pairwise
+from math import hypot, pi, radians
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.global_search import RelocaliserResult
+from hsloc.localisation.hypotheses import Hypothesis, Places, fits_better, tiles
 from hsloc.localisation.motion import fuse, predict_covariance
+from hsloc.localisation.motion_gate import MotionGate
+from hsloc.localisation.track_evidence import MOST_FROM_RIVAL, USUAL_EXPLAINED, fit_evidence, rival_evidence
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.window import Window
+from hsloc.model.estimate import Evidence, State
 from hsloc.model.pose2 import Pose2, wrap_angle
 from hsloc.parameters import Count, NonNegative, Parameters, Positive, Ratio
 
@@ -29,7 +35,8 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from hsloc.localisation.motion import OdometryNoise
+    from hsloc.localisation.motion_models import MotionModel
+    from hsloc.localisation.place_check import PlaceCheck
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
     from hsloc.model.events import PairedScan
@@ -68,52 +75,37 @@ class RelocaliserParameters(Parameters):
     """Minimum difference between the summed fitness of an accepted hypothesis and that of any other."""
     drop: NonNegative = 2.5
     """Difference to the best summed fitness at which a hypothesis is dropped."""
+    max_rival_ratio: Ratio = 0.93
+    """Maximum ratio of another hypothesis's mean fitness to that of an accepted one, unless the paired test passes."""
+    keep_ratio: Ratio = 0.85
+    """Ratio to the best mean fitness from which a hypothesis is kept, however far its sum falls behind."""
+    confidence: Ratio = 0.99
+    """Confidence of the paired test that an accepted hypothesis fits better than every other one."""
+    min_evidence: NonNegative = 4.0
+    """Minimum logarithm of the odds that its scans and the whole map give an accepted hypothesis."""
+    renew_distance: Positive = 3.0
+    """Path length after which the whole map is searched again while no hypothesis fits [m]."""
     restart_below: Ratio = 0.3
     """Mean fitness of the best hypothesis below which the search starts again."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Verdict:
-    """What the relocaliser thinks after a scan."""
-
-    pose: Pose2 | None
-    covariance: F64 | None
-    fitness: float | None
-    evaluations: int
-    is_sure: bool
-    reason: str
-    track: tuple[tuple[int, Pose2], ...] = ()
-    """Once it is sure: the way since the search began, as (odometry messages before, T_map_odom)."""
-    track_is_whole: bool = False
-    """Whether the track goes back to the first scan of the search."""
-
-
-@dataclass(slots=True, eq=False)
-class _Hypothesis:
-    pose: Pose2
-    covariance: F64
-    fitness: float
-    total: float
-    scans: int
-
-    @property
-    def mean(self) -> float:
-        return self.total / self.scans
-
-
-_NEAR = 0.5
-_NEAR_ANGLE = radians(15.0)
 _STEP_WINDOW = (0.25, radians(8.0))
-_FITS = 0.5
-"""Going backwards, a scan fits with so large a part of the winner's fitness."""
-_TRACE_LOST = 5
+_FITS = 0.8
+"""Going backwards, a scan fits with at least this part of the winner's fitness."""
+_WEIGHED = 12
+"""Scans that the winner is weighed by, at most."""
+_FULL_M = 3.0
+"""Comparisons with other places count in full over this path length (m): on the spot one view is repeated."""
+_OFF_MAP = 0.87
+"""Explained fitness by the usual one below which the best place does not fit."""
+_TRACE_LOST = 3
 """Scans in a row that fit nowhere near, going backwards: before them the robot was elsewhere, or is not known."""
 REMEMBERED = 1000
 """Scans of a search that are kept to retrace the way; older ones are forgotten, so that memory is bounded."""
 
 
 class Relocaliser:
-    """Searches the whole map; its state is a list of hypotheses."""
+    """A `GlobalSearch` by tiles; its state is a list of hypotheses."""
 
     def __init__(
         self,
@@ -121,44 +113,58 @@ class Relocaliser:
         likelihood: LikelihoodField,
         matcher: Matcher,
         parameters: RelocaliserParameters,
-        noise: OdometryNoise,
+        motion_model: MotionModel,
         rng: Generator,
+        *,
+        place_check: PlaceCheck | None = None,
     ) -> None:
+        self._check = place_check
+        self._path_length = 0.0
+        self._renewed_at = 0.0
+        self._explained: float | None = None
+        self._usual = USUAL_EXPLAINED
         self._field = likelihood
         self._matcher = matcher
         self._parameters = parameters
-        self._noise = noise
+        self._motion_model = motion_model
+        self._gate = MotionGate(parameters.step_min_d, parameters.step_min_a)
         self._rng = rng
-        self._tiles = _tiles(grid, self._parameters.tile)
-        self._hypotheses: list[_Hypothesis] = []
+        self._tiles = tiles(grid, self._parameters.tile)
+        self._hypotheses: list[Hypothesis] = []
         self._T_odom_last: Pose2 | None = None
-        self._seen: deque[tuple[int, F64, Pose2]] = deque(maxlen=REMEMBERED)
+        self._seen: deque[tuple[int, F64, PairedScan]] = deque(maxlen=REMEMBERED)
 
-    def start(self) -> None:
-        """Forget everything."""
+    def start(self, usual_explained: float | None = None) -> None:
+        """See `GlobalSearch`."""
+        self._usual = USUAL_EXPLAINED if usual_explained is None else usual_explained
         self._hypotheses = []
         self._T_odom_last = None
+        self._explained = None
         self._seen.clear()
 
-    def update(self, paired: PairedScan, odometry_count: int) -> Verdict:
+    def update(self, paired: PairedScan, odometry_count: int) -> RelocaliserResult:
         """Take a scan, and how many odometry messages there were until now."""
         p = self._parameters
         T_odom_base = paired.T_odom_base
         motion = Pose2() if self._T_odom_last is None else self._T_odom_last.between(T_odom_base)
-        moved = hypot(motion.x, motion.y) >= p.step_min_d or abs(motion.theta) >= p.step_min_a
-        if self._hypotheses and not moved:
+        if self._hypotheses and not self._gate.is_open(motion):
             return self._verdict(motion, 0, False)
         points = paired.points_base()
         if len(points) < p.min_points:
             return self._verdict(motion, 0, False)
         self._T_odom_last = T_odom_base
-        self._seen.append((odometry_count, points, T_odom_base))
+        self._seen.append((odometry_count, points, paired))
         if self._hypotheses and self._hypotheses[0].mean < p.restart_below:
             self._hypotheses = []
         evaluations = self._advance(points, motion)
         scans = self._hypotheses[0].scans if self._hypotheses else 1
+        self._path_length += hypot(motion.x, motion.y)
         if scans <= p.seed_scans:
             evaluations += self._seed(points, scans)
+            self._renewed_at = self._path_length
+        elif self._path_length - self._renewed_at >= p.renew_distance:
+            self._renewed_at = self._path_length
+            evaluations += self._renew(points, paired, scans)
         self._keep()
         return self._verdict(Pose2(), evaluations, True)
 
@@ -171,10 +177,26 @@ class Relocaliser:
         poses, fitness, evaluations = self._search(points, windows)
         unsure = np.diag(np.square(half))
         self._hypotheses += [
-            _Hypothesis(pose, unsure, float(fit), float(fit) * scans, scans)
+            Hypothesis(pose, unsure, float(fit), float(fit) * scans, scans, [float(fit)])
             for pose, fit in zip(poses, fitness, strict=True)
         ]
         return evaluations
+
+    def _renew(self, points: F64, paired: PairedScan, scans: int) -> int:
+        """While no hypothesis fits, look at the whole map again: the robot may have come back to it only now."""
+        best = self._hypotheses[0]
+        poor = self._explained is not None and self._explained < _OFF_MAP * self._usual
+        if self._check is None or not poor:
+            return 0
+        joined = [(seen.T_odom_base, self._check.few(p)) for _, p, seen in list(self._seen)[-_WEIGHED:]]
+        found = self._check.fittest(joined, paired.T_odom_base, best.mean)
+        if found is None:
+            return 0
+        half, half_angle = _STEP_WINDOW
+        match = self._matcher.match(points, self._field, Window(found, half, half, half_angle), self._rng)
+        fitness = match.fitness
+        self._hypotheses.append(Hypothesis(match.pose, match.covariance, fitness, fitness * scans, scans, [fitness]))
+        return match.evaluations
 
     def _search(self, points: F64, windows: list[Window]) -> tuple[list[Pose2], F64, int]:
         """The fittest pose in each window, how fit, and the evaluations spent."""
@@ -189,7 +211,7 @@ class Relocaliser:
         """Move the hypotheses with the odometry and match them again."""
         evaluations = 0
         half, half_angle = _STEP_WINDOW
-        spread = 3.0 * np.sqrt(np.diag(self._noise.covariance(motion)))
+        spread = 3.0 * np.sqrt(np.diag(self._motion_model.covariance(motion)))
         half = max(half, float(spread[:2].max()))
         half_angle = max(half_angle, float(spread[2]))
         quick = self._quick_matcher()
@@ -202,49 +224,118 @@ class Relocaliser:
             hypothesis.fitness = match.fitness
             hypothesis.total += match.fitness
             hypothesis.scans += 1
+            hypothesis.history.append(match.fitness)
         return evaluations
 
     def _keep(self) -> None:
         """Drop the hypotheses that fell behind, merge those that met: of each place the best stays."""
         p = self._parameters
         self._hypotheses.sort(key=lambda h: -h.total)
-        taken = _Places()
-        kept: list[_Hypothesis] = []
+        taken = Places()
+        kept: list[Hypothesis] = []
         for hypothesis in self._hypotheses:
-            if len(kept) >= p.hypotheses or hypothesis.total < self._hypotheses[0].total - p.drop:
+            best = self._hypotheses[0]
+            behind = hypothesis.total < best.total - p.drop and hypothesis.mean < p.keep_ratio * best.mean
+            if len(kept) >= p.hypotheses or behind:
                 break
             if taken.add(hypothesis.pose):
                 kept.append(hypothesis)
         self._hypotheses = kept
 
-    def _verdict(self, motion: Pose2, evaluations: int, fresh: bool) -> Verdict:
+    def _verdict(self, motion: Pose2, evaluations: int, fresh: bool) -> RelocaliserResult:
         if not self._hypotheses:
-            return Verdict(None, None, None, evaluations, False, "searching the whole map")
+            return RelocaliserResult(None, None, None, evaluations, False, "searching the whole map")
         p = self._parameters
         best = self._hypotheses[0]
-        lead = best.total - self._hypotheses[1].total if len(self._hypotheses) > 1 else p.drop
-        sure = fresh and best.scans >= p.min_scans and best.mean >= p.min_fitness and lead >= p.min_margin
+        alone = len(self._hypotheses) == 1
+        lead = p.drop if alone else best.total - self._hypotheses[1].total
+        ratio = 0.0 if alone else self._hypotheses[1].mean / max(best.mean, 1e-9)
+        ahead = len(best.history) >= p.min_scans and best.mean >= p.min_fitness and lead >= p.min_margin
+        pose = best.pose @ motion
         reason = f"{len(self._hypotheses)} hypotheses, best {best.mean:.2f}, lead {lead:.2f}, {best.scans} scans"
-        covariance = best.covariance if sure else None
-        fitness = best.fitness if fresh else None
+        evidence: Evidence | None = None
+        state = self._state(best, pose) if fresh else State.LOST
+        proven = fresh and ahead and self._is_proven(best)
+        sure = proven or (fresh and ahead and ratio <= p.max_rival_ratio)
+        if sure and self._check is not None:
+            evidence = self._weigh(best, motion)
+            of_rivals = MOST_FROM_RIVAL if proven else max(rival_evidence(ratio), 0.0)
+            others = min(evidence.distance / _FULL_M, 1.0) * (of_rivals + rival_evidence(evidence.rival))
+            sure = others + min(fit_evidence(evidence, self._usual), 0.0) >= p.min_evidence
         track, whole = self._retrace(best, motion) if sure else ((), False)
-        return Verdict(best.pose @ motion, covariance, fitness, evaluations, sure, reason, track, whole)
+        return RelocaliserResult(
+            pose,
+            best.covariance if sure else None,
+            best.fitness if fresh else None,
+            evaluations,
+            sure,
+            reason,
+            track,
+            whole,
+            state,
+            evidence if sure else None,
+        )
 
-    def _retrace(self, winner: _Hypothesis, motion: Pose2) -> tuple[tuple[tuple[int, Pose2], ...], bool]:
+    def _is_proven(self, best: Hypothesis) -> bool:
+        """Whether the best fits better than each other one in a paired t-test over blocks of scans."""
+        confidence = self._parameters.confidence
+        others = self._hypotheses[1:]
+        return all(fits_better(best.history, other.history, confidence) for other in others) if others else False
+
+    def _state(self, best: Hypothesis, pose: Pose2) -> State:
+        """Why it is not sure: the best place does not fit, or several do."""
+        p = self._parameters
+        if self._check is not None and self._seen:
+            said = self._check.explain(self._seen[-1][2], pose).fitness
+            self._explained = said if self._explained is None else self._explained + 0.3 * (said - self._explained)
+        if best.scans < p.min_scans:
+            return State.LOST
+        if self._explained is not None and self._explained < _OFF_MAP * self._usual:
+            return State.OFF_MAP
+        alike = sum(hypothesis.mean >= p.max_rival_ratio * best.mean for hypothesis in self._hypotheses)
+        return State.AMBIGUOUS if alike > 1 else State.LOST
+
+    def _weigh(self, winner: Hypothesis, motion: Pose2) -> Evidence:
+        """What the last scans say for the winner: how the map explains them, and whether another place fits as well."""
+        assert self._check is not None
+        traced = self._trace(winner, motion, _WEIGHED)
+        said = [self._check.explain(paired, pose) for _, pose, paired, _ in traced]
+        scans = [(pose, self._check.few(paired.points_base())) for _, pose, paired, _ in traced]
+        path = sum(a[1].distance(b[1]) for a, b in pairwise(traced))
+        means = np.mean([(e.fitness, e.short, e.through, e.unmapped) for e in said], axis=0)
+        rival = self._check.rival(scans, winner.pose @ motion)
+        return Evidence(path, float(means[0]), float(means[1]), float(means[2]), float(means[3]), rival)
+
+    def _retrace(self, winner: Hypothesis, motion: Pose2) -> tuple[tuple[tuple[int, Pose2], ...], bool]:
         """The scans seen while searching, localised backwards from where the robot is now known to be.
 
         As far as they fit, and whether that is all of them: where several in a row do not, the trace is lost.
         """
-        half, half_angle = _STEP_WINDOW
-        pose, covariance = winner.pose @ motion, winner.covariance
+        traced = self._trace(winner, motion, REMEMBERED)
         fits = max(self._parameters.min_fitness, _FITS * winner.fitness)
         track: list[tuple[int, Pose2]] = []
         misses = 0
+        for count, pose, paired, fitness in traced:
+            misses = 0 if fitness >= fits else misses + 1
+            track.append((count, pose @ paired.T_odom_base.inverse()))
+            if misses == _TRACE_LOST:
+                return tuple(reversed(track[:-misses])), False
+        whole = len(self._seen) < REMEMBERED
+        return tuple(reversed(track[: len(track) - misses])), whole and misses == 0
+
+    def _trace(self, winner: Hypothesis, motion: Pose2, most: int) -> list[tuple[int, Pose2, PairedScan, float]]:
+        """(odometry messages before, T_map_base, scan, fitness) of the last scans, backwards; ends where none fits."""
+        half, half_angle = _STEP_WINDOW
+        pose, covariance = winner.pose @ motion, winner.covariance
+        fits = max(self._parameters.min_fitness, _FITS * winner.fitness)
+        traced: list[tuple[int, Pose2, PairedScan, float]] = []
+        misses = 0
         T_odom_next: Pose2 | None = None
-        for count, points, T_odom_base in reversed(self._seen):
+        for count, points, paired in reversed(self._seen):
+            T_odom_base = paired.T_odom_base
             if T_odom_next is not None:
                 motion = T_odom_next.between(T_odom_base)
-                covariance = predict_covariance(covariance, pose, motion, self._noise.covariance(motion))
+                covariance = predict_covariance(covariance, pose, motion, self._motion_model.covariance(motion))
                 pose = pose @ motion
             T_odom_next = T_odom_base
             match = self._matcher.match(points, self._field, Window(pose, half, half, half_angle), self._rng)
@@ -252,10 +343,10 @@ class Relocaliser:
             if match.fitness >= fits:
                 pose, covariance = fuse(pose, covariance, match.pose, match.covariance)
                 misses = 0
-            track.append((count, pose @ T_odom_base.inverse()))
-            if misses == _TRACE_LOST:
-                return tuple(reversed(track[:-misses])), False
-        return tuple(reversed(track)), len(self._seen) < REMEMBERED
+            traced.append((count, pose, paired, match.fitness))
+            if misses == _TRACE_LOST or len(traced) == most:
+                break
+        return traced
 
     def _quick_matcher(self) -> HarmonySearch | Matcher:
         """The matcher with a small budget and one restart; a matcher without a budget stays as it is."""
@@ -269,39 +360,3 @@ class Relocaliser:
                 polish_iterations=10,
             )
         return self._matcher
-
-
-class _Places:
-    """Poses that differ; sorted into cells, so that the time does not grow with the square of the map."""
-
-    def __init__(self) -> None:
-        self._cells: dict[tuple[int, int], list[Pose2]] = {}
-
-    def add(self, pose: Pose2) -> bool:
-        """Take a pose, unless one is near already; whether it was taken."""
-        u, v = floor(pose.x / _NEAR), floor(pose.y / _NEAR)
-        near = (other for du in (-1, 0, 1) for dv in (-1, 0, 1) for other in self._cells.get((u + du, v + dv), ()))
-        if any(_same(pose, other) for other in near):
-            return False
-        self._cells.setdefault((u, v), []).append(pose)
-        return True
-
-
-def _same(first: Pose2, second: Pose2) -> bool:
-    return first.distance(second) < _NEAR and abs(wrap_angle(first.theta - second.theta)) < _NEAR_ANGLE
-
-
-def _tiles(grid: OccupancyGrid, side: float) -> list[tuple[float, float]]:
-    """Centres (metres, map frame) of the tiles in which a fair part of the cells is free."""
-    free = grid.free()
-    step = max(round(side / grid.resolution), 1)
-    centres: list[tuple[float, float]] = []
-    for row in range(0, free.shape[0], step):
-        for column in range(0, free.shape[1], step):
-            tile = free[row : row + step, column : column + step]
-            if tile.sum() >= 0.04 * step * step:
-                middle = grid.origin @ Pose2(
-                    (column + tile.shape[1] / 2) * grid.resolution, (row + tile.shape[0] / 2) * grid.resolution, 0.0
-                )
-                centres.append((middle.x, middle.y))
-    return centres

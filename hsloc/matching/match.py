@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.window import Window
+    from hsloc.model.certificate import Certificate
     from hsloc.model.pose2 import Pose2
 
 
@@ -25,6 +26,8 @@ class StopReason(StrEnum):
     """Enough restarts found the same best pose."""
     CONVERGED = "converged"
     """The pose no longer moved (ICP)."""
+    PROVEN = "proven"
+    """No pose of the window is fitter by more than epsilon (exact)."""
     NO_POINTS = "no_points"
     """There was nothing to match."""
 
@@ -36,7 +39,7 @@ class Match:
     `fitness` is in [0, 1], over all the points. `covariance` is 3 x 3 over (x, y, theta) in the map frame (m^2, rad^2);
     a direction that the scan does not determine has the variance of the window. `evaluations` counts every fitness
     evaluation, the initial ones and those of the refinement included. `history` is the best fitness after each
-    evaluation of the first restart, where it was asked for.
+    evaluation of the first restart, where it was asked for; `certificate` what was proven, where it was.
     """
 
     pose: Pose2
@@ -46,6 +49,7 @@ class Match:
     stopped: StopReason
     restarts: int = 1
     history: NDArray[np.float64] | None = None
+    certificate: Certificate | None = None
 
 
 class Matcher(Protocol):

@@ -1,6 +1,6 @@
 """Frozen value types: poses, trajectories, scans, odometry, estimates and occupancy grids."""
 
-from hsloc.model.estimate import Estimate, ScanDiagnostics, Status
+from hsloc.model.estimate import Estimate, Evidence, ScanDiagnostics, State, Status
 from hsloc.model.events import Event, Odometry, PairedScan, Scan, Truth
 from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle, wrap_angles
@@ -10,12 +10,14 @@ __all__ = [
     "IDENTITY",
     "Estimate",
     "Event",
+    "Evidence",
     "OccupancyGrid",
     "Odometry",
     "PairedScan",
     "Pose2",
     "Scan",
     "ScanDiagnostics",
+    "State",
     "Status",
     "Trajectory",
     "Truth",

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from hsloc.model.certificate import Certificate
     from hsloc.model.pose2 import Pose2
 
 
@@ -35,6 +36,39 @@ class Status(StrEnum):
         return self is not Status.SEARCHING
 
 
+class State(StrEnum):
+    """What is known of a pose, in hindsight: the scans after it count as well."""
+
+    LOCALISED = "localised"
+    """The pose is right with high probability, and known to within a decimetre or two."""
+    PREDICTED = "predicted"
+    """The track is right with high probability, but no scan holds the pose well enough here."""
+    AMBIGUOUS = "ambiguous"
+    """Several places of the map fit about as well."""
+    OFF_MAP = "off_map"
+    """No place of the map fits: the robot is not on it, or it has changed here."""
+    LOST = "lost"
+    """The pose is being searched for, or the track is probably wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What a scan says for or against the track that it continues.
+
+    `distance` is the path length since the scan before (m). `explained` is the mean score of the beams that no object
+    in free space cut short, `short`, `through` and `unmapped` are the shares of all beams that end before a wall,
+    behind one, or where the map has nothing. `rival` is the fitness of the fittest other place on the map divided by
+    that of this one, NaN where the places were not compared.
+    """
+
+    distance: float
+    explained: float = float("nan")
+    short: float = 0.0
+    through: float = 0.0
+    unmapped: float = 0.0
+    rival: float = float("nan")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The pose of the base in the map at a stamp, and how it came about.
@@ -53,6 +87,12 @@ class Estimate:
     evaluations: int = 0
     reason: str = ""
     revision: tuple[tuple[int, Pose2], ...] = ()
+    state: State | None = None
+    """What is known at once; None where the scans to come decide."""
+    evidence: Evidence | None = None
+    """What the scan says about the track, of an estimator that weighs it."""
+    certificate: Certificate | None = None
+    """What was proven about the match, where it was asked for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +111,8 @@ class ScanDiagnostics:
     evaluations: NDArray[np.int64]
     reason: tuple[str, ...]
     covariance: NDArray[np.float64]
+    certificates: tuple[Certificate, ...] = ()
+    """Of those scans that have one, in their order."""
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -17,7 +17,7 @@ _HEAD = 4096
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from hsloc.log import LogSummary
+    from hsloc.log import Log, LogSummary
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.request import RunRequest
     from hsloc.slam.map_state import MapState
@@ -90,3 +90,30 @@ def load_state(request: RunRequest) -> tuple[MapState | None, tuple[RunWarning, 
         text = f"{file}: built with other parameters of the mapper; those of this run are used from here on"
         return state, (RunWarning(WarningCode.MAP_PARAMETERS_DIFFER, text),)
     return state, ()
+
+
+def find_map(request: RunRequest, log: Log) -> tuple[OccupancyGrid | None, tuple[RunWarning, ...]]:
+    """The map that is given or that the log carries, and warnings."""
+    if request.map_path is not None:
+        return load_grid(request.map_path)
+    grid = log.map()
+    if grid is not None:
+        return grid, ()
+    unread = unread_maps(log.summary)
+    beside = maps_beside(request.logs[0])
+    given = str(beside[0]) if beside else "map.yaml"
+    what = f"cannot use {unread[0]}" if unread else "the log has no /map"
+    if request.mode == "localise":
+        raise MapError(f"{request.logs[0]}: {what}; give one with --map {given}")
+    if request.mode == "slam" or request.resume is not None or not (unread or beside):
+        return None, ()
+    remedy = f"to localise on a map give it with --map {given}"
+    remedy += "" if not beside[1:] else f" (also there: {', '.join(p.name for p in beside[1:])})"
+    return None, (RunWarning(WarningCode.MAP_NOT_USED, f"{what}, so a map is built", remedy),)
+
+
+def require_map(grid: OccupancyGrid | None) -> OccupancyGrid:
+    """The map. Raises MapError where there is none."""
+    if grid is None:
+        raise MapError("no map to localise in")
+    return grid

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hsloc.config import preset
-from hsloc.errors import ConfigError, LogError, MapError
+from hsloc.errors import ConfigError, LogError
 from hsloc.kernels.cache import compilation_reported
 from hsloc.log import LogSummary, Losses, open_log
 from hsloc.matching.likelihood_field import LikelihoodField
@@ -25,7 +25,7 @@ from hsloc.preprocessing.odometry_resets import ContinuousOdometry
 from hsloc.preprocessing.odometry_watch import OdometryWatch, UnusableOdometry
 from hsloc.replay.engine import replay, seldom_collected
 from hsloc.replay.initial_pose import find_start, first_odometry
-from hsloc.replay.map_sources import load_grid, load_state, maps_beside, unread_maps
+from hsloc.replay.map_sources import find_map, load_state, require_map
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory, pose_covariances
 from hsloc.request import RunRequest
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.localisation.states import StateRows
     from hsloc.log import Log
     from hsloc.matching.match import Matcher
     from hsloc.model.estimate import ScanDiagnostics
@@ -72,6 +73,7 @@ class Result:
     `trajectory` has one pose for each odometry message; where there are none, one for each scan. `localised` says
     which of them are believed. `grid` is the map that was used, or, in `mode` "slam", the one that was drawn; then
     `true_grid` is the one that the log carries, if any. `likelihood` is the field that was matched on, of a given map.
+    `states` are the states of the poses of a localiser that weighs evidence; `localised` are those in this state.
     With `lidar_only` the log's odometry was not used: a localiser's `odometry` is then that of the scans. `deskewed`
     says whether the beams were moved to where the robot was when each was measured.
     """
@@ -92,6 +94,7 @@ class Result:
     mapping: MappingResult | None = None
     true_grid: OccupancyGrid | None = None
     likelihood: LikelihoodField | None = None
+    states: StateRows | None = None
     lidar_only: bool = False
     deskewed: bool = False
 
@@ -114,7 +117,7 @@ class Result:
         if self.mapping is not None:
             return np.full((len(self.trajectory), 3, 3), np.nan)
         config = self.request.config
-        noise = config.localiser.odometry_noise if self.mode == "localise" else config.point_mapper.odometry_noise
+        noise = config.localiser.noise() if self.mode == "localise" else config.point_mapper.odometry_noise
         return pose_covariances(self.trajectory, self.localised, self.diagnostics, noise.covariance)
 
     @property
@@ -224,6 +227,9 @@ def _run_with(
     elif isinstance(estimator, PointMapper):
         grid = estimator.grid()
     trajectory, localised = history.trajectory() if mapping is None else _mapped(history, mapping)
+    states = history.states() if localise else None
+    if states is not None:
+        localised = states.is_localised()
     return Result(
         request=request,
         summary=log.summary,
@@ -241,21 +247,22 @@ def _run_with(
         mapping=mapping,
         true_grid=true_grid,
         likelihood=likelihood,
+        states=states,
         lidar_only=lidar_only,
         deskewed=deskew,
     )
 
 
-def with_offset(spec: RunRequest, log: Log) -> tuple[Log, tuple[RunWarning, ...]]:
+def with_offset(request: RunRequest, log: Log) -> tuple[Log, tuple[RunWarning, ...]]:
     """The log with the estimated offset of its scans, if that is asked for; a warning where there is one.
 
     Otherwise it is estimated only where log times hint at it: `hsloc.analysis` finds smaller ones in the result.
     """
-    automatic = spec.read.time_offset == AUTO
-    apart = abs(log.summary.clocks_apart_s) > HINT_S and spec.read.time_offset is None
+    automatic = request.read.time_offset == AUTO
+    apart = abs(log.summary.clocks_apart_s) > HINT_S and request.read.time_offset is None
     if not (automatic or apart):
         return log, ()
-    found = offsets_of_log(spec.logs, spec.reading(), spec.config.graph_mapper.front_end)
+    found = offsets_of_log(request.logs, request.reading(), request.config.graph_mapper.front_end)
     option = as_option(found)
     if option is None:
         return log, ()
@@ -269,7 +276,7 @@ def with_offset(spec: RunRequest, log: Log) -> tuple[Log, tuple[RunWarning, ...]
         for topic, offset in found.items()
         if offset.is_significant
     )
-    return open_log(spec.logs, replace(spec.reading(), time_offset=option)), warnings
+    return open_log(request.logs, replace(request.reading(), time_offset=option)), warnings
 
 
 def _mapped(history: RunHistory, mapping: MappingResult) -> tuple[Trajectory, NDArray[np.bool_]]:
@@ -296,33 +303,6 @@ def _share(progress: Callable[[Progress], None] | None, total: float, scans: int
     if progress is None:
         return None
     return lambda share: progress(Progress("refine", share * total, total, scans))
-
-
-def find_map(request: RunRequest, log: Log) -> tuple[OccupancyGrid | None, tuple[RunWarning, ...]]:
-    """The map that is given or that the log carries, and warnings."""
-    if request.map_path is not None:
-        return load_grid(request.map_path)
-    grid = log.map()
-    if grid is not None:
-        return grid, ()
-    unread = unread_maps(log.summary)
-    beside = maps_beside(request.logs[0])
-    given = str(beside[0]) if beside else "map.yaml"
-    what = f"cannot use {unread[0]}" if unread else "the log has no /map"
-    if request.mode == "localise":
-        raise MapError(f"{request.logs[0]}: {what}; give one with --map {given}")
-    if request.mode == "slam" or request.resume is not None or not (unread or beside):
-        return None, ()
-    remedy = f"to localise on a map give it with --map {given}"
-    remedy += "" if not beside[1:] else f" (also there: {', '.join(p.name for p in beside[1:])})"
-    return None, (RunWarning(WarningCode.MAP_NOT_USED, f"{what}, so a map is built", remedy),)
-
-
-def require_map(grid: OccupancyGrid | None) -> OccupancyGrid:
-    """The map. Raises MapError where there is none."""
-    if grid is None:
-        raise MapError("no map to localise in")
-    return grid
 
 
 def require_matcher(request: RunRequest) -> None:
@@ -356,7 +336,7 @@ def _localiser(request: RunRequest, grid: OccupancyGrid, likelihood: LikelihoodF
 
     rng = np.random.default_rng(request.seed)
     _warm_up(request.matcher, likelihood)
-    return Localiser(grid, likelihood, request.matcher, request.config.localiser, rng, start)
+    return Localiser.from_parameters(grid, likelihood, request.matcher, request.config.localiser, rng, start)
 
 
 def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:

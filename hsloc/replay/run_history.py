@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.localisation.motion import predict_covariance
+from hsloc.localisation.states import StateLog
 from hsloc.model.estimate import ScanDiagnostics, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
 from hsloc.model.pose2 import Pose2, compose_poses
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.localisation.states import StateRows
+    from hsloc.model.certificate import Certificate
     from hsloc.model.estimate import Estimate
 
 
@@ -38,6 +41,8 @@ class RunHistory:
         self._sigma = array("d")
         self._covariance = array("d")
         self._evaluations = array("q")
+        self._states = StateLog()
+        self._certificates: list[Certificate] = []
         self._believed = 0
         self._searching = False
         self._revisions: list[tuple[int, tuple[tuple[int, Pose2], ...]]] = []
@@ -61,6 +66,7 @@ class RunHistory:
 
     def _add_scan(self, estimate: Estimate) -> None:
         self._note_belief(estimate.status)
+        self._states.add(estimate, len(self._odometry_stamps))
         self._scan_stamps.append(estimate.stamp_ns)
         self._status.append(estimate.status.value)
         self._reason.append(estimate.reason)
@@ -73,6 +79,8 @@ class RunHistory:
             self._sigma.extend(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
             self._covariance.extend(covariance.ravel())
         self._evaluations.append(estimate.evaluations)
+        if estimate.certificate is not None:
+            self._certificates.append(estimate.certificate)
         if estimate.revision:
             self._revisions.append((len(self._odometry_stamps), estimate.revision))
 
@@ -113,6 +121,10 @@ class RunHistory:
                 localised[first:last] = True
         return Trajectory(estimated.stamps_ns, poses), localised
 
+    def states(self) -> StateRows | None:
+        """The state of each pose of the trajectory in hindsight; None for an estimator that weighs no evidence."""
+        return self._states.at_odometry(len(self._odometry_stamps)) if len(self._states) else None
+
     def diagnostics(self) -> ScanDiagnostics:
         """One row for each scan."""
         return ScanDiagnostics(
@@ -123,6 +135,7 @@ class RunHistory:
             evaluations=np.array(self._evaluations, dtype=np.int64),
             reason=tuple(self._reason),
             covariance=np.array(self._covariance, dtype=np.float64).reshape(-1, 3, 3),
+            certificates=tuple(self._certificates),
         )
 
 

@@ -119,7 +119,7 @@ def _localise(
     seed: int,
 ) -> Drive:
     rng = np.random.default_rng(seed)
-    localiser = Localiser(grid, field, config.make_matcher(), config.localiser, rng, world.start())
+    localiser = Localiser.from_parameters(grid, field, config.make_matcher(), config.localiser, rng, world.start())
     history = RunHistory()
     begin = perf_counter()
     for event, estimate in replay(drive, localiser):

@@ -37,7 +37,7 @@ def test_text_says_what_it_was_measured_on_and_what_was_left_out(capsys: pytest.
     assert "Load average before" in out
     assert "HIDE, 280 evaluations" in out
     assert "Promised and measured" in out
-    assert "the matching table was left out" in out
+    assert "the tables of matching and of certificates were left out" in out
     assert "Replay of" not in out
 
 

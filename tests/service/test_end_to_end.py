@@ -15,6 +15,7 @@ from live_service import upload, wait, without_command
 from paths import RECORDINGS
 
 from hsloc.errors import MapError
+from hsloc.maps.metadata import read_metadata
 from hsloc_service.execution.worker import linked_map
 from hsloc_service.settings import Settings
 
@@ -37,7 +38,7 @@ REAL = Settings().worker_command
 def test_the_result_is_that_of_hsloc_replay_byte_for_byte(
     make_client: Callable[..., TestClient], tmp_path: Path, request_: dict[str, object], options: list[str]
 ) -> None:
-    client = make_client(worker_command=REAL, job_memory_bytes=4 << 30)
+    client = make_client(worker_command=REAL, sandbox="none", job_memory_bytes=4 << 30)
     file = upload(client, (RECORDINGS / "office.mcap").read_bytes(), "office.mcap")
     job = client.post("/v1/jobs", json={"log": file, **request_}).json()["id"]
     (tmp_path / "c.yaml").write_text("hide: {budget: 250}\n")
@@ -99,7 +100,7 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
 
 
 def test_hostile_files_fail_in_seconds_with_a_reason(make_client: Callable[..., TestClient]) -> None:
-    client = make_client(worker_command=REAL, job_memory_bytes=2 << 30, slots=2, job_wall_s=30.0)
+    client = make_client(worker_command=REAL, sandbox="none", job_memory_bytes=2 << 30, slots=2, job_wall_s=30.0)
     begin = time.monotonic()
     jobs = {}
     for name, content in HOSTILE.items():
@@ -116,16 +117,33 @@ def test_hostile_files_fail_in_seconds_with_a_reason(make_client: Callable[..., 
     assert client.get("/healthz").status_code == 200
 
 
-@pytest.mark.parametrize("image", ["/etc/passwd", "../input/log.mcap", "..", "a/b.pgm", "", 3, None])
-def test_a_map_may_not_name_a_file_elsewhere(tmp_path: Path, image: object) -> None:
-    (tmp_path / "map").mkdir()
-    (tmp_path / "map" / "map.yaml").write_text(f"image: {json.dumps(image)}\nresolution: 0.05\norigin: [0, 0, 0]\n")
-    with pytest.raises(MapError, match="plain name"):
+def map_yaml(folder: Path, image: object) -> None:
+    (folder / "map").mkdir()
+    (folder / "map" / "map.yaml").write_text(
+        f"image: {json.dumps(image)}\nresolution: 0.05\norigin: [0, 0, 0]\n"
+        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+    )
+
+
+@pytest.mark.parametrize("image", ["..", "a/..", "", 3, None])
+def test_a_map_must_name_an_image(tmp_path: Path, image: object) -> None:
+    map_yaml(tmp_path, image)
+    with pytest.raises(MapError, match="must name a file"):
         linked_map(tmp_path, "map.yaml", ".image")
 
 
+@pytest.mark.parametrize("image", ["/etc/passwd", "../input/log.mcap", "a/b.pgm", "C:\\maps\\b.pgm", "b.pgm"])
+def test_a_map_never_reads_a_file_that_was_not_uploaded(tmp_path: Path, image: str) -> None:
+    """A path is of the user's machine: the uploaded image is meant, whatever this machine has there."""
+    map_yaml(tmp_path, image)
+    (tmp_path / "map" / ".image").write_bytes(b"uploaded")
+    named = read_metadata(linked_map(tmp_path, "map.yaml", ".image")).image
+    assert named.parent == tmp_path / "map"
+    assert named.read_bytes() == b"uploaded"
+
+
 def test_a_map_of_two_uploads(make_client: Callable[..., TestClient]) -> None:
-    client = make_client(worker_command=REAL, job_memory_bytes=2 << 30)
+    client = make_client(worker_command=REAL, sandbox="none", job_memory_bytes=2 << 30)
     yaml = (
         b"image: my map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
     )
@@ -141,7 +159,7 @@ def test_a_map_of_two_uploads(make_client: Callable[..., TestClient]) -> None:
 
 
 def test_a_warning_names_the_map_and_not_the_servers_folder(make_client: Callable[..., TestClient]) -> None:
-    client = make_client(worker_command=REAL, job_memory_bytes=2 << 30)
+    client = make_client(worker_command=REAL, sandbox="none", job_memory_bytes=2 << 30)
     yaml = b"image: m.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
     pixels = b"P5 100 100 255\n" + (b"\x00" * 100 + b"\xcd" * 100) * 50
     chart = {"yaml": upload(client, yaml, "office.yaml"), "image": upload(client, pixels, "m.pgm")}

@@ -166,7 +166,7 @@ def test_a_one_shot_that_cannot_be_queued_leaves_no_file(client: TestClient) -> 
 
 def test_options_have_a_schema(client: TestClient) -> None:
     options = client.get("/v1/options").json()
-    assert options["config_schema"]["properties"]["matcher"]["enum"] == ["hide", "harmony_search", "icp", "hs"]
+    assert options["config_schema"]["properties"]["matcher"]["enum"] == ["hide", "harmony_search", "icp", "exact", "hs"]
     assert {"name": "seed", "default": 0}.items() <= next(
         each for each in options["run"] if each["name"] == "seed"
     ).items()

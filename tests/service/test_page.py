@@ -87,7 +87,7 @@ def inked(page: Any, selector: str) -> int:
 def test_upload_watch_look_download(
     make_live: Callable[..., Live], open_page: Callable[..., Any], tmp_path: Path
 ) -> None:
-    live = make_live(HSLOC_WORKER_COMMAND=REAL, HSLOC_JOB_MEMORY_BYTES="4G")
+    live = make_live(HSLOC_WORKER_COMMAND=REAL, HSLOC_SANDBOX="none", HSLOC_JOB_MEMORY_BYTES="4G")
     log = tmp_path / NASTY
     shutil.copy(RECORDINGS / "office.mcap", log)
     page = open_page(live.url, viewport={"width": 1280, "height": 900})

@@ -34,6 +34,27 @@ def score_sum(scores: Any, points: Any, x: Any, y: Any, theta: Any) -> Any:
     return total
 
 
+def largest_score(scores: Any, u_low: float, u_high: float, v_low: float, v_high: float, sizes: Any, step: int) -> int:
+    """The greatest node, in steps of 1 / 255 rounded up, of the square of whole entries that covers a rectangle.
+
+    An entry is step x step nodes; the square begins at the entry of the rectangle's corner, has the smallest of `sizes`
+    that covers the rectangle and one node more, and is 255 where none of them does.
+    """
+    height, width = scores.shape
+    entries = -(-height // step), -(-width // step)
+    u0, u1 = floor(u_low) // step, (floor(u_high) + 1) // step
+    v0, v1 = floor(v_low) // step, (floor(v_high) + 1) // step
+    if u1 < 0 or v1 < 0 or u0 >= entries[1] or v0 >= entries[0]:
+        return 0
+    fitting = [size for size in sizes if size >= max(u1 - u0, v1 - v0) + 1]
+    if not fitting:
+        return 255
+    rows = slice(max(v0, 0) * step, max((v0 + fitting[0]) * step, 0))
+    columns = slice(max(u0, 0) * step, max((u0 + fitting[0]) * step, 0))
+    under = scores[rows, columns]
+    return min(int(np.ceil(float(under.max()) * 255.0 + 1e-4)), 255) if under.size else 0
+
+
 def distance_to_nearest(cells: Any, row: Any, column: Any) -> Any:
     """Distance in cells from a cell's centre to the nearest occupied cell's centre, by looking at all of them."""
     rows, columns = np.nonzero(cells)
@@ -75,3 +96,53 @@ def scan_points(walls: Any, pose: Any, beams: int = 180) -> Any:
     angles = np.linspace(-np.pi, np.pi, beams, endpoint=False)
     ranges = np.array([cast(walls, pose.x, pose.y, pose.theta + angle) for angle in angles])
     return np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))[np.isfinite(ranges)]
+
+
+def beam_classes(
+    cells: Any,
+    ends: Any,
+    origin: Any,
+    scores: Any,
+    fits: float,
+    margin: float,
+) -> Any:
+    """Of each beam 0 at a wall, 1 in free space, 2 behind a wall, 3 where nothing is mapped."""
+
+    def cell(x: float, y: float) -> int:
+        row, column = int(np.floor(y)), int(np.floor(x))
+        return int(cells[row, column]) if 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1] else -1
+
+    found = []
+    for (x, y), score in zip(ends, scores, strict=True):
+        length = float(np.hypot(x - origin[0], y - origin[1]))
+        steps = np.arange(max(int(np.ceil(length - margin)), 0)) / length
+        walls = [cell(*(origin + part * ((x, y) - origin))) >= 65 for part in steps]
+        if score >= np.float32(fits):
+            found.append(0)
+        else:
+            found.append(2 if any(walls) else 1 if cell(x, y) >= 0 else 3)
+    return np.array(found, dtype=np.int8)
+
+
+def wall_information(
+    points: Any,
+    normals: Any,
+    weights: Any,
+    variances: tuple[float, float],
+    rows: Any,
+    doubtful: float,
+) -> Any:
+    """Information of (x, y, theta) at the pose 0, from the inverse of each row's covariance written out as a matrix."""
+    total = np.zeros((3, 3))
+    for row in np.unique(rows):
+        members = np.flatnonzero((rows == row) & (np.abs(normals).sum(axis=1) > 0.0))
+        if len(members) == 0:
+            continue
+        n, p, w = normals[members], points[members], weights[members]
+        major = np.where(np.abs(n[:, 0]) > np.abs(n[:, 1]), n[:, 0], n[:, 1])
+        n = n * np.where(major < 0.0, -1.0, 1.0)[:, None]
+        jacobian = np.column_stack((n, n[:, 1] * p[:, 0] - n[:, 0] * p[:, 1]))
+        covariance = np.diag(variances[0] / w) + variances[1]
+        trusted = w.sum() / (w.sum() + doubtful)
+        total += trusted * jacobian.T @ np.linalg.inv(covariance) @ jacobian
+    return total

@@ -1,0 +1,58 @@
+"""What the localiser asks of whatever finds an unknown pose on the whole map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from hsloc.model.estimate import State
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hsloc.model.estimate import Evidence
+    from hsloc.model.events import PairedScan
+    from hsloc.model.pose2 import Pose2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelocaliserResult:
+    """The state of a search after a scan.
+
+    `pose` is the best hypothesis, T_map_base at the scan (None while there is none); `covariance` (3, 3) is set once
+    it `is_sure`. `fitness` is that of the scan at the pose, None where it was not matched.
+    """
+
+    pose: Pose2 | None
+    covariance: NDArray[np.float64] | None
+    fitness: float | None
+    evaluations: int
+    is_sure: bool
+    reason: str
+    track: tuple[tuple[int, Pose2], ...] = ()
+    """Once it is sure: T_map_odom since the search began, as (odometry messages before, T_map_odom)."""
+    track_is_whole: bool = False
+    """Whether the track goes back to the first scan of the search."""
+    state: State = State.LOST
+    """While it is not sure: whether several places fit, none does, or it is too early to tell."""
+    evidence: Evidence | None = None
+    """Once it is sure: what its scans say for the place."""
+
+
+class GlobalSearch(Protocol):
+    """Finds an unknown pose from several scans.
+
+    Law: the same scans since `start` and the same state of its random generator give the same results.
+    """
+
+    def start(self, usual_explained: float | None = None) -> None:
+        """Begin a new search: nothing of the scans before is kept.
+
+        `usual_explained` is the explained fitness (see `Evidence`) at places of this map that were sure, if known.
+        """
+        ...
+
+    def update(self, paired: PairedScan, odometry_count: int) -> RelocaliserResult:
+        """Take a scan and the number of odometry messages before it."""
+        ...

@@ -1,0 +1,73 @@
+"""The match gate: which matches are accepted, and after how many refusals in a row the pose is lost.
+
+A match is measured by its fitness and by the usual fitness, an exponentially weighted mean over the matches accepted
+before. Localiser and mapper share it; their limits differ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+_WEIGHT_OF_NEW = 0.05
+"""Weight of a new match in the usual fitness: its memory is about 20 matches."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatchLimits:
+    """The limits of a match gate."""
+
+    min_fitness: float
+    """Least fitness of an accepted match, in [0, 1]."""
+    min_fitness_ratio: float
+    """Least ratio of an accepted match's fitness to the usual fitness, in [0, 1]."""
+    recovery_fitness_ratio: float
+    """Least ratio to the usual fitness of a match that was found in a wide window after a refusal, in [0, 1]."""
+    recovery_gain: float = 0.1
+    """Least gain in fitness of a match in a wide window over the refused one: similar places compete there."""
+
+
+class MatchGate:
+    """State: the usual fitness, and the number of refusals in a row."""
+
+    def __init__(self, limits: MatchLimits) -> None:
+        self._limits = limits
+        self.usual: float | None = None
+        self.refusals = 0
+
+    @property
+    def is_fresh(self) -> bool:
+        """Whether no match was accepted or refused yet."""
+        return self.usual is None and self.refusals == 0
+
+    def refusal(self, fitness: float) -> str:
+        """Why a match of this fitness is refused; empty if it is accepted."""
+        limits = self._limits
+        if fitness < limits.min_fitness:
+            return f"fitness {fitness:.2f} below {limits.min_fitness:.2f}"
+        if self.usual is not None and fitness < limits.min_fitness_ratio * self.usual:
+            return f"fitness {fitness:.2f} far below the usual {self.usual:.2f}"
+        return ""
+
+    def is_recovered(self, refused: float, wide: float) -> bool:
+        """Whether a match of fitness `wide` in a wide window takes the place of one of fitness `refused`.
+
+        While no fitness is usual yet, the least fitness stands in for it.
+        """
+        limits = self._limits
+        usual = limits.min_fitness if self.usual is None else self.usual
+        return wide >= max(refused + limits.recovery_gain, limits.recovery_fitness_ratio * usual)
+
+    def accept(self, fitness: float) -> None:
+        """Count an accepted match."""
+        self.refusals = 0
+        self.usual = fitness if self.usual is None else self.usual + _WEIGHT_OF_NEW * (fitness - self.usual)
+
+    def refuse(self) -> int:
+        """Count a refused match; the number of refusals in a row."""
+        self.refusals += 1
+        return self.refusals
+
+    def restart(self, fitness: float | None) -> None:
+        """Begin from a pose that was found with a known fitness."""
+        self.refusals = 0
+        self.usual = fitness

@@ -1,0 +1,178 @@
+"""The state of each pose of a run in hindsight: localised, predicted, ambiguous, off the map, or lost; and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.localisation.track_evidence import TrackRow, smooth, usual_explained
+from hsloc.model.estimate import Evidence, State, Status
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from hsloc.model.estimate import Estimate
+
+    F64 = NDArray[np.float64]
+
+CONFIDENCE = 0.9
+"""Least probability that the track is right for a pose to be called localised."""
+MAX_SIGMA = 0.1
+"""Largest standard deviation of a localised pose in any direction (m): 2.5 of them are 0.25 m."""
+MAX_SIGMA_ANGLE = np.radians(2.0)
+"""And of its heading (rad): 2.5 of them are 5 deg."""
+_POOR_FIT = 0.92
+"""Explained fitness by the usual one below which a doubted pose is taken for off the map."""
+_SETTLED = 5
+"""Matches after which the covariance no longer knows how a track began."""
+_BRIDGED_M = 2.0
+"""Over this path length of refused scans the pose is interpolated if the next match agrees with the prediction (m)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StateRows:
+    """Columns of n rows: states, their probability, standard deviations (n, 3) in m, m, rad, fitness and reason."""
+
+    state: tuple[State, ...]
+    probability: F64
+    sigma: F64
+    fitness: F64
+    reason: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.state)
+
+    def is_localised(self) -> NDArray[np.bool_]:
+        """Which rows are localised, shape (n,)."""
+        return np.array([state is State.LOCALISED for state in self.state], dtype=np.bool_)
+
+
+class StateLog:
+    """Collects the estimates of the scans that say something of the state; `rows` judges them all in hindsight."""
+
+    def __init__(self) -> None:
+        self._estimates: list[Estimate] = []
+        self._counts: list[int] = []
+
+    def add(self, estimate: Estimate, odometry_count: int) -> None:
+        """Take the estimate at a scan and the number of odometry messages before; one without evidence is skipped."""
+        if estimate.evidence is not None:
+            self._estimates.append(estimate)
+            self._counts.append(odometry_count)
+
+    def __len__(self) -> int:
+        return len(self._estimates)
+
+    def at_odometry(self, n: int) -> StateRows:
+        """The states at the n odometry messages: each lies between two scans, and is no surer than either."""
+        scans = self.at_scans()
+        if len(scans) == 0:
+            return StateRows((State.LOST,) * n, np.zeros(n), np.full((n, 3), np.nan), np.full(n, np.nan), ("",) * n)
+        counts = np.array(self._counts)
+        k = np.arange(n)
+        before = np.searchsorted(counts, k, side="right") - 1
+        after = np.minimum(before + 1, len(scans) - 1)
+        before = np.maximum(before, 0)
+        worse = np.where(_rank(scans, before) >= _rank(scans, after), before, after)
+        # A pose before the first match of a new track belongs to the old one unless it was revised.
+        span = np.maximum(counts[after] - counts[before], 1)
+        part = np.clip((k - counts[before]) / span, 0.0, 1.0)[:, None]
+        variance = (1.0 - part) * scans.sigma[before] ** 2 + part * scans.sigma[after] ** 2
+        return StateRows(
+            tuple(scans.state[i] for i in worse),
+            np.minimum(scans.probability[before], scans.probability[after]),
+            np.sqrt(variance),
+            scans.fitness[before],
+            tuple(scans.reason[i] for i in worse),
+        )
+
+    def at_scans(self) -> StateRows:
+        """The states at the scans that were added."""
+        rows, owners = self._tracks()
+        smoothed = smooth(rows)
+        usual = usual_explained(rows)
+        sigma = self._sigma(owners)
+        states: list[State] = []
+        reasons: list[str] = []
+        probability = np.zeros(len(self._estimates))
+        for k, estimate in enumerate(self._estimates):
+            owner = owners[k]
+            if owner < 0:
+                states.append(estimate.state or State.LOST)
+                reasons.append(estimate.reason)
+                continue
+            probability[k] = smoothed[owner, 0]
+            state, reason = _judge(smoothed[owner], sigma[k], usual, rows[: owner + 1])
+            states.append(state)
+            reasons.append(reason or estimate.reason)
+        fitness = np.array([np.nan if e.fitness is None else e.fitness for e in self._estimates])
+        return StateRows(tuple(states), probability, sigma, fitness, tuple(reasons))
+
+    def _tracks(self) -> tuple[list[TrackRow], list[int]]:
+        """The rows of all tracks, and of each scan its row; -1 for a guess that no later search revised."""
+        rows: list[TrackRow] = []
+        owners = [-1] * len(self._estimates)
+        for k, estimate in enumerate(self._estimates):
+            assert estimate.evidence is not None
+            if estimate.status is Status.SEARCHING:
+                continue
+            begins = not rows or estimate.status is Status.RELOCALISED
+            owners[k] = len(rows)
+            rows.append(TrackRow(estimate.status, estimate.evidence, begins))
+            if estimate.revision:
+                since = estimate.revision[0][0]
+                for j in range(k - 1, -1, -1):
+                    if self._counts[j] < since or owners[j] >= 0:
+                        break
+                    owners[j] = owners[k]
+        return rows, owners
+
+    def _sigma(self, owners: Sequence[int]) -> F64:
+        """Standard deviations (n, 3): of a guess unknown; of refused scans between agreeing matches interpolated."""
+        n = len(self._estimates)
+        sigma = np.full((n, 3), np.nan)
+        for k in range(n - 1, -1, -1):
+            estimate = self._estimates[k]
+            if owners[k] < 0:
+                continue
+            if estimate.covariance is not None:
+                sigma[k] = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
+            elif k + 1 < n and owners[k] == owners[k + 1]:
+                sigma[k] = sigma[k + 1]
+            if estimate.status is Status.RELOCALISED:
+                # Before it the scans were matched backwards, and are as sure as those matched forwards after it.
+                settled = next((j for j in range(k + _SETTLED, k, -1) if j < n and owners[j] - owners[k] == j - k), k)
+                sigma[k] = np.fmin(sigma[k], sigma[settled])
+        return sigma
+
+
+def _rank(scans: StateRows, index: NDArray[np.int64]) -> NDArray[np.int64]:
+    order = {State.LOCALISED: 0, State.PREDICTED: 1, State.AMBIGUOUS: 2, State.OFF_MAP: 3, State.LOST: 4}
+    ranks = np.array([order[state] for state in scans.state])
+    return np.asarray(ranks[index])
+
+
+def _judge(probabilities: F64, sigma: F64, usual: float, before: Sequence[TrackRow]) -> tuple[State, str]:
+    """The state of a row of a track, and the reason where it is not localised."""
+    right, alike, astray = probabilities
+    if right < CONFIDENCE:
+        if alike > astray:
+            return State.AMBIGUOUS, "another place fits as well"
+        evidence = _last_explained(before)
+        if evidence is not None and evidence.explained < _POOR_FIT * usual:
+            return State.OFF_MAP, f"the map explains {evidence.explained:.2f} of the scan, usually {usual:.2f}"
+        return State.LOST, "scans before or after do not fit"
+    if not (max(sigma[0], sigma[1]) <= MAX_SIGMA and sigma[2] <= MAX_SIGMA_ANGLE):
+        return State.PREDICTED, f"standard deviation {max(sigma[0], sigma[1]):.2f} m, {np.degrees(sigma[2]):.1f} deg"
+    return State.LOCALISED, ""
+
+
+def _last_explained(rows: Sequence[TrackRow]) -> Evidence | None:
+    for row in reversed(rows[-5:]):
+        if np.isfinite(row.evidence.explained):
+            return row.evidence
+    return None

@@ -1,0 +1,58 @@
+"""How much a match says about the pose, direction by direction: its information, without any prior.
+
+`Match.covariance` has the variance of the search window where the scan determines nothing. A filter must not take that
+for a measurement: along a corridor it would shrink with every scan. What is here is zero where nothing is measured.
+"""
+
+from __future__ import annotations
+
+from math import cos, sin
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.kernels.fitness import point_scores
+from hsloc.kernels.wall_information import wall_information, wall_normals, wall_rows
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hsloc.matching.likelihood_field import LikelihoodField
+    from hsloc.model.pose2 import Pose2
+
+    F64 = NDArray[np.float64]
+
+_POINT_SIGMA = 0.02
+"""Standard deviation of a point from its wall (m): the range noise of indoor lidars, 1 to 3 cm by their data sheets."""
+_MAX_GAP = 0.2
+"""Neighbouring points of one wall lie as near as this (m), and farther apart with distance."""
+
+
+def match_information(points: F64, field: LikelihoodField, pose: Pose2) -> F64:
+    """Information (3, 3) of (x, y, theta) in the map frame (1/m^2, 1/rad^2) of points (n, 2) in the order of the beams.
+
+    Zero in directions that no wall holds. The wall's own variance is that of a place within a cell.
+    """
+    if len(points) == 0:
+        return np.zeros((3, 3))
+    points = np.ascontiguousarray(points)
+    cells = field.to_cells(pose)
+    scores = np.empty(len(points), dtype=np.float32)
+    point_scores(field.packed, field.scale(points), cells[0], cells[1], cells[2], scores)
+    normals = np.empty_like(points)
+    wall_normals(points, _MAX_GAP, _POINT_SIGMA**2, normals)
+    metres = cells * (field.resolution, field.resolution, 1.0)
+    rows = np.empty(len(points), dtype=np.int64)
+    wall_rows(points, normals, metres, field.resolution, rows)
+    order = np.argsort(rows, kind="stable")
+    cell_variance = field.resolution**2 / 12.0
+    variances = np.array((_POINT_SIGMA**2 + cell_variance, cell_variance))
+    information = wall_information(
+        points, normals, scores.astype(np.float64), metres, field.resolution, variances, rows, order
+    )
+    angle = field.T_map_field.theta
+    if angle != 0.0:
+        c, s = cos(angle), sin(angle)
+        rotation = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
+        information = rotation @ information @ rotation.T
+    return information

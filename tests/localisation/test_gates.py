@@ -1,0 +1,66 @@
+"""The motion gate and the match gate."""
+
+from __future__ import annotations
+
+import pytest
+
+from hsloc.localisation.match_gate import MatchGate, MatchLimits
+from hsloc.localisation.motion_gate import MotionGate
+from hsloc.model import Pose2
+
+LIMITS = MatchLimits(min_fitness=0.3, min_fitness_ratio=0.7, recovery_fitness_ratio=0.9)
+
+
+@pytest.mark.parametrize(
+    ("motion", "is_open"),
+    [
+        (Pose2(0.19, 0.0, 0.09), False),
+        (Pose2(0.12, 0.16, 0.0), True),
+        (Pose2(-0.2, 0.0, 0.0), True),
+        (Pose2(0.0, 0.0, -0.1), True),
+    ],
+)
+def test_a_motion_gate_opens_by_distance_or_by_angle(motion: Pose2, is_open: bool) -> None:
+    assert MotionGate(0.2, 0.1).is_open(motion) is is_open
+
+
+def test_a_fresh_gate_refuses_by_the_least_fitness_alone() -> None:
+    gate = MatchGate(LIMITS)
+    assert gate.is_fresh
+    assert gate.refusal(0.3) == ""
+    assert gate.refusal(0.29) == "fitness 0.29 below 0.30"
+
+
+def test_the_usual_fitness_follows_the_accepted_matches() -> None:
+    gate = MatchGate(LIMITS)
+    gate.accept(0.9)
+    assert not gate.is_fresh
+    assert gate.refusal(0.62) == "fitness 0.62 far below the usual 0.90"
+    for _ in range(200):
+        gate.accept(0.8)
+    assert gate.usual == pytest.approx(0.8, abs=1e-4)
+    assert gate.refusal(0.62) == ""
+
+
+def test_refusals_are_counted_in_a_row() -> None:
+    gate = MatchGate(LIMITS)
+    assert [gate.refuse(), gate.refuse()] == [1, 2]
+    assert not gate.is_fresh
+    gate.accept(0.9)
+    assert gate.refuse() == 1
+
+
+def test_a_wide_match_must_gain_and_reach_most_of_the_usual_fitness() -> None:
+    gate = MatchGate(LIMITS)
+    gate.accept(0.9)
+    assert gate.is_recovered(0.5, 0.81)
+    assert not gate.is_recovered(0.5, 0.80)
+    assert not gate.is_recovered(0.72, 0.815)
+
+
+def test_a_restart_takes_the_fitness_of_the_place_that_was_found() -> None:
+    gate = MatchGate(LIMITS)
+    gate.refuse()
+    gate.restart(0.8)
+    assert gate.refusals == 0
+    assert gate.usual == 0.8

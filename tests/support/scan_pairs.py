@@ -9,9 +9,9 @@ import numpy as np
 
 from hsloc.kernels.point_to_line import Term, pair_terms
 from hsloc.model import Pose2, Scan
-from hsloc.slam.keyscans import KeyScans
 
 if TYPE_CHECKING:
+    from hsloc.slam.keyscans import KeyScans
     from numpy.typing import NDArray
 
 DEGREE = radians(1.0)

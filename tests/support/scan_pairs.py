@@ -11,8 +11,9 @@ from hsloc.kernels.point_to_line import Term, pair_terms
 from hsloc.model import Pose2, Scan
 
 if TYPE_CHECKING:
-    from hsloc.slam.keyscans import KeyScans
     from numpy.typing import NDArray
+
+    from hsloc.slam.keyscans import KeyScans
 
 DEGREE = radians(1.0)
 

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from scan_pairs import room_scan, terms
+from room_scans import DEGREE, room_scan, terms
 
 from hsloc.kernels.point_to_line import bearing, choose_hits
 from hsloc.model import Pose2, Scan
@@ -12,8 +12,6 @@ from hsloc.slam.keyscans import KeyScan, KeyScans
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-DEGREE = np.radians(1.0)
 
 
 @pytest.fixture(scope="module")

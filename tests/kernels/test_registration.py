@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from scan_pairs import room_scan, terms
+from room_scans import room_scan, terms
 
 from hsloc.kernels.point_to_line import Term
 from hsloc.kernels.registration import Prior, RegistrationParameters, Scene, add_pairs, register

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from drives import ape_rmse, drive
-from mapped_drives import mapped
 
 from hsloc.dataclass_json import to_json
 from hsloc.model import IDENTITY, Estimate, Odometry, PairedScan, Pose2, Scan, Status
@@ -17,6 +16,12 @@ from hsloc.slam.parameters import GraphMapperParameters
 
 if TYPE_CHECKING:
     from hsloc.slam.result import MappingResult
+
+
+def mapped(events: Any, parameters: Any = None, seed: int = 0) -> Any:
+    mapper = Mapper(parameters or GraphMapperParameters(), np.random.default_rng(seed))
+    said = [mapper.update(event) for event in events]
+    return mapper.finish(), said
 
 
 def scans_of(events: Any) -> Any:

@@ -1,8 +1,7 @@
-"""Scans of a room, and the terms of a pair of them."""
+"""Scans in a room of 6 x 4 m by hand, and the equations of a pair of them."""
 
 from __future__ import annotations
 
-from math import radians
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
 
     from hsloc.slam.keyscans import KeyScans
 
-DEGREE = radians(1.0)
+DEGREE = np.radians(1.0)
 
 
 def room_scan(pose: Pose2, *, beams: int = 181, noise: float = 0.0, seed: int = 0, increment: Any = DEGREE) -> Scan:

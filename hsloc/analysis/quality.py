@@ -100,8 +100,6 @@ def verdict_reasons(result: Result, warnings: Sequence[RunWarning]) -> tuple[Ver
         reasons += _of_the_map(result.mapping, result)
     if result.states is not None:
         reasons += localisation_reasons(result.states, result.trajectory)
-    elif 0.0 < _share(result) < 1.0:
-        reasons.append(_not_localised(result))
     return tuple(reasons)
 
 
@@ -128,22 +126,6 @@ def _of_the_map(mapping: MappingResult, result: Result) -> list[VerdictReason]:
 
 def _share(result: Result) -> float:
     return float(result.localised.mean()) if len(result.localised) else 0.0
-
-
-def _not_localised(result: Result) -> VerdictReason:
-    """The poses that are guesses, with the places where the pose was lost and found."""
-    trajectory = result.trajectory
-    spans = _runs(~result.localised)
-    last = len(trajectory) - 1
-    ends = [row for first, end in spans for row in (first - 1, end + 1) if 0 <= row <= last]
-    return VerdictReason(
-        Verdict.CHECK,
-        "poses_not_localised",
-        f"{100.0 * (1.0 - _share(result)):.1f} % of the poses are not localised: they are guesses",
-        "use the poses that are localised, or give the start (--initial-pose)",
-        places=tuple((float(x), float(y)) for x, y in trajectory.poses[ends, :2]),
-        times=_times(trajectory.stamps_ns, spans, result),
-    )
 
 
 def _unplaced(result: Result) -> tuple[tuple[float, float], ...]:

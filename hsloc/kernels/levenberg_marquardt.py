@@ -70,10 +70,12 @@ def polish(
         trial_total = normal_equations(packed, points, trial[0], trial[1], trial[2], trial_information, trial_gradient)
         evaluations += 1
         if trial_total > total:
-            pose[:] = trial
+            for j in range(3):  # scalars: rows assigned as a whole take the compiler seconds
+                pose[j] = trial[j]
+                gradient[j] = trial_gradient[j]
+                for k in range(3):
+                    information[j, k] = trial_information[j, k]
             total = trial_total
-            information[:] = trial_information
-            gradient[:] = trial_gradient
             damping = max(damping / 5.0, 1e-6)
         else:
             damping *= 10.0

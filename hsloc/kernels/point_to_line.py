@@ -34,6 +34,9 @@ _SAME_FACE = 0.7
 """Minimum cosine between the normals of one wall in two scans. Internal: 45 degrees, faces differ by 90 or 180."""
 _THROUGH = 0.25
 """Distance (m) by which a beam that looked through a point ends behind it. Internal: above errors of range."""
+_CLEARED = 4.0
+"""Depth (m) up to which a beam without a return has looked through. Internal: as where the map is built; beyond, a wall
+may have been out of range, or of glass."""
 
 
 class ScanArrays(NamedTuple):
@@ -272,6 +275,8 @@ def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: 
             known = 0
             for k in range(max(middle - 1, 0), min(middle + 2, n_beams)):
                 end = np.float64(ranges[first + k])
+                if end == np.inf:
+                    end = np.float64(_CLEARED)
                 if end == end:
                     known += 1
                     nearest = min(nearest, end)

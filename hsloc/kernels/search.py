@@ -157,7 +157,8 @@ def improve_memory(
             _improvise(memory, low, high, par, bandwidth, p.consideration_rate, rng, new)
             total = score_sum(packed, points, new[0], new[1], new[2], sums[worst])
             if total > sums[worst]:
-                memory[worst] = new
+                for j in range(3):  # scalars: a row assigned as a whole takes the compiler a second
+                    memory[worst, j] = new[j]
                 sums[worst] = total
                 if total > sums[best]:
                     best = worst
@@ -183,7 +184,8 @@ def improve_memory(
                 new[j] = min(max(value, low[j]), high[j])
             total = score_sum(packed, points, new[0], new[1], new[2], sums[i])
             if total > sums[i]:
-                memory[i] = new
+                for j in range(3):
+                    memory[i, j] = new[j]
                 sums[i] = total
                 if total > sums[best]:
                     best = i
@@ -235,7 +237,8 @@ def search(
         )
         restart += 1
         evaluations += spent
-        candidate[:] = memory[row]
+        for j in range(3):
+            candidate[j] = memory[row, j]
         if p.polish_iterations > 0:
             _, spent = polish(packed, few_points, candidate, low, high, p.polish_iterations, information)
             evaluations += spent
@@ -254,7 +257,8 @@ def search(
             agreed = 1
         if total > best_total:
             best_total = total
-            pose[:] = candidate
+            for j in range(3):
+                pose[j] = candidate[j]
         if p.restarts > 1 and agreed >= p.agreement:
             stopped = STOPPED_AGREEMENT
             break

@@ -11,8 +11,9 @@ from hsloc.errors import MapError
 from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import Pose2, wrap_angles
 from hsloc.slam.calibration import OdometryCalibration
+from hsloc.slam.evidence import Recorded, nothing_seen, weigh
 from hsloc.slam.joint_registration import Registration, moved_scans, refine
-from hsloc.slam.loop_closer import Loop, LoopCloser
+from hsloc.slam.loop_closer import TORN, LoopCloser, loop_edges
 from hsloc.slam.map_extension import connect, unconnected
 from hsloc.slam.map_session import from_front_end
 from hsloc.slam.map_state import MapState, fingerprint
@@ -28,17 +29,16 @@ if TYPE_CHECKING:
 
     from hsloc.slam.front_end import LocalMatch
     from hsloc.slam.keyscans import KeyScan, KeyScans
-    from hsloc.slam.loop_closer import LoopParameters
+    from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_session import MapSession
     from hsloc.slam.parameters import GraphMapperParameters, Resume
-    from hsloc.slam.submaps import Submaps
     from hsloc.slam.trajectory_correction import EventLog
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
-_MOST_TORN = 5
-"""Maximum number of repeated loop searches, each without the worst wrong loop. Internal: bounds the time."""
+_UNSETTLED_M = 0.01
+"""Another pass is made if 1 of 100 keyscans moved farther than this [m] in the last round: a fifth of a cell."""
 _RESIDUAL_SCANS = 400
 """Scans whose residuals are measured. Internal: a sample for the metrics, no pose depends on it."""
 
@@ -87,7 +87,37 @@ def finish(
         quality=_quality(refined, passes, loops, loop_edges, grid, gathered.scans),
         calibration=calibration,
         state=_state(gathered, refined.poses, loop_edges, grid, parameters),
+        evidence=weigh(_recorded(gathered, refined, loops, parameters.use_odometry)),
     )
+
+
+def _recorded(gathered: MapSession, refined: Registration, loops: list[Loop], use_odometry: bool) -> Recorded:
+    reference = gathered.places.reference
+    ends = np.array([(reference[loop.first], reference[loop.second]) for loop in loops], dtype=np.int64).reshape(-1, 2)
+    ranges = gathered.scans.ranges
+    measured = max(int((~np.isnan(ranges)).sum()), 1)
+    return Recorded(
+        stamps_ns=gathered.stamps_ns,
+        poses=refined.poses,
+        motions=gathered.motions,
+        covariances=gathered.covariances,
+        refused=gathered.refused,
+        odometry=_composed(gathered.steps.measured) if use_odometry else None,
+        pairs=refined.pairs,
+        counts=refined.counts,
+        loops=ends[[loop.accepted for loop in loops]],
+        torn=ends[[loop.reason.startswith(TORN) for loop in loops]],
+        no_return_share=float(np.isposinf(ranges).sum()) / measured,
+    )
+
+
+def _composed(steps: F64) -> F64:
+    """Poses (n, 3) from the steps (n - 1, 3) between them; the first is the origin."""
+    theta = np.concatenate(([0.0], np.cumsum(steps[:, 2])))
+    c, s = np.cos(theta[:-1]), np.sin(theta[:-1])
+    x = np.concatenate(([0.0], np.cumsum(c * steps[:, 0] - s * steps[:, 1])))
+    y = np.concatenate(([0.0], np.cumsum(s * steps[:, 0] + c * steps[:, 1])))
+    return np.column_stack((x, y, theta))
 
 
 def _connects(loop: Loop, gathered: MapSession) -> bool:
@@ -114,49 +144,11 @@ def _close_loops(
     gathered: MapSession, parameters: GraphMapperParameters, rng: Generator, progress: Callable[[float], None]
 ) -> tuple[F64, list[Loop], Edges]:
     """Poses of the keyscans with all loops closed, the loops, and those accepted as edges between keyscans."""
-    p, places, chain = parameters.loops, gathered.places, gathered.chain
-    torn: list[Loop] = []
-    while True:
-        banned = frozenset((loop.first, loop.second) for loop in torn)
-        closer = LoopCloser(places, gathered.scans, p, rng, banned, gathered.known, gathered.first_place)
-        closer.close(progress)
-        solved, edges, worst = _solved(closer, places, chain, p)
-        if worst is None or len(torn) >= _MOST_TORN:
-            break
-        # What was searched for after a wrong loop was searched for in wrong places: all of it once more, without it.
-        torn.append(worst)
-    loops = closer.loops
-    while worst is not None:
-        loops = [loop if loop.first != worst.first or loop.second != worst.second else worst for loop in loops]
-        closer.loops = loops
-        solved, edges, worst = _solved(closer, places, chain, p)
-    return solved, [*loops, *torn], edges
-
-
-def _solved(
-    closer: LoopCloser, places: Submaps, chain: Edges, parameters: LoopParameters
-) -> tuple[F64, Edges, Loop | None]:
-    """The graph of keyscans solved with the loops, and the loop that tears worst, if any does, as refused."""
-    edges = _between_keyscans(closer.loops, places, parameters.robust)
-    solved = solve_edges(places.expand(closer.poses), Edges.concatenate([chain, edges]))
-    _, _, chi = edge_errors(solved, edges)
-    if not (chi > parameters.max_edge_chi).any():
-        return solved, edges, None
-    loop = closer.accepted[int(np.argmax(chi))]
-    return solved, edges, replace(loop, accepted=False, reason=f"torn: {chi.max():.0f} sigma off, the graph solved")
-
-
-def _between_keyscans(loops: list[Loop], places: Submaps, robust: float) -> Edges:
-    accepted = [loop for loop in loops if loop.accepted]
-    if not accepted:
-        return Edges.none()
-    reference = places.reference
-    return Edges(
-        np.array([(reference[loop.first], reference[loop.second]) for loop in accepted], dtype=np.int64),
-        np.array([loop.T_first_second.to_array() for loop in accepted]),
-        np.array([np.linalg.inv(loop.covariance) for loop in accepted]),
-        np.full(len(accepted), robust),
-    )
+    p, places = parameters.loops, gathered.places
+    closer = LoopCloser(places, gathered.scans, p, rng, gathered.known, gathered.first_place)
+    closer.close(progress)
+    edges = loop_edges(closer.accepted, places.reference, p.robust)
+    return solve_edges(places.expand(closer.poses), Edges.concatenate([gathered.chain, edges])), closer.loops, edges
 
 
 def _refine(
@@ -164,11 +156,11 @@ def _refine(
 ) -> tuple[Registration, int]:
     """Passes over the whole log, each with partners chosen again, until nothing moves."""
     most, p = parameters.passes, parameters.joint_registration
-    # Later passes begin near their end: no wide gates, and fewer rounds.
-    later = replace(p, gates=p.gates[-1:], rounds=max(p.rounds // 2, 1))
+    # Later passes begin near their end: no wide gates.
+    later = replace(p, gates=p.gates[-1:])
     refined = refine(poses, scans, edges, p, lambda part: progress(part / most))
     passes = 1
-    while passes < most:
+    while passes < most and refined.moved >= _UNSETTLED_M:
         begin = refined.poses
         done = passes
         refined = refine(begin, scans, edges, later, lambda part: progress((done + part) / most))  # noqa: B023
@@ -242,6 +234,7 @@ def _empty(track: EventLog) -> MappingResult:
         quality=MappingQuality(nan, nan, nan, nan, 0, 0, nan, nan, nan, nan, 0, 0, 0.0),
         calibration=OdometryCalibration(),
         state=None,
+        evidence=nothing_seen(),
     )
 
 

@@ -52,7 +52,7 @@ class JointRegistrationParameters(Parameters):
     """Number of points that count as one independent measurement, as neighbouring beams share their errors."""
     points_per_scan: Count = 90
     """Approximate number of hits of a scan that are used."""
-    rounds: Count = 6
+    rounds: Count = 3
     """Maximum number of rounds in a pass."""
     convergence_tolerance: NonNegative = 0.002
     """Step below which a pass has converged [m], the 99th percentile over the poses; angles count 5 m/rad."""

@@ -76,10 +76,10 @@ class KeyScans:
             np.concatenate([scan.points for scan in scans]),
             np.concatenate([scan.normals for scan in scans]),
             np.concatenate([scan.centroids for scan in scans]),
-            _starts([len(scan.points) for scan in scans]),
+            starts_of([len(scan.points) for scan in scans]),
             np.concatenate([scan.hit_of_beam for scan in scans]),
             np.concatenate([scan.ranges for scan in scans]),
-            _starts([len(scan.ranges) for scan in scans]),
+            starts_of([len(scan.ranges) for scan in scans]),
             np.array([scan.geometry for scan in scans]),
         )
 
@@ -136,8 +136,9 @@ class KeyScans:
         for k in range(len(self)):
             count = choose_hits(self.normals[self.start[k] : self.start[k + 1]], most, row)
             parts.append(row[:count].copy())
-        return np.concatenate(parts), _starts([len(part) for part in parts])
+        return np.concatenate(parts), starts_of([len(part) for part in parts])
 
 
-def _starts(lengths: list[int]) -> I64:
+def starts_of(lengths: list[int]) -> I64:
+    """Where each of n parts begins if they are stored one after the other, and the end of the last, shape (n + 1,)."""
     return np.concatenate(([0], np.cumsum(lengths))).astype(np.int64)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.random import Generator
 
-    from hsloc.slam.loop_closer import Loop
+    from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_session import MapSession
     from hsloc.slam.map_state import MapState
     from hsloc.slam.parameters import GraphMapperParameters, Resume

@@ -9,8 +9,9 @@ import numpy as np
 
 from hsloc.model.estimate import Status
 from hsloc.model.pose2 import Pose2, compose_poses, relative_poses
+from hsloc.slam.front_end import odometry_chi, odometry_scale
 from hsloc.slam.keyscans import KeyScans
-from hsloc.slam.loop_closer import Loop
+from hsloc.slam.loop_matcher import Loop
 from hsloc.slam.pose_graph import Edges
 from hsloc.slam.submaps import UNKNOWN_STEP, Submaps
 
@@ -69,7 +70,7 @@ def from_front_end(
     poses = np.array([found.pose.to_array() for found in local])
     motions = np.array([found.motion.to_array() for found in local])
     covariances = np.array([found.covariance for found in local])
-    refused = np.array([found.status is Status.REJECTED for found in local], dtype=bool)
+    refused = np.array([found.status is Status.REJECTED or found.is_doubtful for found in local], dtype=bool)
     length, turn = parameters.loops.submap_length, parameters.front_end.turn_length
     return MapSession(
         scans=KeyScans.from_scans(scans),
@@ -159,5 +160,11 @@ def _odometry_edges(
     odometry = track.key_odometry()
     steps = relative_poses(odometry[:-1], odometry[1:])
     noise = parameters.front_end.odometry_noise
-    floored = [noise.covariance(Pose2.from_array(step)) + _ODOMETRY_FLOOR for step in steps]
+    chi = [
+        odometry_chi(Pose2.from_array(step), Pose2.from_array(motion), noise)
+        for step, motion, no in zip(steps, motions[1:], refused[1:], strict=True)
+        if not no
+    ]
+    scale = odometry_scale(chi)
+    floored = [scale**2 * noise.covariance(Pose2.from_array(step)) + _ODOMETRY_FLOOR for step in steps]
     return Edges.chain(steps, np.array(floored).reshape(-1, 3, 3), refused[1:])

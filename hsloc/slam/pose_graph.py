@@ -129,8 +129,13 @@ class PoseGraph:
         return PoseGraph(stamps, np.array(poses), Edges(pairs, measured, information, trusted))
 
 
-def solve_edges(poses: F64, edges: Edges, rounds: int = 20, still: float = 1e-5) -> F64:
+def solve_edges(
+    poses: F64, edges: Edges, rounds: int = 20, still: float = 1e-5, widened: tuple[float, ...] = ()
+) -> F64:
     """Gauss-Newton on a pose graph, robust weights recomputed in each round; the first pose stays.
+
+    In the first rounds the scales of the robust weights are multiplied by `widened`, so that edges which are far off at
+    the start pull at all (graduated non-convexity, Yang et al. 2020).
 
     Ends when no pose moves farther than `still` (m; rad).
     """
@@ -139,13 +144,14 @@ def solve_edges(poses: F64, edges: Edges, rounds: int = 20, still: float = 1e-5)
     poses = poses.copy()
     system = BlockSystem(len(poses), edges.pairs[:, 0], edges.pairs[:, 1])
     blocks = np.empty((len(edges), 3, 3))
-    for _ in range(rounds):
+    for k in range(rounds):
         diagonal, right = np.zeros((len(poses), 3, 3)), np.zeros((len(poses), 3))
+        scale = edges.scale * widened[k] if k < len(widened) else edges.scale
         equations = Equations(diagonal, blocks, right)
-        add_edges(poses, edges.pairs, edges.measured, edges.information, edges.scale, equations)
+        add_edges(poses, edges.pairs, edges.measured, edges.information, scale, equations)
         step = solve_anchored(system, diagonal, blocks, right)
         poses = apply_increment(poses, step)
-        if np.abs(step).max() < still:
+        if np.abs(step).max() < still and k >= len(widened):
             break
     return poses
 

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.model.pose2 import Pose2
     from hsloc.slam.calibration import OdometryCalibration
-    from hsloc.slam.loop_closer import Loop
+    from hsloc.slam.evidence import Evidence
+    from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_state import MapState
     from hsloc.slam.pose_graph import PoseGraph
 
@@ -76,3 +77,5 @@ class MappingResult:
     """What the map says of the odometry."""
     state: MapState | None
     """What is saved to go on from; None if no scan had a return."""
+    evidence: Evidence
+    """Whether the map is right, as far as what was recorded tells."""

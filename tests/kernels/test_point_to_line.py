@@ -1,45 +1,17 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from room_scans import DEGREE, room_scan, terms
 
-from hsloc.kernels.point_to_line import Term, bearing, choose_hits, pair_terms
+from hsloc.kernels.point_to_line import bearing, choose_hits
 from hsloc.model import Pose2, Scan
 from hsloc.slam.keyscans import KeyScan, KeyScans
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-DEGREE = np.radians(1.0)
-
-
-def room_scan(pose: Pose2, *, beams: int = 181, noise: float = 0.0, seed: int = 0, increment: Any = DEGREE) -> Scan:
-    """What a laser in a room of 6 x 4 m sees, by hand: the nearest of four walls."""
-    angles = pose.theta - increment * (beams - 1) / 2 + increment * np.arange(beams)
-    with np.errstate(divide="ignore"):
-        to_x = np.where(np.cos(angles) > 0, 6.0 - pose.x, -pose.x) / np.cos(angles)
-        to_y = np.where(np.sin(angles) > 0, 4.0 - pose.y, -pose.y) / np.sin(angles)
-    ranges = np.minimum(np.abs(to_x), np.abs(to_y))
-    ranges = ranges + noise * np.random.default_rng(seed).standard_normal(beams)
-    return Scan(0, ranges.astype(np.float32), -increment * (beams - 1) / 2, increment, 0.05, 30.0)
-
-
-def terms(
-    scans: KeyScans,
-    i: int,
-    j: int,
-    pose: NDArray[np.float64] | tuple[float, float, float],
-    *,
-    gate: float = 0.3,
-    scale: float = 1e6,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    information, gradient, counts = np.empty((3, 3)), np.empty(3), np.empty(5)
-    pair_terms(
-        i, j, np.array(pose, dtype=float), scans.arrays(10_000), gate, scale, Term(information, gradient), counts
-    )
-    return information, gradient, counts
 
 
 @pytest.fixture(scope="module")
@@ -133,3 +105,17 @@ def test_rare_directions_are_chosen_in_full() -> None:
     assert count == 20
     assert (np.diff(rows) > 0).all()
     assert np.ptp(rows[rows < 90]) > 70, "spread over the whole wall"
+
+
+def test_what_lies_beyond_a_short_range_was_not_looked_through() -> None:
+    """A lidar that sees 4 m has no return from farther walls: they are no conflict with what another scan saw there."""
+    pose = Pose2(1.0, 2.0, 0.0)
+    far = room_scan(pose)
+    short = Scan(0, np.where(far.ranges < 4.0, far.ranges, np.inf).astype(np.float32), far.angle_min, DEGREE, 0.05, 4.0)
+    scans = KeyScans.from_scans([KeyScan.of(far), KeyScan.of(short)])
+    _, _, counts = terms(scans, 0, 1, (0.0, 0.0, 0.0))
+    assert counts[1] == 0
+    assert counts[0] > 60
+    near = KeyScans.from_scans([KeyScan.of(room_scan(Pose2(3.5, 2.0, 0.0))), KeyScan.of(short)])
+    _, _, counts = terms(near, 0, 1, (0.0, 0.0, 0.0))
+    assert counts[1] > 10, "a wall 2.5 m ahead was looked through"

@@ -76,6 +76,25 @@ def test_a_wrong_loop_with_a_robust_weight_is_harmless() -> None:
     assert chi[0] > 50.0
 
 
+def test_a_doubtful_step_yields_to_loops_that_begin_far_off() -> None:
+    """Robust weights alone leave it where it is: at the start all loops look like outliers."""
+    true = np.column_stack((0.5 * np.arange(20), np.zeros(20), np.zeros(20)))
+
+    def edges(pairs: list[tuple[int, int]], sigma: float, scale: float) -> Edges:
+        ends = np.array(pairs)
+        information = np.tile(np.diag(1.0 / np.array((sigma, sigma, 0.2 * sigma)) ** 2), (len(pairs), 1, 1))
+        measured = relative_poses(true[ends[:, 0]], true[ends[:, 1]])
+        return Edges(ends, measured, information, np.full(len(pairs), scale))
+
+    chain = edges([(k, k + 1) for k in range(19)], 0.02, np.inf)
+    chain.measured[10, 0] += 1.0
+    chain.scale[10] = 1.0
+    both = Edges.concatenate([chain, edges([(4, 14), (5, 16)], 0.05, 2.0)])
+    start = dead_reckoned(true, chain)
+    assert np.abs(solve_edges(start, both) - true).max() > 0.9
+    assert np.abs(solve_edges(start, both, widened=(16.0, 8.0, 4.0, 2.0)) - true).max() < 0.01
+
+
 def test_without_edges_nothing_moves() -> None:
     poses = circle(5)
     np.testing.assert_array_equal(solve_edges(poses, Edges.none()), poses)

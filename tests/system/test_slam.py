@@ -14,7 +14,7 @@ from hsloc.evaluation.alignment import umeyama
 from hsloc.export.results_folder import write_results
 from hsloc.log import LogWriter, ReadOptions, open_log
 from hsloc.maps import load_map
-from hsloc.model import Scan
+from hsloc.model import Pose2, Scan
 from hsloc.replay.run import Result, run
 from hsloc.request import RunRequest
 
@@ -83,10 +83,31 @@ def test_intel_is_mapped_better_than_published(data: Path) -> None:
 
 
 @pytest.mark.data
-def test_aces_closes_its_loop(data: Path) -> None:
-    folder = data / "aces"
-    found = run(RunRequest(logs=(folder / "aces.clf.gz",)))
-    reference = np.loadtxt(folder / "aces.rbpf.txt")
-    poses = found.trajectory.interpolated(np.round(reference[:, 0] * 1e9).astype(np.int64))
-    moved = umeyama(reference[:, 1:3], poses[:, :2]) @ poses[:, :2]
-    assert np.hypot(*(moved - reference[:, 1:3]).T).mean() <= 0.20
+def test_freiburg_is_not_built_twice(data: Path) -> None:
+    """In this log's odometry reversing looks like driving forward: 1.19 m, and not a word."""
+    folder = data / "fr079"
+    read = ReadOptions(laser_pose=Pose2(-0.04, 0.0, 0.0))
+    found = run(RunRequest(logs=(folder / "fr079.clf.gz",), read=read))
+    result = evaluate_relations(found.trajectory, read_relations(folder / "fr079.relations"))
+    assert result.statistics.trans_part.mean <= 0.036
+    assert found.mapping is not None
+    assert found.mapping.evidence.verdict == "good"
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("log", "reference", "rmse"),
+    [
+        ("aces/aces.clf.gz", "aces/aces.rbpf.txt", 0.12),
+        ("seattle/seattle.clf.gz", "seattle/seattle.gfs.ref.txt", 0.10),
+        ("orebro/orebro.clf.gz", "orebro/orebro.gfs.ref.txt", 0.20),
+    ],
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_sparse_logs_are_mapped_whatever_the_seed(data: Path, log: str, reference: str, rmse: float, seed: int) -> None:
+    """One scan in 0.7 to 0.9 m; in Seattle's odometry a turn is missing, Orebro was a lottery over seeds."""
+    found = run(RunRequest(logs=(data / log,), seed=seed))
+    wanted = np.loadtxt(data / reference)
+    poses = found.trajectory.interpolated(np.round(wanted[:, 0] * 1e9).astype(np.int64))
+    moved = umeyama(wanted[:, 1:3], poses[:, :2]) @ poses[:, :2]
+    assert np.sqrt((np.hypot(*(moved - wanted[:, 1:3]).T) ** 2).mean()) <= rmse

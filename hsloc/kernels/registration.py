@@ -1,0 +1,165 @@
+"""One scan onto several others that stand still: point to line, with a prior on the pose.
+
+Gauss-Newton on the terms of `hsloc.kernels.point_to_line.pair_terms`, taken in both directions. A direction that no
+wall fixes has no gradient, so that there the pose stays where the prior has it. A field of scores does not have this
+property: it prefers the pose at which the scans overlap most.
+"""
+
+from __future__ import annotations
+
+from math import pi, sqrt
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hsloc.kernels.levenberg_marquardt import solve_damped
+from hsloc.kernels.normal_equations import Blocks, add_relative_term, relative
+from hsloc.kernels.point_to_line import ScanArrays, Term, pair_terms
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    F32 = NDArray[np.float32]
+    F64 = NDArray[np.float64]
+    I32 = NDArray[np.int32]
+    I64 = NDArray[np.int64]
+
+_STILL_M = 1e-4
+_STILL_RAD = 1e-5
+"""A step smaller than both ends the registration."""
+
+
+class RegistrationParameters(NamedTuple):
+    """How points are paired and weighed."""
+
+    gates: tuple[float, float, float]
+    """Maximum distance [m] of a point to the wall that it is paired with, in rounds 1, 2 and from 3 on."""
+    scale_of_gate: float
+    """Scale of the Geman-McClure weight, as a part of the gate."""
+    weight: float
+    """Information [1/m^2] of a paired point."""
+    prior_scale: float
+    """Scale of the Cauchy weight on the chi of the prior; infinite: the prior is trusted."""
+    rounds: int
+    """Gauss-Newton steps at most."""
+
+
+class Scene(NamedTuple):
+    """n scans, of which those from `first_moving` on move together and the others stand still."""
+
+    first_moving: int
+    scan_poses: F64
+    """Of the fixed scans in the map, of the moving ones as seen from the pose that is sought, shape (n, 3)."""
+    scans: ScanArrays
+
+
+class Prior(NamedTuple):
+    """What is known of the pose beforehand, in the map."""
+
+    pose: F64
+    information: F64
+    """Shape (3, 3)."""
+
+
+@njit(cache=True, nogil=True)
+def add_pairs(pose: F64, scene: Scene, gate: float, p: RegistrationParameters, term: Term, counts: F64) -> None:
+    """Add the equations of the scans that move with `pose` against those that stand still.
+
+    Adds to `term`, by (x, y, theta) of `pose` in the map, and to `counts` (5,) as in `pair_terms`.
+    """
+    first_moving = scene.first_moving
+    scan_poses = scene.scan_poses
+    information = term.information
+    gradient = term.gradient
+    moved = np.empty(3)
+    rel = np.empty(3)
+    one = Term(np.empty((3, 3)), np.empty(3))
+    tally = np.empty(5)
+    ha = np.empty((3, 3))
+    away = np.zeros((3, 3))
+    off = np.zeros((3, 3))
+    lost = np.zeros(3)
+    block = np.zeros((3, 3))
+    pull = np.zeros(3)
+    onto_first = Blocks(block, off, away, pull, lost)
+    onto_second = Blocks(away, off, block, lost, pull)
+    c = np.cos(pose[2])
+    s = np.sin(pose[2])
+    for k in range(first_moving, len(scan_poses)):
+        dx = c * scan_poses[k, 0] - s * scan_poses[k, 1]
+        dy = s * scan_poses[k, 0] + c * scan_poses[k, 1]
+        moved[0] = pose[0] + dx
+        moved[1] = pose[1] + dy
+        moved[2] = pose[2] + scan_poses[k, 2]
+        block[:] = 0.0
+        pull[:] = 0.0
+        for m in range(first_moving):
+            for direction in range(2):
+                i = k if direction == 0 else m
+                j = m if direction == 0 else k
+                if direction == 0:
+                    relative(scan_poses[m], moved, rel)
+                else:
+                    relative(moved, scan_poses[m], rel)
+                pair_terms(i, j, rel, scene.scans, gate, p.scale_of_gate * gate, one, tally)
+                counts += tally
+                for a in range(3):
+                    one.gradient[a] *= p.weight
+                    for b in range(3):
+                        one.information[a, b] *= p.weight
+                if direction == 0:
+                    add_relative_term(scan_poses[m], rel, one, onto_second, ha)
+                else:
+                    add_relative_term(moved, rel, one, onto_first, ha)
+        # From the moved scan's pose to `pose`: x and y shift with it, theta also swings the scan around it.
+        information += block
+        for a in range(3):
+            swing = block[a, 1] * dx - block[a, 0] * dy
+            information[a, 2] += swing
+            information[2, a] += swing
+        information[2, 2] += dx * dx * block[1, 1] + dy * dy * block[0, 0] - 2.0 * dx * dy * block[0, 1]
+        gradient += pull
+        gradient[2] += pull[1] * dx - pull[0] * dy
+
+
+@njit(cache=True, nogil=True)
+def register(pose: F64, scene: Scene, prior: Prior, p: RegistrationParameters, information: F64, counts: F64) -> float:
+    """Move `pose` (3,), in place, to where the moving scans fit the fixed ones and the prior best.
+
+    Writes the `information` (3, 3) of the pairs alone and their `counts` (5,), at the pose before the last step.
+    Returns the chi of that pose against the prior.
+    """
+    gradient = np.empty(3)
+    step = np.empty(3)
+    error = np.empty(3)
+    total = np.empty((3, 3))
+    term = Term(information, gradient)
+    chi2 = 0.0
+    for k in range(p.rounds):
+        gate = p.gates[min(k, 2)]
+        information[:] = 0.0
+        gradient[:] = 0.0
+        counts[:] = 0.0
+        add_pairs(pose, scene, gate, p, term, counts)
+        for a in range(3):
+            error[a] = pose[a] - prior.pose[a]
+        error[2] -= 2.0 * pi * np.round(error[2] / (2.0 * pi))
+        chi2 = 0.0
+        for a in range(3):
+            for b in range(3):
+                chi2 += error[a] * prior.information[a, b] * error[b]
+        weight = 1.0
+        if p.prior_scale < np.inf:
+            weight = p.prior_scale**2 / (p.prior_scale**2 + chi2)
+        for a in range(3):
+            for b in range(3):
+                total[a, b] = information[a, b] + weight * prior.information[a, b]
+                gradient[a] += weight * prior.information[a, b] * error[b]
+        solve_damped(total, gradient, 0.0, step)
+        for a in range(3):
+            pose[a] -= step[a]
+        still = abs(step[0]) < _STILL_M and abs(step[1]) < _STILL_M and abs(step[2]) < _STILL_RAD
+        if still and k >= 2:
+            break
+    return sqrt(chi2)

@@ -1,0 +1,275 @@
+"""Is the map right? What was recorded is held against the finished map.
+
+The scans' residuals cannot answer: each scan fits a map that was built from it, also where a corridor was built twice.
+What can is what the map was not built from, or not from alone: steps that the scans refused and no loop bridges, second
+visits that look through walls, the odometry over stretches that no loop spans, loops that were believed and then
+contradicted, stretches driven without seeing a wall.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from hsloc.model.pose2 import relative_poses, wrap_angles
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    F64 = NDArray[np.float64]
+    I64 = NDArray[np.int64]
+    Bools = NDArray[np.bool_]
+
+Verdict = Literal["good", "check", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """Why a map should be looked at: a code for scripts, a sentence, and where and when.
+
+    `places` are positions in the map (m), `times_s` pairs of seconds since the first keyscan. `verdict` is "check" or
+    "failed".
+    """
+
+    code: str
+    text: str
+    verdict: Verdict
+    places: tuple[tuple[float, float], ...] = ()
+    times_s: tuple[tuple[float, float], ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "code": self.code,
+            "text": self.text,
+            "verdict": self.verdict,
+            "places": [list(place) for place in self.places],
+            "times_s": [list(times) for times in self.times_s],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """The verdict on a map: the worst of its reasons, "good" without one."""
+
+    verdict: Verdict
+    reasons: tuple[Reason, ...] = ()
+
+    @staticmethod
+    def of(reasons: list[Reason]) -> Evidence:
+        """The worst first."""
+        ordered = sorted(reasons, key=lambda reason: reason.verdict != "failed")
+        return Evidence(ordered[0].verdict if ordered else "good", tuple(ordered))
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"verdict": self.verdict, "reasons": [reason.to_dict() for reason in self.reasons]}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """What the verdict is found from; n keyscans.
+
+    `poses` (n, 3) are final. `motions` and `covariances` lead to each keyscan from the one before, as the front end
+    had them; `refused` (n,) where it had not the scans' word. `odometry` (n, 3) is as recorded, None without any.
+    `pairs` (m, 2) of keyscans that see the same walls, with `counts` (m, 5) as in `kernels.point_to_line.pair_terms`.
+    `loops` (k, 2) are pairs of keyscans that accepted loops join, `torn` (j, 2) those of loops that the solved graph
+    contradicted. `no_return_share` is the part of the beams that met nothing.
+    """
+
+    stamps_ns: I64
+    poses: F64
+    motions: F64
+    covariances: F64
+    refused: Bools
+    odometry: F64 | None
+    pairs: I64
+    counts: F64
+    loops: I64
+    torn: I64
+    no_return_share: float
+
+    def lengths(self) -> F64:
+        """Metres to each keyscan from the one before."""
+        return np.asarray(np.hypot(self.motions[:, 0], self.motions[:, 1]), dtype=np.float64)
+
+    def spanned(self, loops: int = 1) -> Bools:
+        """Steps (n,) that lie between the two ends of so many accepted loops: a wrong one would have kept them open."""
+        change = np.zeros(len(self.poses) + 1, dtype=np.int64)
+        if len(self.loops):
+            low, high = self.loops.min(axis=1), self.loops.max(axis=1)
+            np.add.at(change, low + 1, 1)
+            np.add.at(change, high + 1, -1)
+        return np.asarray(np.cumsum(change)[: len(self.poses)] >= loops)
+
+
+_SECOND_VISIT_M = 12.0
+"""Metres of the way after which a place is visited again."""
+_VISIT_SEEN = 60.0
+"""Points that both visits could see, of a keyscan, without which its second visit says nothing."""
+_INCONSISTENT = 0.6
+"""Consistency of a second visit (points on walls, of those on walls or looked through) below which it is wrong."""
+_INCONSISTENT_M = 1.0
+"""Metres of such visits in a row: people and doors are passed sooner."""
+_FAILED_SHARE = 0.1
+"""Share of all second visits that fail a map."""
+_OPEN_STEPS = 3
+"""Refused steps in a row that no loop spans: fewer are bridged by the scans around them."""
+_OPEN_SIGMA_M = 0.4
+"""Standard deviation [m] of such steps together, of which one is enough: that of a step that the scans contradicted."""
+_OPEN_LOOPS = 2
+"""Accepted loops that verify the steps between their ends."""
+_HEALED = 0.9
+"""Consistency of the scans before and after refused steps at which these did no harm, as is asked of a loop."""
+_HEALED_WITHIN = 10
+"""Keyscans before and after that are compared."""
+_WINDOW = 20
+"""Keyscans over which odometry and map are compared."""
+_ODOMETRY_SHARE = 0.5
+"""Difference of the two, as a part of the way, that is not a matter of calibration."""
+_ODOMETRY_TURN = 0.5
+"""The same of the heading [rad]."""
+_BLIND_M = 2.0
+"""A step so many metres long, and five times the usual one, was driven without enough returns."""
+_BLIND_SHARE = 0.1
+_NO_RETURN_SHARE = 0.4
+"""On five real logs at most 0.03 of the beams meet nothing, cut to 4 m 0.27; where they erased walls 0.52 and more."""
+_MOST_NAMED = 20
+"""Places named in a reason, at most."""
+
+
+def weigh(recorded: Recorded) -> Evidence:
+    """The verdict on a map of at least one keyscan."""
+    found = [
+        _open_joints(recorded),
+        _second_visits(recorded),
+        _against_odometry(recorded),
+        _torn_loops(recorded),
+        _blind(recorded),
+        _no_returns(recorded),
+    ]
+    return Evidence.of([reason for reason in found if reason is not None])
+
+
+def nothing_seen() -> Evidence:
+    """The verdict where no scan had a return."""
+    return Evidence.of([Reason("blind", "no scan had enough returns: there is no map", "failed")])
+
+
+def _open_joints(r: Recorded) -> Reason | None:
+    """Runs of steps that only odometry holds: one loop over several of them shares out their errors as it likes."""
+    wrong = []
+    for first, last in _runs(r.refused & ~r.spanned(_OPEN_LOOPS)):
+        sigma = float(np.sqrt(np.trace(r.covariances[first : last + 1, :2, :2].sum(axis=0))))
+        if (last - first + 1 >= _OPEN_STEPS or sigma > _OPEN_SIGMA_M) and not _healed(r, first, last):
+            wrong.append((first, last))
+    if not wrong:
+        return None
+    text = f"{len(wrong)} joint(s) are held by odometry alone: the scans refused it, fewer than two loops span it"
+    return _reason(r, "open-joint", text, wrong, failed=False)
+
+
+def _healed(r: Recorded, first: int, last: int) -> bool:
+    """Whether the scans just before and after refused steps agree in the finished map after all."""
+    i, j = r.pairs.min(axis=1), r.pairs.max(axis=1)
+    across = (i < first) & (j >= last) & (j - i <= last - first + _HEALED_WITHIN)
+    paired, conflict = r.counts[across, :2].sum(axis=0)
+    return bool(paired >= _VISIT_SEEN and paired >= _HEALED * (paired + conflict))
+
+
+def _second_visits(r: Recorded) -> Reason | None:
+    """Second visits that look through the walls of the first."""
+    way = np.cumsum(r.lengths())
+    far = np.abs(way[r.pairs[:, 1]] - way[r.pairs[:, 0]]) > _SECOND_VISIT_M
+    n = len(r.poses)
+    paired, conflict = (
+        np.bincount(r.pairs[far].reshape(-1), weights=np.repeat(r.counts[far, k], 2), minlength=n) for k in (0, 1)
+    )
+    known = paired + conflict >= _VISIT_SEEN
+    if not known.any():
+        return None
+    bad = known & (paired < _INCONSISTENT * (paired + conflict))
+    wrong = [run for run in _runs(bad) if way[run[1]] - way[max(run[0] - 1, 0)] >= _INCONSISTENT_M]
+    if not wrong:
+        return None
+    share = sum(last - first + 1 for first, last in wrong) / int(known.sum())
+    text = f"{100.0 * share:.0f} % of the second visits look through walls of the first, in {len(wrong)} stretch(es)"
+    return _reason(r, "second-visit", text, wrong, failed=share > _FAILED_SHARE)
+
+
+def _against_odometry(r: Recorded) -> Reason | None:
+    """Stretches over which map and odometry differ by what no calibration explains, and that no loop spans."""
+    if r.odometry is None or len(r.poses) <= _WINDOW:
+        return None
+    ours = relative_poses(r.poses[:-_WINDOW], r.poses[_WINDOW:])
+    theirs = relative_poses(r.odometry[:-_WINDOW], r.odometry[_WINDOW:])
+    lengths, turns = zip(*(_driven(poses) for poses in (r.poses, r.odometry)), strict=True)
+    length, turn = np.minimum(*lengths), np.minimum(*turns)
+    apart = np.hypot(*(ours - theirs)[:, :2].T)
+    angle = np.abs(wrap_angles(ours[:, 2] - theirs[:, 2]))
+    # A turn at the beginning that is off by an angle swings the whole stretch.
+    off = (apart > _ODOMETRY_SHARE * length + 0.3) | (angle > _ODOMETRY_TURN + 0.2 * turn)
+    open_steps = np.cumsum(~r.spanned())
+    off &= open_steps[_WINDOW:] - open_steps[:-_WINDOW] == _WINDOW
+    wrong = [(first, min(last + _WINDOW, len(r.poses) - 1)) for first, last in _runs(off)]
+    if not wrong:
+        return None
+    text = f"map and odometry contradict each other over {len(wrong)} stretch(es) that no loop spans"
+    return _reason(r, "odometry", text, wrong, failed=False)
+
+
+def _driven(poses: F64) -> tuple[F64, F64]:
+    """Path length (m) and sum of turns (rad) of each window."""
+    steps = relative_poses(poses[:-1], poses[1:])
+    way = np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
+    turned = np.concatenate(([0.0], np.cumsum(np.abs(wrap_angles(steps[:, 2])))))
+    return way[_WINDOW:] - way[:-_WINDOW], turned[_WINDOW:] - turned[:-_WINDOW]
+
+
+def _torn_loops(r: Recorded) -> Reason | None:
+    """Loops that passed every test and were contradicted by the others."""
+    if len(r.torn) == 0 or len(r.torn) < 0.1 * (len(r.loops) + len(r.torn)):
+        return None
+    text = f"{len(r.torn)} of {len(r.loops) + len(r.torn)} loops contradict the others: one side is wrong"
+    ends = [(int(pair.max()), int(pair.max())) for pair in r.torn]
+    return _reason(r, "torn-loop", text, ends, failed=False)
+
+
+def _blind(r: Recorded) -> Reason | None:
+    """Stretches driven without enough returns to match."""
+    lengths = r.lengths()
+    if len(lengths) < 2 or lengths.sum() <= 0.0:
+        return None
+    long = lengths > max(_BLIND_M, 5.0 * float(np.median(lengths[1:])))
+    share = float(lengths[long].sum() / lengths.sum())
+    if share < _BLIND_SHARE:
+        return None
+    text = f"{100.0 * share:.0f} % of the path was driven with too few returns: the lidar sees too little here"
+    return _reason(r, "blind", text, _runs(long), failed=share > 0.5)
+
+
+def _no_returns(r: Recorded) -> Reason | None:
+    if r.no_return_share < _NO_RETURN_SHARE:
+        return None
+    text = f"{100.0 * r.no_return_share:.0f} % of the beams met nothing: where that is a fault they erase walls"
+    return Reason("no-returns", text, "check")
+
+
+def _reason(r: Recorded, code: str, text: str, runs: list[tuple[int, int]], *, failed: bool) -> Reason:
+    named = runs[:_MOST_NAMED]
+    seconds = (r.stamps_ns - r.stamps_ns[0]) * 1e-9
+    return Reason(
+        code,
+        text,
+        "failed" if failed else "check",
+        tuple((float(r.poses[last, 0]), float(r.poses[last, 1])) for _, last in named),
+        tuple((float(seconds[max(first - 1, 0)]), float(seconds[last])) for first, last in named),
+    )
+
+
+def _runs(flags: Bools) -> list[tuple[int, int]]:
+    """First and last index of each run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], flags, [False])).astype(np.int8)))
+    return [(int(first), int(end) - 1) for first, end in zip(edges[::2], edges[1::2], strict=True)]

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hsloc.slam.evidence import Recorded, nothing_seen, weigh
+
+N = 200
+
+
+@pytest.fixture
+def lap() -> Recorded:
+    """Two laps of a square of 10 m, keyscans each 0.4 m; the second lap sees the walls of the first."""
+    s = np.arange(N) * 0.4 % 40.0
+    side, along = (s // 10.0).astype(int), s % 10.0
+    corner, heading = np.array([(0, 0), (10, 0), (10, 10), (0, 10)])[side], np.pi / 2 * side
+    ahead = np.column_stack((np.cos(heading), np.sin(heading)))
+    poses = np.column_stack((corner + along[:, None] * ahead, heading))
+    pairs = np.column_stack((np.arange(100), np.arange(100, 200)))
+    return Recorded(
+        stamps_ns=np.arange(N) * 10**9,
+        poses=poses,
+        motions=np.tile((0.4, 0.0, 0.0), (N, 1)),
+        covariances=np.tile(np.diag((0.01, 0.01, 0.005)) ** 2, (N, 1, 1)),
+        refused=np.zeros(N, dtype=bool),
+        odometry=poses.copy(),
+        pairs=pairs,
+        counts=np.tile((150.0, 1.0, 180.0, 0.0, 150.0), (100, 1)),
+        loops=np.array([(10, 110)]),
+        torn=np.zeros((0, 2), dtype=np.int64),
+        no_return_share=0.1,
+    )
+
+
+def codes(recorded: Recorded) -> tuple[str, list[str]]:
+    found = weigh(recorded)
+    return found.verdict, [reason.code for reason in found.reasons]
+
+
+def test_a_right_map_is_good(lap: Recorded) -> None:
+    assert codes(lap) == ("good", [])
+
+
+def test_refused_steps_that_no_loop_spans_are_named(lap: Recorded) -> None:
+    refused = lap.refused.copy()
+    refused[150:153] = True
+    found = weigh(replace(lap, refused=refused))
+    assert found.verdict == "check"
+    (reason,) = found.reasons
+    assert reason.code == "open-joint"
+    assert reason.places == (tuple(lap.poses[152, :2]),)
+    assert reason.times_s == ((149.0, 152.0),)
+    assert json.loads(json.dumps(found.to_dict()))["reasons"][0]["code"] == "open-joint"
+    once = replace(lap, refused=np.roll(refused, -100))
+    assert codes(once) == ("check", ["open-joint"]), "a single loop shares out the errors of what it spans"
+    assert codes(replace(once, loops=np.array([(10, 110), (20, 120)]))) == ("good", [])
+
+
+@pytest.mark.parametrize(("counts", "codes_wanted"), [((90.0, 5.0), []), ((60.0, 60.0), ["open-joint"])])
+def test_scans_around_refused_steps_may_agree_after_all(
+    lap: Recorded, counts: tuple[float, float], codes_wanted: list[str]
+) -> None:
+    refused = lap.refused.copy()
+    refused[150:153] = True
+    around = replace(
+        lap,
+        refused=refused,
+        pairs=np.vstack((lap.pairs, (149, 154))),
+        counts=np.vstack((lap.counts, (*counts, 150.0, 0.0, 90.0))),
+    )
+    assert codes(around)[1] == codes_wanted
+
+
+def test_one_refused_step_matters_if_it_may_hide_much(lap: Recorded) -> None:
+    refused = lap.refused.copy()
+    refused[150] = True
+    assert codes(replace(lap, refused=refused)) == ("good", [])
+    covariances = lap.covariances.copy()
+    covariances[150] = np.diag((0.4, 0.4, 0.3)) ** 2
+    assert codes(replace(lap, refused=refused, covariances=covariances)) == ("check", ["open-joint"])
+
+
+@pytest.mark.parametrize(("wrong", "verdict"), [(5, "check"), (40, "failed")])
+def test_second_visits_that_look_through_walls_are_wrong(lap: Recorded, wrong: int, verdict: str) -> None:
+    counts = lap.counts.copy()
+    counts[20 : 20 + wrong, :2] = (50.0, 100.0)
+    assert codes(replace(lap, counts=counts)) == (verdict, ["second-visit"])
+
+
+def test_a_person_who_stands_in_the_way_is_no_wrong_map(lap: Recorded) -> None:
+    counts = lap.counts.copy()
+    counts[20:22, :2] = (50.0, 100.0)
+    assert codes(replace(lap, counts=counts)) == ("good", [])
+
+
+def test_odometry_that_contradicts_is_told_where_no_loop_spans(lap: Recorded) -> None:
+    odometry = lap.poses.copy()
+    odometry[150:, 0] += 8.0
+    assert codes(replace(lap, odometry=odometry)) == ("check", ["odometry"])
+    within = lap.poses.copy()
+    within[50:, 0] += 8.0
+    assert codes(replace(lap, odometry=within)) == ("good", [])
+    assert codes(replace(lap, odometry=None)) == ("good", [])
+
+
+def test_loops_that_contradict_each_other_are_told(lap: Recorded) -> None:
+    assert codes(replace(lap, torn=np.array([(20, 120), (30, 140)]))) == ("check", ["torn-loop"])
+
+
+def test_what_the_lidar_did_not_see_is_told(lap: Recorded) -> None:
+    motions = lap.motions.copy()
+    motions[60:70, 0] = 3.0
+    assert codes(replace(lap, motions=motions)) == ("check", ["blind"])
+    assert codes(replace(lap, no_return_share=0.6)) == ("check", ["no-returns"])
+    assert nothing_seen().verdict == "failed"

@@ -52,7 +52,7 @@ def localisation_reasons(rows: StateRows, trajectory: Trajectory) -> tuple[Verdi
         if part <= (TOLERATED_PREDICTED if state is State.PREDICTED else TOLERATED_SHARE):
             continue
         spans = _spans(np.array([each is state for each in rows.state]))
-        ends = [row for first, last in spans for row in (first - 1, last + 1) if 0 <= row < n]
+        firsts = [first for first, _ in spans]
         start = int(trajectory.stamps_ns.min())
         seconds = ((trajectory.stamps_ns - start) / 1e9).tolist()
         reasons.append(
@@ -61,7 +61,7 @@ def localisation_reasons(rows: StateRows, trajectory: Trajectory) -> tuple[Verdi
                 f"poses_{state.value}",
                 f"{100.0 * part:.1f} % of the poses are {_WORDS[state]}",
                 _REMEDIES[state],
-                places=tuple((float(x), float(y)) for x, y in trajectory.poses[ends, :2]),
+                places=tuple((float(x), float(y)) for x, y in trajectory.poses[firsts, :2]),
                 times=tuple((seconds[first], seconds[last]) for first, last in spans),
             )
         )

@@ -112,7 +112,7 @@ def test_a_reason_has_its_place_and_time() -> None:
     found = rows(localised=60, off_map=40)
     (reason,) = localisation_reasons(found, path(100))
     assert reason.text == "40.0 % of the poses are off the map, or the map has changed there"
-    assert reason.places == ((59.0, 0.0),)
+    assert reason.places == ((60.0, 0.0),)
     assert reason.times == ((60.0, 99.0),)
 
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.replay.run import Result
+    from hsloc.slam.result import MappingResult
 
 _MAX_WITHOUT_PLACE = 0.5
 """Fraction of scans without a place from which on the poses of the others are not to be trusted."""
@@ -95,31 +96,36 @@ def verdict_reasons(result: Result, warnings: Sequence[RunWarning]) -> tuple[Ver
         elif warning.code in _VERDICTS:
             verdict = _VERDICTS[WarningCode(warning.code)]
             reasons.append(VerdictReason(verdict, warning.code, warning.text, warning.remedy))
+    if result.mapping is not None:
+        reasons += _of_the_map(result.mapping, result)
     if result.states is not None:
         reasons += localisation_reasons(result.states, result.trajectory)
-    elif 0.0 < _share(result) < 1.0:
-        reasons.append(_not_localised(result))
     return tuple(reasons)
+
+
+_MAP_REMEDY = "look at the places on the map; try another --seed, --no-odom, or a cut of the log (--start, --end)"
+
+
+def _of_the_map(mapping: MappingResult, result: Result) -> list[VerdictReason]:
+    """What the mapper found against its own map."""
+    stamps, first = result.diagnostics.stamps_ns, result.trajectory.stamps_ns
+    # Its times begin with the first keyscan, those of a verdict with the first pose.
+    begin = (int(stamps[0]) - int(first[0])) / NS_PER_S if len(stamps) and len(first) else 0.0
+    return [
+        VerdictReason(
+            Verdict(reason.verdict),
+            reason.code.replace("-", "_"),
+            reason.text,
+            _MAP_REMEDY,
+            places=reason.places,
+            times=tuple((a + begin, b + begin) for a, b in reason.times_s),
+        )
+        for reason in mapping.evidence.reasons
+    ]
 
 
 def _share(result: Result) -> float:
     return float(result.localised.mean()) if len(result.localised) else 0.0
-
-
-def _not_localised(result: Result) -> VerdictReason:
-    """The poses that are guesses, with the places where the pose was lost and found."""
-    trajectory = result.trajectory
-    spans = _runs(~result.localised)
-    last = len(trajectory) - 1
-    ends = [row for first, end in spans for row in (first - 1, end + 1) if 0 <= row <= last]
-    return VerdictReason(
-        Verdict.CHECK,
-        "poses_not_localised",
-        f"{100.0 * (1.0 - _share(result)):.1f} % of the poses are not localised: they are guesses",
-        "use the poses that are localised, or give the start (--initial-pose)",
-        places=tuple((float(x), float(y)) for x, y in trajectory.poses[ends, :2]),
-        times=_times(trajectory.stamps_ns, spans, result),
-    )
 
 
 def _unplaced(result: Result) -> tuple[tuple[float, float], ...]:

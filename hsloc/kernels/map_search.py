@@ -185,7 +185,7 @@ def fit_boxes(
 ) -> tuple[F64, int, bool]:
     """The boxes of the finest level whose bound exceeds `needed` (a sum of scores).
 
-    `is_open[open_starts[k] + y * open_widths[k] + x]` says whether the square (x, y) of level k holds a place that
+    `is_open[open_starts[k] + y * open_widths[k] + x]` is whether the square (x, y) of level k holds a place that
     counts. `half_thetas[k]` is half the interval of headings at level k, that of the coarsest level divides the turn.
     Returns rows (x, y, theta, half, half, half_theta, bound) in cells, the boxes bounded, and whether it came to its
     end within `max_boxes` and `max_results`.
@@ -205,7 +205,7 @@ def fit_boxes(
     results = np.empty((256, 7), dtype=np.float64)
     found = 0
     boxes = 0
-    # One list of squares for each level; `first[k]` says where that of level k begins in the common stack.
+    # One list of squares for each level; `first[k]` is where the list of level k begins in the common stack.
     squares = np.empty((4096, 2), dtype=np.int32)
     first = np.zeros(coarsest + 3, dtype=np.int64)
     turn = np.zeros(coarsest + 1, dtype=np.int64)

@@ -122,6 +122,7 @@ class Relocaliser:
         self._path_length = 0.0
         self._renewed_at = 0.0
         self._explained: float | None = None
+        self._state = State.LOST
         self._usual = USUAL_EXPLAINED
         self._field = likelihood
         self._matcher = matcher
@@ -140,6 +141,7 @@ class Relocaliser:
         self._hypotheses = []
         self._T_odom_last = None
         self._explained = None
+        self._state = State.LOST
         self._seen.clear()
 
     def update(self, paired: PairedScan, odometry_count: int) -> RelocaliserResult:
@@ -254,7 +256,8 @@ class Relocaliser:
         pose = best.pose @ motion
         reason = f"{len(self._hypotheses)} hypotheses, best {best.mean:.2f}, lead {lead:.2f}, {best.scans} scans"
         evidence: Evidence | None = None
-        state = self._state(best, pose) if fresh else State.LOST
+        if fresh:
+            self._state = self._judge(best, pose)
         proven = fresh and ahead and self._is_proven(best)
         sure = proven or (fresh and ahead and ratio <= p.max_rival_ratio)
         if sure and self._check is not None:
@@ -272,7 +275,7 @@ class Relocaliser:
             reason,
             track,
             whole,
-            state,
+            self._state,
             evidence if sure else None,
         )
 
@@ -282,7 +285,7 @@ class Relocaliser:
         others = self._hypotheses[1:]
         return all(fits_better(best.history, other.history, confidence) for other in others) if others else False
 
-    def _state(self, best: Hypothesis, pose: Pose2) -> State:
+    def _judge(self, best: Hypothesis, pose: Pose2) -> State:
         """Why it is not sure: the best place does not fit, or several do."""
         p = self._parameters
         if self._check is not None and self._seen:

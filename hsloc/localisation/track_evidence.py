@@ -163,14 +163,15 @@ def usual_explained(rows: Sequence[TrackRow]) -> float:
     """The explained fitness that is usual at places that comparisons vouch for; that of a good map where none does.
 
     Where several comparisons vouch for the track, three quarters of the scans between them reach it: people and
-    furniture are usual there. With few, a quarter of the scans does.
+    furniture are usual there. With few, a quarter of the scans does. The
+    comparison of a relocalisation does not count: the place was chosen by it.
     """
     path = np.cumsum([row.evidence.distance for row in rows])
     explained = np.array([row.evidence.explained for row in rows])
     vouched = np.zeros(len(rows), dtype=np.bool_)
     comparisons = 0
     for k, row in enumerate(rows):
-        if rival_evidence(row.evidence.rival) >= 0.5 * MOST_FROM_RIVAL:
+        if row.status is Status.MATCHED and rival_evidence(row.evidence.rival) >= 0.5 * MOST_FROM_RIVAL:
             comparisons += 1
             vouched |= (path <= path[k]) & (path >= path[k] - _CERTIFIED_M)
     values = explained[vouched & np.isfinite(explained)]

@@ -48,7 +48,7 @@ _SAMPLE = 100
 _SMALLEST = 0.02
 """Cells by which a box moves points at least."""
 _INSIDE = 1e-6
-"""Part of a cell by which its corners are drawn in: a corner on the line between two squares is in neither."""
+"""Part of a cell by which its corners are moved inwards: a corner on the line between two squares is in neither."""
 _PLACES = 200_000
 """Cells that are looked at in one go, which bounds the memory."""
 _ROUNDING = 1e-6
@@ -138,7 +138,7 @@ class WholeMapSearch:
     def _seed(self, scaled: NDArray[np.float32]) -> tuple[Mode | None, int]:
         """A fit place, looked for with few points and a demand that falls; None where there is none.
 
-        That it is the fittest is not said: the demand on all others is made from it.
+        It need not be the fittest: the demand on all others is derived from it.
         """
         p = self._parameters
         few = scaled[:_SEED_POINTS]

@@ -2,7 +2,7 @@
 
 A search such as HIDE finds a pose and knows nothing of those it did not look at. Branch and bound over continuous boxes
 (hsloc/kernels/box_search.py) starts from that pose, rules out all others, or finds the fitter one. See
-docs/certificates.md for what this says about a robot, and what it does not.
+docs/certificates.md for what this states about a robot, and what it does not.
 """
 
 from __future__ import annotations

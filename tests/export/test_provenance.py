@@ -127,10 +127,11 @@ def test_every_option_survives_the_line(option: Option) -> None:
     """Request, line, command line, request: nothing that decides the files is lost."""
     if option.name in ("config", "duration_s"):  # written as --set and --end
         return
-    value = EXAMPLES.get(option.name, "/some/topic")
+    value = EXAMPLES.get(option.name, True if option.kind == "switch" else "/some/topic")
     request = RunRequest.from_values(["my logs/run.mcap"], {option.name: value})
     words = shlex.split(command(request))
     assert words[2] == "my logs/run.mcap"
-    assert any(word.startswith(option.flag) for word in words)
+    written_as = (option.flag, "--set=") if option.place == "config" else option.flag
+    assert any(word.startswith(written_as) for word in words)
     arguments = build_parser().parse(words[1:])
     assert run_request(arguments) == request

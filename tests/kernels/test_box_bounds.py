@@ -1,4 +1,4 @@
-"""No pose of a box is fitter than its bound: on drawn fields, on random ones, and on a real one."""
+"""No pose of a box is fitter than its bound: on a simulated field, on random ones, and on a real one."""
 
 from __future__ import annotations
 

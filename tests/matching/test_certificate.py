@@ -1,4 +1,4 @@
-"""What a certificate says is so, and the exact matcher keeps what it promises."""
+"""What a certificate states holds, and the exact matcher keeps what it promises."""
 
 from __future__ import annotations
 

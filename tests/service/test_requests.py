@@ -19,8 +19,10 @@ from paths import RECORDINGS
 from hsloc_service.auth import Tokens
 from hsloc_service.db.tables import AssetRow
 from hsloc_service.housekeeping import Housekeeping
+from hsloc_service.http.schemas import JobRequest
 from hsloc_service.results.store import Asset
 from hsloc_service.settings import Settings
+from hsloc_service.stored_request import ALWAYS, ALWAYS_READ, plain
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -291,3 +293,14 @@ def test_what_has_not_changed_is_304_and_the_rest_is_compressed(make_live: Calla
         assert (again.status_code, again.content) == (304, b"")
         submit(client)
         assert client.get("/v1/jobs", headers={"If-None-Match": packed.headers["etag"]}).status_code == 200
+
+
+def test_a_request_is_kept_as_version_0_1_kept_it() -> None:
+    """An Idempotency-Key from before an update still finds its job: new options that are as usual are left out."""
+    request = JobRequest.model_validate({"log": str(uuid.uuid4()), "read": {"start_s": 1.0}})
+    kept = plain(request.model_dump())
+    assert set(kept) == {"log", *ALWAYS}
+    assert set(kept["read"]) == set(ALWAYS_READ)
+    more = JobRequest.model_validate({"log": request.log, "max_ape": 0.1, "read": {"stamps": "log"}})
+    assert {"max_ape", *kept} == set(plain(more.model_dump()))
+    assert plain(more.model_dump())["read"]["stamps"] == "log"

@@ -25,9 +25,10 @@ def test_wean_hall_from_an_unknown_start(data: Path, name: Any) -> None:
     reference = np.loadtxt(folder / f"{name}.pf.ref.txt")
     poses = found.trajectory.interpolated(np.round(reference[:, 0] * 1e9).astype(np.int64))
     metres = np.hypot(poses[:, 0] - reference[:, 1], poses[:, 1] - reference[:, 2])
-    assert found.localised.all()
-    assert metres.max() < 0.5
-    assert np.median(metres) < 0.25
+    certain = reference[:, 4] < 0.2  # the reference's own spread (m): less so where its runs have just converged
+    assert found.localised.mean() > 0.9
+    assert metres[certain].max() < 0.6
+    assert np.median(metres) < 0.15
 
 
 @pytest.mark.parametrize("log", ["mcap_zstd/mcap_zstd.mcap", "macfirst_floor_take_2/macfirst_floor_take_2_0.db3"])

@@ -1,0 +1,161 @@
+"""False certainty in simulation: poses that are wrong by more than 0.25 m or 5 deg and called localised.
+
+    python benchmarks/false_certainty.py [--seed N] [CASE ...]
+
+A line for each case: share of wrong poses called localised, share of right poses called anything else, and the mean
+normalised estimation error squared of the matched poses (3 is expected), with the coverage of the 95 % ellipsoid.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from hsloc.config import Config
+from hsloc.localisation.localiser import Localiser
+from hsloc.matching import LikelihoodField
+from hsloc.model import Event, OccupancyGrid, PairedScan, Pose2, Scan, Status, Truth, wrap_angles
+from hsloc.replay.engine import replay
+from hsloc.replay.run_history import RunHistory
+from hsloc.simulation import presets
+from hsloc.simulation.built_in import built_in
+from hsloc.simulation.odometer import OdometryNoise
+from hsloc.simulation.scenario import Kidnap, Scenario
+from hsloc.simulation.simulator import events
+from hsloc.simulation.world import World
+
+NOISE_20 = OdometryNoise(4e-2, 2.4e-3, 8e-2, 4e-2)
+PLAIN = World(
+    "plain",
+    np.array([(0, 0, 60, 0), (60, 0, 60, 2.2), (60, 2.2, 0, 2.2), (0, 2.2, 0, 0)], dtype=np.float64),
+    np.array([(12.0, 1.1), (48.0, 1.1)]),
+)
+PLAIN_DRIVE = Scenario(
+    "plain",
+    robot=presets.BRISK,
+    sensor=replace(presets.AHEAD, range_max=8.0),
+    odometry=presets.DRIFTING,
+)
+OFFICE = replace(presets.OFFICE, duration_s=90.0)
+HALL = replace(presets.HALL, duration_s=90.0)
+LOOP = presets.CORRIDOR_LOOP
+SYMMETRIC = replace(presets.preset("symmetric-corridor"), laps=1.5)
+
+Change = Callable[[OccupancyGrid], OccupancyGrid]
+
+
+def same(grid: OccupancyGrid) -> OccupancyGrid:
+    return grid
+
+
+def known(share: float) -> Change:
+    """The map is known up to a share of its width."""
+
+    def cut(grid: OccupancyGrid) -> OccupancyGrid:
+        cells = grid.cells.copy()
+        cells[:, int(share * cells.shape[1]) :] = -1
+        return replace(grid, cells=cells)
+
+    return cut
+
+
+def mirrored(grid: OccupancyGrid) -> OccupancyGrid:
+    return replace(grid, cells=np.ascontiguousarray(grid.cells[:, ::-1]))
+
+
+def map_of(world: str) -> Change:
+    return lambda _: built_in(world).occupancy_grid(0.05)
+
+
+CASES: dict[str, tuple[Scenario, Change, float]] = {
+    "office": (OFFICE, same, 0.0),
+    "loop": (LOOP, same, 0.0),
+    "hall": (HALL, same, 0.0),
+    "office, half its map": (OFFICE, known(0.5), 0.0),
+    "office, two thirds": (OFFICE, known(0.667), 0.0),
+    "loop, half its map": (LOOP, known(0.5), 0.0),
+    "hall, half its map": (HALL, known(0.5), 0.0),
+    "office, map of the loop": (OFFICE, map_of("corridor-loop"), 0.0),
+    "hall, map of the office": (HALL, map_of("office"), 0.0),
+    "office, mirrored": (OFFICE, mirrored, 0.0),
+    "loop, mirrored": (LOOP, mirrored, 0.0),
+    "office, kidnapped": (replace(OFFICE, kidnaps=(Kidnap(30.0, 21.0),)), same, 0.0),
+    "loop, kidnapped": (replace(LOOP, kidnaps=(Kidnap(30.0, 25.0),)), same, 0.0),
+    "symmetric": (SYMMETRIC, same, 0.0),
+    "symmetric, kidnapped": (replace(SYMMETRIC, kidnaps=(Kidnap(20.0, 12.0),)), same, 0.0),
+    "plain corridor": (PLAIN_DRIVE, same, 0.0),
+    "office, crowd of 50 %": (OFFICE, same, 0.5),
+    "loop, crowd of 50 %": (LOOP, same, 0.5),
+    "office, noise x 20": (replace(OFFICE, odometry=NOISE_20), same, 0.0),
+    "loop, noise x 20": (replace(LOOP, odometry=NOISE_20), same, 0.0),
+    "hall, noise x 20": (replace(HALL, odometry=NOISE_20), same, 0.0),
+}
+"""Scenario, what becomes of its map, and the share of beams that a crowd blocks."""
+
+
+def crowded(drive: list[Event], share: float, seed: int) -> Iterator[Event]:
+    """Twelve sectors that wander around the robot see something 0.6 to 1.6 m away."""
+    rng = np.random.default_rng(seed)
+    phase, speed = rng.uniform(0.0, 2.0 * np.pi, 12), rng.normal(0.0, 0.5, 12)
+    for event in drive:
+        if isinstance(event, Scan):
+            time = (event.stamp_ns - drive[0].stamp_ns) * 1e-9
+            ranges, bearing = event.ranges.copy(), event.angles() + event.T_base_laser.theta
+            for k in range(12):
+                inside = np.abs(wrap_angles(bearing - phase[k] - speed[k] * time)) < share * np.pi / 12.0
+                ranges[inside] = np.minimum(ranges[inside], 1.1 + 0.5 * np.sin(0.3 * time + k))
+            yield replace(event, ranges=ranges.astype(np.float32))
+        else:
+            yield event
+
+
+def measure(name: str, seed: int, is_known: bool) -> str:
+    scenario, change, crowd = CASES[name]
+    world = PLAIN if scenario.world == "plain" else built_in(scenario.world)
+    drive = list(events(replace(scenario, seed=seed), world))
+    grid = change(world.occupancy_grid(0.05))
+    field, config = LikelihoodField.from_grid(grid), Config()
+    start: Pose2 | None = world.start() if is_known else None
+    rng = np.random.default_rng(seed)
+    localiser = Localiser.from_parameters(grid, field, config.make_matcher(), config.localiser, rng, start)
+    history, squared = RunHistory(), []
+    truth: Truth | None = None
+    for event, estimate in replay(crowded(drive, crowd, seed) if crowd else drive, localiser):
+        history.add(event, estimate)
+        truth = event if isinstance(event, Truth) else truth
+        at_truth = isinstance(event, PairedScan) and truth is not None and truth.stamp_ns == event.scan.stamp_ns
+        if at_truth and estimate is not None and estimate.covariance is not None and estimate.status is Status.MATCHED:
+            off = estimate.T_map_base.to_array() - truth.T_map_base.to_array()
+            off[2] = wrap_angles(off[2:])[0]
+            if np.hypot(off[0], off[1]) < 0.25:
+                squared.append(off @ np.linalg.solve(estimate.covariance, off))
+    trajectory, _ = history.trajectory()
+    states, reference = history.states(), history.reference()
+    assert states is not None
+    assert reference is not None
+    off = trajectory.poses - reference.poses
+    wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.25) | (np.abs(wrap_angles(off[:, 2])) > np.radians(5.0))
+    wrong |= "mirrored" in name or "map of" in name
+    localised = states.is_localised()
+    doubted = (~wrong & ~localised).sum() / max((~wrong).sum(), 1)
+    nees = f"{np.mean(squared):6.2f} {100.0 * np.mean(np.array(squared) < 7.81):5.1f} %" if squared else ""
+    start_name = "given" if is_known else "unknown"
+    return f"{name:26s} {start_name:8s} {100.0 * (wrong & localised).mean():5.1f} % {100.0 * doubted:5.1f} % {nees}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"of {'; '.join(CASES)}")
+    arguments = parser.parse_args()
+    print("case, start: wrong and localised, right and not localised, NEES, coverage")
+    for name in arguments.cases or CASES:
+        for is_known in (True, False):
+            print(measure(name, arguments.seed, is_known), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -98,7 +98,7 @@ def verdict_reasons(result: Result, warnings: Sequence[RunWarning]) -> tuple[Ver
             reasons.append(VerdictReason(verdict, warning.code, warning.text, warning.remedy))
     if result.mapping is not None:
         reasons += _of_the_map(result.mapping, result)
-    if result.states is not None:
+    if result.states is not None and (_share(result) > 0.0 or not reasons):
         reasons += localisation_reasons(result.states, result.trajectory)
     return tuple(reasons)
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class PosedEvent(NamedTuple):
-    """A scan or an odometry message with the result's poses at its stamp, and whether these are localised."""
+    """A scan or an odometry message with the result's poses at its stamp, and whether these follow a track."""
 
     event: Odometry | PairedScan
     T_map_odom: Pose2
@@ -34,7 +34,8 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
     part that is done.
     """
     log = open_log(result.request.logs, result.request.reading())
-    poses, odometry, localised = result.trajectory.poses, result.odometry.poses, result.localised
+    poses, odometry = result.trajectory.poses, result.odometry.poses
+    localised = result.localised if result.tracked is None else result.tracked
     first = None if result.follows_scans else Pose2.from_array(odometry[0])
     row = -1
 

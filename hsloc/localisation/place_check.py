@@ -96,22 +96,23 @@ class PlaceCheck:
         self._pooled: NDArray[np.float32] | None = None
 
     def explain(self, paired: PairedScan, pose: Pose2) -> Explanation:
-        """What the map explains of a scan, its companions included, with the base at `pose` in the map."""
-        classes, scores = [], []
-        for one in (paired, *paired.companions):
-            T_map_base = pose if one is paired else pose @ paired.to(one)
-            found, score = self._classify(one, T_map_base)
-            classes.append(found)
-            scores.append(score)
-        beam, score = np.concatenate(classes), np.concatenate(scores)
+        """What the map explains of a scan with the base at `pose` in the map.
+
+        Of several lasers that of which it explains most: one that is mounted otherwise than stated says nothing.
+        """
+        found = [self._explained(paired, pose)]
+        found += [self._explained(other, pose @ paired.to(other)) for other in paired.companions]
+        return max(found, key=lambda one: one.fitness)
+
+    def _explained(self, paired: PairedScan, T_map_base: Pose2) -> Explanation:
+        beam, score = self._classify(paired, T_map_base)
         n = len(beam)
         if n == 0:
             return Explanation(0.0, 0.0, 0.0, 0.0)
         counts = np.bincount(beam, minlength=4)
-        short = int(counts[SHORT])
         judged = (beam != SHORT) & (beam != UNMAPPED)
         fitness = float(score[judged].sum()) / int(judged.sum()) if judged.any() else 0.0
-        return Explanation(fitness, short / n, int(counts[THROUGH]) / n, int(counts[UNMAPPED]) / n)
+        return Explanation(fitness, int(counts[SHORT]) / n, int(counts[THROUGH]) / n, int(counts[UNMAPPED]) / n)
 
     def _classify(self, paired: PairedScan, T_map_base: Pose2) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
         points = paired.scan.points_base()

@@ -24,14 +24,17 @@ if TYPE_CHECKING:
 
 _POINT_SIGMA = 0.02
 """Standard deviation of a point from its wall (m): the range noise of indoor lidars, 1 to 3 cm by their data sheets."""
+_LEAST_ON_WALLS = 0.5
+"""Share of points on walls below which the world is one of points, or the lidar too coarse to show walls."""
 _MAX_GAP = 0.2
 """Neighbouring points of one wall lie as near as this (m), and farther apart with distance."""
 
 
-def match_information(points: F64, field: LikelihoodField, pose: Pose2) -> F64:
+def match_information(points: F64, field: LikelihoodField, pose: Pose2) -> F64 | None:
     """Information (3, 3) of (x, y, theta) in the map frame (1/m^2, 1/rad^2) of points (n, 2) in the order of the beams.
 
-    Zero in directions that no wall holds. The wall's own variance is that of a place within a cell.
+    Zero in directions that no wall holds; None where most points show no wall, so that nothing is known of it.
+    The wall's own variance is that of a place within a cell.
     """
     if len(points) == 0:
         return np.zeros((3, 3))
@@ -41,6 +44,8 @@ def match_information(points: F64, field: LikelihoodField, pose: Pose2) -> F64:
     point_scores(field.packed, field.scale(points), cells[0], cells[1], cells[2], scores)
     normals = np.empty_like(points)
     wall_normals(points, _MAX_GAP, _POINT_SIGMA**2, normals)
+    if np.count_nonzero(np.abs(normals).sum(axis=1)) < _LEAST_ON_WALLS * len(points):
+        return None
     metres = cells * (field.resolution, field.resolution, 1.0)
     rows = np.empty(len(points), dtype=np.int64)
     wall_rows(points, normals, metres, field.resolution, rows)

@@ -73,7 +73,8 @@ class Result:
     `trajectory` has one pose for each odometry message; where there are none, one for each scan. `localised` says
     which of them are believed. `grid` is the map that was used, or, in `mode` "slam", the one that was drawn; then
     `true_grid` is the one that the log carries, if any. `likelihood` is the field that was matched on, of a given map.
-    `states` are the states of the poses of a localiser that weighs evidence; `localised` are those in this state.
+    `states` are the states of the poses of a localiser that weighs evidence; `localised` are those in this state,
+    `tracked` the poses that were not searched for, whether their scans fit or not.
     With `lidar_only` the log's odometry was not used: a localiser's `odometry` is then that of the scans. `deskewed`
     says whether the beams were moved to where the robot was when each was measured.
     """
@@ -95,6 +96,7 @@ class Result:
     true_grid: OccupancyGrid | None = None
     likelihood: LikelihoodField | None = None
     states: StateRows | None = None
+    tracked: NDArray[np.bool_] | None = None
     lidar_only: bool = False
     deskewed: bool = False
 
@@ -228,6 +230,7 @@ def _run_with(
         grid = estimator.grid()
     trajectory, localised = history.trajectory() if mapping is None else _mapped(history, mapping)
     states = history.states() if localise else None
+    tracked = localised
     if states is not None:
         localised = states.is_localised()
     return Result(
@@ -248,6 +251,7 @@ def _run_with(
         true_grid=true_grid,
         likelihood=likelihood,
         states=states,
+        tracked=tracked,
         lidar_only=lidar_only,
         deskewed=deskew,
     )

@@ -1,8 +1,9 @@
-"""The front end: each scan against the scans just before it.
+"""The front end: each scan against the keyscans just before it.
 
-Odometry predicts, HIDE searches the box of the prediction on a field drawn from the recent keyscans, and prediction
-and match are weighed by their covariances. A scan that moved far enough becomes a keyscan. Drift is left to the loop
-closer, precision to the refinement.
+Odometry predicts, and the scan is registered onto the last keyscans, point to line, with the prediction as prior.
+Where that is refused, or the prediction is too uncertain to begin at, HIDE searches on the field of the local map. A
+step that contradicts the odometry, or through whose walls scans have looked, is doubtful. A scan that moved far enough
+becomes a keyscan. Drift is left to the loop closer, precision to the joint registration.
 """
 
 from __future__ import annotations

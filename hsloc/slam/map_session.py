@@ -35,9 +35,10 @@ _ODOMETRY_FLOOR = np.diag((0.01**2, 0.01**2, 0.005**2))
 class MapSession:
     """Keyscans at `poses` (n, 3), not yet corrected, and what was measured between them.
 
-    `motions` (n, 3) and `covariances` (n, 3, 3) lead to each keyscan from the one before, by the front end; `refused`
-    (n,): by odometry alone. `steps` (n - 1) are for the refinement. `known` loops are believed already. Keyscans
-    from `first` on, and places from `first_place` on, are those of the log that was read.
+    `motions` (n, 3) and `covariances` (n, 3, 3) lead to each keyscan from the one before, by the front end;
+    `refused` (n,): by odometry alone, or doubtful. `steps` (n - 1) are for the refinement. `known` loops are
+    believed already. Keyscans from `first` on, and places from `first_place` on, are those of the log that was
+    read.
     """
 
     scans: KeyScans

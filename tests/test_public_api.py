@@ -106,7 +106,7 @@ def test_a_built_map_has_no_covariances() -> None:
         ("nowhere.mcap", {}, "nowhere.mcap: no such file"),
         ([], {}, "no log was named"),
         (SLIP, {"matchr": "icp"}, "no option is called 'matchr'; did you mean matcher?"),
-        (SLIP, {"matcher": 3}, "matcher is 3; it must be one of hide, harmony_search, icp, or an object"),
+        (SLIP, {"matcher": 3}, "matcher is 3; it must be one of hide, harmony_search, icp, exact, or an object"),
         (SLIP, {"matcher": "magic"}, "matcher is 'magic'"),
         (SLIP, {"initial_pose": (1.0, 2.0)}, "initial_pose is (1.0, 2.0); it must be x, y [m], yaw [rad]"),
         (SLIP, {"seed": -1}, "--seed is -1; it must be a number of 0 or more"),

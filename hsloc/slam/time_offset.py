@@ -44,6 +44,8 @@ _NEAR_S = 0.5
 """Half-width of the search where nothing is known of the clocks but that the run did not get lost (s)."""
 _LEAST_TURNED = 1.0
 """Sum of rotation (rad) without which the offset is not determined."""
+_LONGEST_HALF_S = 0.5
+"""Half of a sweep that is longer (s) is an error of time_increment, not a lidar that turns so slowly."""
 _MIN_STEPS = 20
 _HUBER = 1.345
 """Scale of the robust weights in standard deviations (Huber 1981): 95 % efficient on Gaussian errors."""
@@ -163,6 +165,8 @@ def estimate_offset(
     """
     odometry: list[tuple[int, float]] = []
 
+    middles: dict[int, int] = {}
+
     def kept() -> Iterable[Event]:
         count, last_ns = 0, 0
         for event in events:
@@ -174,10 +178,11 @@ def estimate_offset(
                 count += 1
                 if count <= most_scans:
                     last_ns = event.stamp_ns
+                    middles[event.stamp_ns] = event.stamp_ns + _half_sweep_ns(event)
                     yield event
 
     matched = with_laser_odometry(kept(), parameters, rng)
-    scans = [(event.stamp_ns, event.T_odom_base.theta) for event in matched if isinstance(event, Odometry)]
+    scans = [(middles[event.stamp_ns], event.T_odom_base.theta) for event in matched if isinstance(event, Odometry)]
     if not scans or not odometry:
         return UNKNOWN
     seen, told = _headings(scans), _headings(odometry)
@@ -189,6 +194,12 @@ def estimate_offset(
     if isfinite(near.sigma) and _misfit(seen, told, near.seconds) <= 1.2 * _misfit(seen, told, whole.seconds):
         return near
     return whole
+
+
+def _half_sweep_ns(scan: Scan) -> int:
+    """From the first beam to the middle of a scan: a lidar that turns shows the heading of then (ns)."""
+    half = 0.5 * max(len(scan.ranges) - 1, 0) * scan.time_increment
+    return round(half * NANOSECONDS) if abs(half) <= _LONGEST_HALF_S else 0
 
 
 def _headings(pairs: list[tuple[int, float]]) -> Headings:

@@ -116,9 +116,9 @@ def test_a_map_that_says_free_where_it_means_unknown_is_noted(tmp_path: Path) ->
     grid = OccupancyGrid(np.pad(np.zeros((40, 40), dtype=np.int8), 10, constant_values=-1), 0.1)
     grid.cells[10, 10:50] = 100
     yaml = save_map(grid, tmp_path / "m")
-    assert load_world(yaml).notes == ()  # type: ignore[attr-defined]
+    assert load_world(yaml).warnings == ()
     yaml.write_text(yaml.read_text().replace("0.196", "0.25"))
-    assert "free_thresh" in load_world(yaml).notes[0]  # type: ignore[attr-defined]
+    assert "free_thresh" in str(load_world(yaml).warnings[0])
 
 
 def test_a_map_without_room_for_the_robot_is_refused(tmp_path: Path) -> None:

@@ -40,7 +40,10 @@ def test_turtlebot_from_an_unknown_start(data: Path, log: Any) -> None:
     found = run(request)
     assert found.localised.all()
     metrics = analyse(found).metrics
-    assert metrics.verdict == "good"
-    assert metrics.warnings == found.warnings
+    # The stamps of this robot's lidar are a tenth of a second late, which is the one thing to say against the result.
+    (offset,) = metrics.warnings[len(found.warnings) :]
+    assert metrics.warnings[: len(found.warnings)] == found.warnings
+    assert offset.code.startswith("clock_offset")
+    assert {reason.code for reason in metrics.verdict_reasons} <= {"clock_offset_large"}
     assert metrics.map.residuals.within_15_cm >= 0.85  # type: ignore[operator]
     assert any(warning.code == "map_unknown_read_as_free" for warning in found.warnings)

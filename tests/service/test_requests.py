@@ -125,7 +125,7 @@ def test_relations_that_cannot_be_read_are_told_at_once(make_client: Callable[..
     relations = upload(client, b"1 2 0 0 0 0 0 0\n1 2 3\n", "wrong.relations")
     job = client.post("/v1/jobs", json={"log": log, "relations": relations}).json()["id"]
     ended = wait(client, job, 60.0)
-    assert (ended["state"], ended["reason"]) == ("failed", "invalid_input")
+    assert (ended["state"], ended["reason"]) == ("failed", "invalid_input"), ended
     assert ended["message"].startswith("wrong.relations, line 2: 3 columns")
     phases = [row["phase"] for row in events(client, job) if "phase" in row]
     assert "replay" not in phases

@@ -18,6 +18,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import hsloc
+import hsloc_service
 from hsloc_service.execution import landlock
 from hsloc_service.logs import log
 from hsloc_service.settings import SettingsError
@@ -73,6 +75,8 @@ class Sandbox:
         found = {Path(path).absolute() for path in (sys.prefix, sys.base_prefix, *sysconfig.get_paths().values())}
         found |= {Path(path).absolute() for path in sys.path if path}
         found |= {path for path in map(Path, os.environ.get("PYTHONPATH", "").split(":")) if path.is_absolute()}
+        # An editable install finds its packages through a hook, outside sys.path.
+        found |= {Path(each.__file__).absolute().parent for each in (hsloc, hsloc_service)}
         programs = [Path(each) for each in self.command if os.path.isabs(each)]
         found |= {path.parent for each in programs for path in (each, each.resolve())}
         found |= {each.resolve() for each in tuple(found)}

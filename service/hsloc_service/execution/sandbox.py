@@ -76,7 +76,7 @@ class Sandbox:
         found |= {Path(path).absolute() for path in sys.path if path}
         found |= {path for path in map(Path, os.environ.get("PYTHONPATH", "").split(":")) if path.is_absolute()}
         # An editable install finds its packages through a hook, outside sys.path.
-        found |= {Path(each.__file__).absolute().parent for each in (hsloc, hsloc_service)}
+        found |= {Path(each).absolute() for package in (hsloc, hsloc_service) for each in package.__path__}
         programs = [Path(each) for each in self.command if os.path.isabs(each)]
         found |= {path.parent for each in programs for path in (each, each.resolve())}
         found |= {each.resolve() for each in tuple(found)}

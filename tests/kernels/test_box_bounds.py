@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from math import pi
 from typing import Any
 
@@ -18,6 +19,10 @@ from hsloc.kernels.levenberg_marquardt import polish
 from hsloc.matching import LikelihoodField
 from hsloc.matching.score_pyramid import SIZES, make_pyramid, score_pyramid
 from hsloc.model import Pose2
+
+pytestmark = pytest.mark.skipif(
+    os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="millions of poses need the compiler"
+)
 
 TOLERANCE = 1e-6
 """Of the fitness: the rounding of float32."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from math import pi
 from typing import Any
 
@@ -14,6 +15,10 @@ from hsloc.kernels.fitness import fitness_many
 from hsloc.matching import LikelihoodField
 from hsloc.matching.score_pyramid import score_pyramid
 from hsloc.model import OccupancyGrid, Pose2
+
+pytestmark = pytest.mark.skipif(
+    os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="millions of poses need the compiler"
+)
 
 NOWHERE = np.empty((0, 3))
 

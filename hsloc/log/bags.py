@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from hsloc.errors import HslocError, LogFormatError
-from hsloc.log.container import Channel, RawMessage, in_runs
+from hsloc.errors import LogFormatError
+from hsloc.log.container import Channel, RawMessage, guarded, in_runs
 from hsloc.log.messages.definitions import long_name
 from hsloc.log.summary import Losses, TopicStatistics
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
+    from contextlib import AbstractContextManager
     from pathlib import Path
 
     from hsloc.warnings import RunWarning
@@ -110,23 +110,5 @@ class BagContainer:
             self.losses_at_opening.truncated_files += 1
             self.losses_at_opening.note(f"{self.path}: holds {counted} messages of {promised} that it speaks of")
 
-    @contextmanager
-    def _guarded(self, losses: Losses | None = None) -> Iterator[None]:
-        """One error for all that rosbags and what it stands on may raise.
-
-        Damage in the middle of reading is a loss, and what came before it stands; at opening it is an error.
-        """
-        try:
-            yield
-        except (HslocError, GeneratorExit):
-            raise
-        except Exception as error:
-            reason = (str(error).splitlines() or [""])[0][:160]
-            line = (
-                f"{self.path}: cannot be read as a {self.format} ({reason}); if its recorder was stopped hard, "
-                "`rosbag reindex` saves what is whole"
-            )
-            if losses is None:
-                raise LogFormatError(line) from error
-            losses.truncated_files += 1
-            losses.note(line)
+    def _guarded(self, losses: Losses | None = None) -> AbstractContextManager[None]:
+        return guarded(f"{self.path}: cannot be read as a {self.format}", "`rosbag reindex`", losses)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Protocol
+
+from hsloc.errors import HslocError, LogFormatError
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -55,6 +58,26 @@ def plausible_times(ordered: Sequence[int] | NDArray[np.uint64]) -> tuple[int, i
     low, high = int(ordered[cut]), int(ordered[-1 - cut])
     margin = 2 * (high - low) + _HOUR_NS
     return low - margin, min(high + margin, (1 << 63) - 1)
+
+
+@contextmanager
+def guarded(complaint: str, remedy: str, losses: Losses | None) -> Iterator[None]:
+    """One error, `complaint` with its reason and a command as remedy, for all that a reader's library may raise.
+
+    Damage in the middle of reading is a loss, and what came before it stands; at opening, where there are no `losses`
+    to count it in, it is a LogFormatError.
+    """
+    try:
+        yield
+    except (HslocError, GeneratorExit):
+        raise
+    except Exception as error:
+        reason = (str(error).splitlines() or [""])[0][:160]
+        line = f"{complaint} ({reason}); if its recorder was stopped hard, {remedy} saves what is whole"
+        if losses is None:
+            raise LogFormatError(line) from error
+        losses.truncated_files += 1
+        losses.note(line)
 
 
 class Container(Protocol):

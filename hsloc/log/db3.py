@@ -13,14 +13,15 @@ from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-from hsloc.errors import HslocError, LogError, LogFormatError
-from hsloc.log.container import Channel, RawMessage, in_runs, plausible_times
+from hsloc.errors import LogError, LogFormatError
+from hsloc.log.container import Channel, RawMessage, guarded, in_runs, plausible_times
 from hsloc.log.files import Scratch
 from hsloc.log.messages.definitions import long_name
 from hsloc.log.summary import Losses, TopicStatistics
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
+    from contextlib import AbstractContextManager
     from pathlib import Path
 
     from hsloc.warnings import RunWarning
@@ -150,23 +151,7 @@ class Db3Container:
         if damage.reasons and not self.statistics:
             raise LogFormatError(damage.reasons[0])
 
-    @contextmanager
-    def _guarded(self, losses: Losses | None = None) -> Iterator[None]:
-        """One error for all that SQLite may raise.
-
-        Damage in the middle of reading is a loss, and what came before it stands; at opening it is an error.
-        """
-        try:
-            yield
-        except (HslocError, GeneratorExit):
-            raise
-        except Exception as error:
-            reason = (str(error).splitlines() or [""])[0][:160]
-            line = (
-                f"{self.path}: cannot be read as a {self.format} ({reason}); if its recorder was stopped hard, "
-                f"`sqlite3 {self.path.name} .recover` saves what is whole"
-            )
-            if losses is None:
-                raise LogFormatError(line) from error
-            losses.truncated_files += 1
-            losses.note(line)
+    def _guarded(self, losses: Losses | None = None) -> AbstractContextManager[None]:
+        return guarded(
+            f"{self.path}: cannot be read as a {self.format}", f"`sqlite3 {self.path.name} .recover`", losses
+        )

@@ -12,12 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from evaluation_paths import diagnostics_of, drive, estimate_of, odometry_of, office
+from evaluation_paths import diagnostics_of
 from PIL import Image
-from sample_metrics import sample_metrics
 
 from hsloc.errors import OutputError
-from hsloc.evaluation.metrics import compare
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
 from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.report.data import prepare
@@ -30,25 +28,6 @@ if TYPE_CHECKING:
 
 NASTY = "<script>alert('x')</script> & \"quoted\" {{data}} {{nothing}} ]]> <b>"
 VOID = {"meta", "input", "br", "link"}
-
-
-@pytest.fixture(scope="module")
-def run() -> dict[str, Any]:
-    rng = np.random.default_rng(3)
-    truth = drive([(-10, -4), (-10, 0), (0, 0), (0, 4), (0, 0), (8, 0)], rate_hz=20.0)
-    estimate = estimate_of(rng, truth)
-    comparison = compare(estimate, truth)
-    odometry, grid = odometry_of(rng, truth), office(rng)
-    diagnostics = diagnostics_of(rng, truth, lost=((10.0, 15.0),), rejected=0.03)
-    return {
-        "trajectory": estimate,
-        "odometry": odometry,
-        "reference": truth,
-        "grid": grid,
-        "diagnostics": diagnostics,
-        "metrics": sample_metrics(comparison, diagnostics),
-        "comparison": comparison,
-    }
 
 
 class Page(HTMLParser):

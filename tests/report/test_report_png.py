@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 import matplotlib
 import numpy as np
 import pytest
-from evaluation_paths import diagnostics_of, drive, estimate_of, odometry_of, office
+from evaluation_paths import diagnostics_of, office
 from PIL import Image
-from sample_metrics import sample_metrics
 
 from hsloc.errors import OutputError
 from hsloc.evaluation import PoseStatistics, RelationsResult, Statistics
@@ -29,25 +28,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 NOTHING = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
-
-
-@pytest.fixture(scope="module")
-def run() -> Any:
-    rng = np.random.default_rng(3)
-    truth = drive([(-10, -4), (-10, 0), (0, 0), (0, 4), (0, 0), (8, 0)], rate_hz=20.0)
-    estimate = estimate_of(rng, truth)
-    comparison = compare(estimate, truth)
-    odometry, grid = odometry_of(rng, truth), office(rng)
-    diagnostics = diagnostics_of(rng, truth, lost=((10.0, 15.0),), rejected=0.03)
-    return {
-        "trajectory": estimate,
-        "odometry": odometry,
-        "reference": truth,
-        "grid": grid,
-        "diagnostics": diagnostics,
-        "metrics": sample_metrics(comparison, diagnostics),
-        "comparison": comparison,
-    }
 
 
 def pixels(path: Any) -> Any:

@@ -6,14 +6,13 @@ fails, or is interrupted, leaves nothing half-written behind.
 
 from __future__ import annotations
 
-import os
-import shutil
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.analysis import Analysis, analyse, run_timings
+from hsloc.atomic_write import whole_folder
 from hsloc.errors import OutputError
 from hsloc.evaluation import write_json, write_tum
 from hsloc.export.provenance import config_text, provenance
@@ -62,18 +61,8 @@ def write_results(
     folder = Path(folder)
     refuse_folder(folder, overwrite)
     folder = folder.resolve()  # "." and ".." have no name of their own, and a link stays what it is
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
-    try:
-        partial.mkdir(parents=True)
-        written = _write(result, partial, progress)
-        if folder.exists():
-            shutil.rmtree(folder)
-        partial.rename(folder)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-    return written
+    with whole_folder(folder) as partial:
+        return _write(result, partial, progress)
 
 
 def refuse_folder(folder: Path, overwrite: bool) -> None:

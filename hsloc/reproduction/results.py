@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.atomic_write import write_text_atomically
+from hsloc.atomic_write import whole_folder, write_text_atomically
 from hsloc.errors import OutputError
 from hsloc.evaluation.metrics import write_json
 from hsloc.reproduction import published
@@ -43,20 +41,11 @@ def write_results(
     if folder.exists() and not overwrite and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder}: exists already; choose another --out, or pass --overwrite")
     text = markdown(reproduction, notes)
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
-    try:
-        partial.mkdir(parents=True)
+    with whole_folder(folder) as partial:
         figures = [path for results in reproduction.materials for path in draw_figures(results, partial)]
         pictures = "".join(f"\n![{path.stem}]({path.name})\n" for path in figures)
         write_text_atomically(partial / "report.md", text + pictures)
         write_json(partial / "results.json", {**reproduction.to_dict(), "notes": list(notes)})
-        if folder.exists():
-            shutil.rmtree(folder)
-        partial.rename(folder)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return text
 
 

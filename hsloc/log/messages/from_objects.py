@@ -24,6 +24,8 @@ from hsloc.model import Pose2
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from numpy.typing import NDArray
+
 
 def object_header(message: Any) -> tuple[int, str]:
     """(stamp in ns, frame_id) of a message object."""
@@ -38,19 +40,8 @@ def _object_pose(pose: Any) -> Pose2:
 
 def object_laser_scan(message: Any) -> ScanMessage:
     """From a message object."""
-    intensities = np.array(message.intensities, dtype=np.float32)
-    return ScanMessage(
-        *object_header(message),
-        float(message.angle_min),
-        float(message.angle_increment),
-        float(message.time_increment),
-        float(message.range_min),
-        float(message.range_max),
-        np.array(message.ranges, dtype=np.float32),
-        intensities if len(intensities) else None,
-        float(message.scan_time),
-        angle_max=float(message.angle_max),
-    )
+    ranges = np.array(message.ranges, dtype=np.float32)
+    return _object_scan(message, ranges, np.array(message.intensities, dtype=np.float32))
 
 
 def object_multi_echo_laser_scan(message: Any) -> ScanMessage:
@@ -59,6 +50,10 @@ def object_multi_echo_laser_scan(message: Any) -> ScanMessage:
         np.array([beam.echoes[0] if len(beam.echoes) else nan for beam in beams], dtype=np.float32)
         for beams in (message.ranges, message.intensities)
     )
+    return _object_scan(message, ranges, intensities)
+
+
+def _object_scan(message: Any, ranges: NDArray[np.float32], intensities: NDArray[np.float32]) -> ScanMessage:
     return ScanMessage(
         *object_header(message),
         float(message.angle_min),

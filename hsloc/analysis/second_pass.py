@@ -8,7 +8,7 @@ from hsloc.log import open_log
 from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.preprocessing.odometry_resets import ContinuousOdometry
-from hsloc.replay.engine import pair, seldom_collected
+from hsloc.replay.engine import pair, rarely_collected
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -44,7 +44,7 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
         T_map_base = Pose2(*poses[row].tolist())
         return T_map_base @ Pose2(*odometry[row].tolist()).inverse(), T_map_base
 
-    with seldom_collected():
+    with rarely_collected():
         events = _with_recorded_odometry(log.events(), result) if result.lidar_only else log.events()
         for event in pair(ContinuousOdometry(events), deskew=result.deskewed, first=first):
             if isinstance(event, PairedScan):

@@ -22,7 +22,7 @@ CASES = {"track": (1.0, None), "small": (1.0, 1.0), "large": (0.99, 4.0)}
 CERTIFICATES = {"small": (0.98, 5.0, 100.0), "large": (0.98, 20.0, 100.0)}
 """Least share of gaps closed, most milliseconds: median and 95th percentile."""
 WHOLE_MAP = {2_000.0: 0.3, 10_000.0: 1.0, 40_000.0: 4.0}
-"""Most seconds for one scan on a floor of so many square metres."""
+"""Greatest time for one scan [s] by the area of the floor [m2]."""
 
 
 @dataclass(frozen=True, slots=True)

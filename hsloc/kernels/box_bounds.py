@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
 
 SMALL = 1.5
-"""A box moves a typical point by at most so many cells either way: the slopes are looked at."""
+"""Greatest motion of a typical point within a box (cells) for which the slopes are used."""
 MAX_SQUARES = 4
 """In a row, under one point: beyond that one look-up of the maxima is nearly as good."""
 _LOOK = 8

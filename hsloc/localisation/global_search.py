@@ -35,7 +35,7 @@ class RelocaliserResult:
     track_is_whole: bool = False
     """Whether the track goes back to the first scan of the search."""
     state: State = State.LOST
-    """While it is not sure: whether several places fit, none does, or it is too early to tell."""
+    """While it is not sure: whether several places fit, none does, or too few scans were seen."""
     evidence: Evidence | None = None
     """Once it is sure: what its scans say for the place."""
 

@@ -263,7 +263,7 @@ class Localiser:
         """Follow how large innovations really are; covariances that are reported grow with them.
 
         What grows is not the weight of the odometry or of the match: which of the two is worse than assumed, an
-        innovation does not tell. (Where the odometry's noise was scaled, the matches pulled the pose from door to door
+        innovation does not show. (Where the odometry's noise was scaled, the matches pulled the pose from door to door
         in the corridors of Wean Hall.)
         """
         squared, freedom = normalised_innovation(predicted, covariance, measured, information)

@@ -51,7 +51,7 @@ class MatchGate:
     def is_recovered(self, refused: float, wide: float) -> bool:
         """Whether a match of fitness `wide` in a wide window takes the place of one of fitness `refused`.
 
-        While no fitness is usual yet, the least fitness stands in for it.
+        While no fitness is usual yet, the minimum fitness is used instead.
         """
         limits = self._limits
         usual = limits.min_fitness if self.usual is None else self.usual

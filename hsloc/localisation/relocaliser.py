@@ -3,7 +3,7 @@
 The free space is cut into tiles; HIDE searches each of them over all headings, and what it finds becomes a hypothesis.
 Each further scan moves the hypotheses with the odometry, matches them again in a small window and adds to their record.
 Hypotheses that fall behind are dropped, those that meet are merged. The winner must be ahead of all others by a sum
-of fitness that grows over several scans and some way: in a place that exists twice, nobody is sure. The scans
+of fitness that grows over several scans and some way: in a place that exists twice, no answer is sure. The scans
 seen until then are matched again, backwards, so that the trajectory can be completed.
 
 (Counting out the points whose beam runs through a wall was tried and made it worse: in the Wean Hall log a fifth of

@@ -125,7 +125,7 @@ class TopicSummary:
 
     @property
     def rate_hz(self) -> float:
-        """Mean rate; 0 where it cannot be told."""
+        """Mean rate; 0 where it is unknown."""
         if self.count < 2 or self.first_ns is None or self.last_ns is None or self.last_ns <= self.first_ns:
             return 0.0
         return (self.count - 1) * NANOSECONDS / (self.last_ns - self.first_ns)

@@ -112,7 +112,7 @@ class FrameTree:
     def resolve(self, frame: str, beside: str = "") -> str | None:
         """The frame under the name that the tree has for it: itself, or with or without a prefix.
 
-        Of several with one last name the one with the prefix of `beside` is meant; None where it cannot be told.
+        Of several with one last name the one with the prefix of `beside` is meant; None where that is ambiguous.
         """
         if frame in self:
             return frame

@@ -1,6 +1,6 @@
 """Odometry that is not odometry: it stands still, or never states a heading, while the scans say that the robot moves.
 
-A fixed transform that was published to satisfy another node, a dead encoder, a pose that nobody fills in: estimating
+A fixed transform that was published to satisfy another node, a dead encoder, a pose that is never filled in: estimating
 with it is worse than estimating without. The watch looks at odometry and scans as they pass, and raises
 `UnusableOdometry` as soon as it is sure.
 """

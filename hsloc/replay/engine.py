@@ -119,8 +119,8 @@ _COLLECT_AFTER = 50_000
 
 
 @contextmanager
-def seldom_collected() -> Iterator[None]:
-    """Let the garbage collector run seldom while a log streams by: events are many, and none is part of a cycle."""
+def rarely_collected() -> Iterator[None]:
+    """Let the garbage collector run rarely while a log streams by: events are many, and none is part of a cycle."""
     before = gc.get_threshold()
     if before[0] > 0:  # 0 is never, as somebody wants it.
         gc.set_threshold(max(before[0], _COLLECT_AFTER), *before[1:])

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _STALE_NS = 1_000_000_000
 """A pose stated longer before the first event says nothing any more: the robot has moved on."""
 _FARTHEST = 5.0
-"""A pose stated later is carried back to the first event with the odometry, over so many metres of way at most."""
+"""Greatest path length [m] over which odometry carries a pose stated later back to the first event."""
 _OUTSIDE = 5.0
 """A start may lie so far outside the map (m): a robot may look into it from a part that was never drawn."""
 

@@ -23,7 +23,7 @@ from hsloc.model.trajectory import Trajectory
 from hsloc.options import AUTO
 from hsloc.preprocessing.odometry_resets import ContinuousOdometry
 from hsloc.preprocessing.odometry_watch import OdometryWatch, UnusableOdometry
-from hsloc.replay.engine import replay, seldom_collected
+from hsloc.replay.engine import rarely_collected, replay
 from hsloc.replay.initial_pose import find_start, first_odometry
 from hsloc.replay.map_sources import find_map, load_state, require_map
 from hsloc.replay.references import read_reference
@@ -209,7 +209,7 @@ def _run_with(
     events = ContinuousOdometry(_events(request, log, lidar_only, localise), log.summary.odom_topic)
     # Turns that were joined of segments are known beam by beam; a whole turn is deskewed if the user asks for it.
     deskew = request.read.deskew or (log.summary.segments > 1 and not lidar_only)
-    with seldom_collected():
+    with rarely_collected():
         for event, estimate in replay(_reported(log, events, history, progress), estimator, deskew=deskew, first=first):
             history.add(event, estimate)
     replayed = time.perf_counter()

@@ -145,7 +145,7 @@ STRIDE = 0.22
 """Metres that a leg swings forwards and backwards."""
 STEPS_PER_METRE = 0.75
 PERSONAL_SPACE = 0.4
-"""Nearer to the laser (metres) nobody walks: who would, has stepped aside and is not seen."""
+"""Minimum distance of a walking person from the laser [m]: nearer ones have stepped aside and are not seen."""
 
 
 class Walkers:

@@ -96,7 +96,7 @@ class Recorded:
         return np.asarray(np.hypot(self.motions[:, 0], self.motions[:, 1]), dtype=np.float64)
 
     def spanned(self, loops: int = 1) -> Bools:
-        """Steps (n,) that lie between the two ends of so many accepted loops: a wrong one would have kept them open."""
+        """Steps (n,) between the two ends of this number of accepted loops: a wrong step would have kept them open."""
         change = np.zeros(len(self.poses) + 1, dtype=np.int64)
         if len(self.loops):
             low, high = self.loops.min(axis=1), self.loops.max(axis=1)
@@ -132,7 +132,7 @@ _ODOMETRY_SHARE = 0.5
 _ODOMETRY_TURN = 0.5
 """The same of the heading [rad]."""
 _BLIND_M = 2.0
-"""A step so many metres long, and five times the usual one, was driven without enough returns."""
+"""A step longer than this [m], and than five times the usual one, was driven without enough returns."""
 _BLIND_SHARE = 0.1
 _NO_RETURN_SHARE = 0.4
 """On five real logs at most 0.03 of the beams meet nothing, cut to 4 m 0.27; where they erased walls 0.52 and more."""

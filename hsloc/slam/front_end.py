@@ -128,7 +128,7 @@ _BEST_ODOMETRY = 0.5
 _WORST_ODOMETRY = 10.0
 """Factors within which the assumed noise of the odometry is adapted to the log."""
 _WEIGHED_EVERY = 20
-"""The odometry's weight is estimated anew after so many matched keyscans."""
+"""Number of matched keyscans after which the odometry's weight is estimated again."""
 _BASIN = 0.3
 """Half-width [m] of a window from whose centre the registration finds its way: its first gate."""
 _BASIN_ANGLE = 0.2
@@ -347,7 +347,7 @@ def odometry_chi(motion: Pose2, found: Pose2, noise: OdometryNoise) -> float:
 def odometry_scale(chi: list[float]) -> float:
     """Factor on the standard deviations of the assumed noise that fits the steps' `chi` of this log (robustly).
 
-    By its 95th percentile, for turns come seldom and err most; not below a half, for what slips once in a hundred steps
+    By its 95th percentile, as turns are rare and err most; not below a half, for what slips once in a hundred steps
     is beyond that.
     """
     if len(chi) < _WEIGHED_EVERY:

@@ -31,7 +31,7 @@ _LOOKED = 60
 _AROUND = 2
 """Places compared before and after the one that was found."""
 _AGREE = 2
-"""So many places must be connected by a loop, where the log has so many."""
+"""Minimum number of places that a loop connects, where the log has that many."""
 
 
 def connect(resume: Resume, log: MapSession, parameters: GraphMapperParameters, rng: Generator) -> MapSession:

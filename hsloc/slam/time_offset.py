@@ -50,12 +50,12 @@ _MIN_STEPS = 20
 _HUBER = 1.345
 """Scale of the robust weights in standard deviations (Huber 1981): 95 % efficient on Gaussian errors."""
 SIGNIFICANT = 4.0
-"""An offset counts if it is so many of its standard deviations from zero; under Gaussian errors once in 16,000 runs."""
+"""Minimum ratio of an offset to its standard deviation; under Gaussian errors once in 16,000 runs."""
 HINT_S = 0.15
 """Difference of stamps and log times between scans and odometry (s) from which on the offset is estimated before a run:
 drivers and networks delay messages by less."""
 LARGE_S = 0.1
-"""From here on (s) poses are wrong by 10 cm at 1 m/s and by 6 degrees at 1 rad/s: nobody would call that right."""
+"""From here on (s) poses are wrong by 10 cm at 1 m/s and by 6 degrees at 1 rad/s: a wrong result by any standard."""
 SMALLEST_S = 0.02
 """Offsets below this (s) are not worth a word: they move a beam by 2 cm at 1 m/s."""
 
@@ -114,10 +114,10 @@ def find_offset(scans: Headings, odometry: Headings, near_s: float = _NEAR_S, st
         return np.diff(np.interp(at, t_odom, odometry.theta)), inside[1:] & inside[:-1]
 
     def cost(offset: float) -> float:
-        told, inside = steps(offset)
+        predicted, inside = steps(offset)
         if inside.sum() < max(_MIN_STEPS, len(seen) // 4):
             return float("inf")
-        return float(np.mean(np.minimum(np.abs(seen - told)[inside], 0.5)))
+        return float(np.mean(np.minimum(np.abs(seen - predicted)[inside], 0.5)))
 
     if float(np.abs(seen).sum()) < _LEAST_TURNED:
         return UNKNOWN
@@ -135,10 +135,10 @@ def _refined(best: float, seen: F64, steps: Callable[[float], tuple[F64, NDArray
     half = 0.5 * _GRID_S
     sigma = float("inf")
     for _ in range(20):
-        told, inside = steps(best)
+        predicted, inside = steps(best)
         later, earlier = steps(best + half)[0], steps(best - half)[0]
         slope = ((later - earlier) / (2.0 * half))[inside]
-        residual = (seen - told)[inside]
+        residual = (seen - predicted)[inside]
         scale = max(1.4826 * float(np.median(np.abs(residual - np.median(residual)))), 1e-5)
         weight = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(residual), 1e-12))
         information = float(np.sum(weight * slope**2))
@@ -185,13 +185,14 @@ def estimate_offset(
     scans = [(middles[event.stamp_ns], event.T_odom_base.theta) for event in matched if isinstance(event, Odometry)]
     if not scans or not odometry:
         return UNKNOWN
-    seen, told = _headings(scans), _headings(odometry)
+    turns, odometry_turns = _headings(scans), _headings(odometry)
     # By steps of half a second and more the rotation stands out of the noise of single scans.
-    near = find_offset(_thinned(seen), told)
-    whole = find_offset(_thinned(seen), told, near_s=RANGE_S)
+    near = find_offset(_thinned(turns), odometry_turns)
+    whole = find_offset(_thinned(turns), odometry_turns, near_s=RANGE_S)
     if not isfinite(whole.sigma):
         return near
-    if isfinite(near.sigma) and _misfit(seen, told, near.seconds) <= 1.2 * _misfit(seen, told, whole.seconds):
+    limit = 1.2 * _misfit(turns, odometry_turns, whole.seconds)
+    if isfinite(near.sigma) and _misfit(turns, odometry_turns, near.seconds) <= limit:
         return near
     return whole
 
@@ -221,8 +222,8 @@ def _misfit(scans: Headings, odometry: Headings, offset_s: float) -> float:
     inside = (at >= odometry.stamps_ns[0]) & (at <= odometry.stamps_ns[-1])
     if inside.sum() < _MIN_STEPS:
         return float("inf")
-    told = np.interp(at[inside].astype(np.float64), odometry.stamps_ns.astype(np.float64), odometry.theta)
-    return float(np.mean(np.minimum(np.abs(np.diff(scans.theta[inside]) - np.diff(told)), 0.5)))
+    interpolated = np.interp(at[inside].astype(np.float64), odometry.stamps_ns.astype(np.float64), odometry.theta)
+    return float(np.mean(np.minimum(np.abs(np.diff(scans.theta[inside]) - np.diff(interpolated)), 0.5)))
 
 
 def offsets_of_log(paths: Sequence[Path], options: ReadOptions, parameters: FrontEndParameters) -> dict[str, Offset]:

@@ -42,7 +42,7 @@ class Settings:
     """Values of the Host header that are answered; `*` for any. Keeps DNS rebinding out."""
 
     trusted_proxies: tuple[str, ...] = ()
-    """Addresses of proxies whose `X-Forwarded-For` counts as the client's address; nobody's otherwise."""
+    """Addresses of proxies whose `X-Forwarded-For` counts as the client's address; by default none's."""
 
     max_upload_bytes: int = 64 * GIB
     """Maximum size of an upload [B]."""

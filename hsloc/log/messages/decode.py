@@ -146,7 +146,7 @@ def alignment(data: Payload) -> int:
 def _fits(data: Payload, end: int) -> bool:
     """Whether a message ends at `end`, but for bytes that fill up a word.
 
-    Some middleware labels its messages as XCDR2 and lays them out as XCDR1 does: their length tells which it is.
+    Some middleware labels its messages as XCDR2 and lays them out as XCDR1 does: the length decides.
     """
     return 0 <= len(data) - end < 4
 

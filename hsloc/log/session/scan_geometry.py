@@ -27,7 +27,7 @@ _LONGEST_TURN = 1.25 * _TURN
 _WIDEST_SEGMENT = pi
 """A segment of a turn spans at most half of it (rad)."""
 _SPARE_BEAMS = 2.5
-"""By so many beams drivers may be off where they count the last beam, or round (beams)."""
+"""Error of drivers that count the last beam, or round (beams)."""
 _LEAST_DISAGREEMENT = radians(2.0)
 """Angles that fit within this are not worth a word (rad)."""
 _LONGEST_SWEEP, _SHORTEST_SWEEP = 1.5, 0.25

@@ -37,7 +37,7 @@ POSSIBLE_SPEED, LIKELY_SPEED = 15.0, 2.0
 POSSIBLE_JUMP, LIKELY_JUMP = 2.0, 1.0
 """Metres besides: odometry may be late, and wheels slip."""
 _RESET, _AWAY = 0.01, 0.5
-"""Odometry within so many metres of zero has begun anew, if it was farther away than the second before."""
+"""Odometry within this distance of zero [m] was reset, if it was farther away a second before."""
 _ENDS = 200
 """Messages looked at on either end of a part."""
 

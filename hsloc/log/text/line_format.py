@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Line(NamedTuple):
-    """What a line tells; ranges as they stand in it (metres)."""
+    """Content of a line; ranges as written (metres)."""
 
     odometry: Odometry | None = None
     scan: Scan | None = None

@@ -69,7 +69,7 @@ def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, 
     report("open", 0.0, 1.0, 0)
     request = make_request(job, folder)
     if request.relations is not None:
-        read_relations(request.relations)  # what cannot be read is told now, not after an hour of replay
+        read_relations(request.relations)  # what cannot be read is reported now, not after an hour of replay
 
     def replayed(progress: Progress) -> None:
         report(progress.phase, progress.done_s, progress.total_s, progress.scans)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from hsloc.reproduction.windows import UNCERTAINTIES
 from hsloc.text_table import DASH, table
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from hsloc.reproduction.convergence import Convergence
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from hsloc.reproduction.run import MaterialResults, Reproduction
     from hsloc.reproduction.scan_match import ScanMatch
     from hsloc.reproduction.windows import Windows
+
+
+D = TypeVar("D", "Drive", "Mapped")
 
 
 def write_results(
@@ -157,6 +160,20 @@ def _e2(convergence: Convergence, title: str) -> list[str]:
     return lines
 
 
+def _by_matcher(drives: Sequence[D]) -> Iterator[tuple[str, str, list[D]]]:
+    """Matcher, preset, and the drives of the two."""
+    for preset in dict.fromkeys(drive.preset for drive in drives):
+        for matcher in ("HIDE", "HS"):
+            yield matcher, preset, [drive for drive in drives if (drive.matcher, drive.preset) == (matcher, preset)]
+
+
+def _rmse_cells(drives: Sequence[Drive] | Sequence[Mapped]) -> list[str]:
+    """Of each axis the median and, in brackets, the worst of the seeds."""
+    rmse = np.array([drive.rmse for drive in drives])
+    median, worst = np.median(rmse, axis=0), rmse.max(axis=0)
+    return [f"{median[axis]:.4f} ({worst[axis]:.4f})" for axis in range(3)]
+
+
 def _e3(drives: Sequence[Drive], title: str) -> list[str]:
     first = drives[0]
     seeds = len({drive.seed for drive in drives})
@@ -173,21 +190,17 @@ def _e3(drives: Sequence[Drive], title: str) -> list[str]:
         "",
     ]
     cells = []
-    for preset in dict.fromkeys(drive.preset for drive in drives):
-        for matcher in ("HIDE", "HS"):
-            chosen = [drive for drive in drives if (drive.matcher, drive.preset) == (matcher, preset)]
-            rmse = np.array([drive.rmse for drive in chosen])
-            median, worst = np.median(rmse, axis=0), rmse.max(axis=0)
-            cells.append(
-                (
-                    f"{matcher}, {preset}",
-                    " / ".join(f"{value:g}" for value in published.E3_RMSE[matcher]),
-                    *(f"{median[axis]:.4f} ({worst[axis]:.4f})" for axis in range(3)),
-                    f"{min(drive.matched for drive in chosen)}",
-                    f"{np.median([drive.seconds for drive in chosen]):.2f}",
-                    f"{published.E3_SECONDS[matcher]:.0f}",
-                )
+    for matcher, preset, chosen in _by_matcher(drives):
+        cells.append(
+            (
+                f"{matcher}, {preset}",
+                " / ".join(f"{value:g}" for value in published.E3_RMSE[matcher]),
+                *_rmse_cells(chosen),
+                f"{min(drive.matched for drive in chosen)}",
+                f"{np.median([drive.seconds for drive in chosen]):.2f}",
+                f"{published.E3_SECONDS[matcher]:.0f}",
             )
+        )
     head = (
         "matcher, preset", "published x / y / theta", "x m", "y m", "theta rad", "least scans matched", "seconds",
         "published s",
@@ -226,22 +239,18 @@ def _e4(mapped: Sequence[Mapped], title: str) -> list[str]:
         "",
     ]
     cells = []
-    for preset in dict.fromkeys(drive.preset for drive in mapped):
-        for matcher in ("HIDE", "HS"):
-            chosen = [drive for drive in mapped if (drive.matcher, drive.preset) == (matcher, preset)]
-            rmse = np.array([drive.rmse for drive in chosen])
-            median, worst = np.median(rmse, axis=0), rmse.max(axis=0)
-            cells.append(
-                (
-                    f"{matcher}, {preset}",
-                    " / ".join(f"{value:g}" for value in published.E4_RMSE) if matcher == "HS" else DASH,
-                    *(f"{median[axis]:.4f} ({worst[axis]:.4f})" for axis in range(3)),
-                    f"{np.median([drive.points for drive in chosen]):.0f}",
-                    f"{100 * np.median([drive.complete for drive in chosen]):.0f} %",
-                    f"{np.median([drive.distance for drive in chosen]):.3f}",
-                    f"{np.median([drive.seconds for drive in chosen]):.2f}",
-                )
+    for matcher, preset, chosen in _by_matcher(mapped):
+        cells.append(
+            (
+                f"{matcher}, {preset}",
+                " / ".join(f"{value:g}" for value in published.E4_RMSE) if matcher == "HS" else DASH,
+                *_rmse_cells(chosen),
+                f"{np.median([drive.points for drive in chosen]):.0f}",
+                f"{100 * np.median([drive.complete for drive in chosen]):.0f} %",
+                f"{np.median([drive.distance for drive in chosen]):.3f}",
+                f"{np.median([drive.seconds for drive in chosen]):.2f}",
             )
+        )
     head = (
         "matcher, preset", "published x / y / theta", "x m", "y m", "theta rad", "points", "complete", "points off m",
         "seconds",

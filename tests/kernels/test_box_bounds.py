@@ -20,9 +20,7 @@ from hsloc.matching import LikelihoodField
 from hsloc.matching.score_pyramid import SIZES, make_pyramid, score_pyramid
 from hsloc.model import Pose2
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="millions of poses need the compiler"
-)
+compiled = pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="millions of poses need the compiler")
 
 TOLERANCE = 1e-6
 """Of the fitness: the rounding of float32."""
@@ -69,6 +67,7 @@ def excess_of_the_fittest(field: Any, scans: Any, count: Any, seed: Any) -> Any:
     return worst
 
 
+@compiled
 def test_no_pose_of_5000_boxes_in_a_room_is_fitter_than_the_bound() -> None:
     grid, walls = naive.room()
     field = LikelihoodField.from_grid(grid)
@@ -76,6 +75,7 @@ def test_no_pose_of_5000_boxes_in_a_room_is_fitter_than_the_bound() -> None:
     assert excess_of_the_fittest(field, scans, 5000, 1) <= TOLERANCE
 
 
+@compiled
 @pytest.mark.data
 def test_no_pose_of_5000_boxes_in_a_real_building_is_fitter_than_the_bound(data: Any) -> None:
     cases = read_cases(data / "match-cases" / "intel.npz")

@@ -16,9 +16,7 @@ from hsloc.matching import LikelihoodField
 from hsloc.matching.score_pyramid import score_pyramid
 from hsloc.model import OccupancyGrid, Pose2
 
-pytestmark = pytest.mark.skipif(
-    os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="millions of poses need the compiler"
-)
+compiled = pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="millions of poses need the compiler")
 
 NOWHERE = np.empty((0, 3))
 
@@ -50,6 +48,7 @@ def run(
     return pose, *found
 
 
+@compiled
 @pytest.mark.parametrize("seed", range(6))
 def test_no_pose_of_a_dense_search_is_fitter_than_the_bound(scene: Any, seed: Any) -> None:
     field, walls = scene

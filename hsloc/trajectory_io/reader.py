@@ -151,7 +151,8 @@ def _columns(path: Path, line: str) -> _Columns | None:
     if min(q) >= 0:
         quaternion = (q[0], q[1], q[2], q[3])
         return _Columns(t, (x, y, z), quaternion, unit=unit)
-    heading = find("theta", "yaw", "heading", "phi")
+    angles = ("theta", "yaw", "heading", "phi")
+    heading = find(*angles, *(f"{angle}_{unit}" for angle in angles for unit in ("rad", "deg", "radians", "degrees")))
     if heading >= 0:
         return _Columns(t, (x, y, z), heading=heading, unit=unit, in_degrees="deg" in names[heading])
     return None

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from hsloc.kernels.normal_equations import Blocks, add_relative_term, relative
+from hsloc.kernels.normal_equations import Blocks, Equations, add_edges, add_relative_term, relative
 from hsloc.kernels.point_to_line import Term
 from hsloc.model.pose2 import relative_poses
 
@@ -39,3 +39,50 @@ def test_terms_of_poses_are_those_of_the_chain_rule() -> None:
         np.testing.assert_allclose(got, want, atol=1e-6)
     np.testing.assert_allclose(gj, b.T @ gradient, atol=1e-6)
     np.testing.assert_allclose(gi, a.T @ gradient, atol=1e-6)
+
+
+def empty(poses: int, edges: int) -> Equations:
+    return Equations(np.zeros((poses, 3, 3)), np.zeros((edges, 3, 3)), np.zeros((poses, 3)))
+
+
+def test_the_right_side_of_edges_is_half_the_derivative_of_their_sum_of_squares(rng: Any) -> None:
+    edges = np.array([[0, 1], [1, 2], [0, 2], [2, 3]])
+    poses = rng.normal(size=(4, 3))
+    roots = rng.normal(size=(4, 3, 3))
+    information = roots @ roots.transpose(0, 2, 1)
+    # Headings are whole turns away from what was measured: only the remainder counts.
+    measured = relative_poses(poses[edges[:, 0]], poses[edges[:, 1]]) + 0.1 * rng.normal(size=(4, 3))
+    measured[:, 2] += 2.0 * np.pi * np.array([0, 1, -2, 0])
+
+    def squares(at: Any) -> float:
+        return add_edges(at, edges, measured, information, np.full(4, np.inf), empty(4, 4))
+
+    equations = empty(4, 4)
+    total = add_edges(poses, edges, measured, information, np.full(4, np.inf), equations)
+    assert 0.0 < total == squares(poses)
+    derivative = np.zeros((4, 3))
+    for k in np.ndindex(4, 3):
+        step = np.zeros((4, 3))
+        step[k] = 1e-6
+        derivative[k] = (squares(poses + step) - squares(poses - step)) / 2e-6
+    np.testing.assert_allclose(equations.right, 0.5 * derivative, atol=1e-5)
+    # A motion of all poses together changes nothing: the blocks of a row add up to nothing for a shift.
+    rows = equations.diagonal[:, :, :2].copy()
+    for m, (j, i) in enumerate(edges):
+        rows[j] += equations.off_diagonal[m][:, :2]
+        rows[i] += equations.off_diagonal[m].T[:, :2]
+    np.testing.assert_allclose(rows, 0.0, atol=1e-9)
+
+
+def test_an_edge_that_contradicts_the_graph_weighs_less_by_cauchy(rng: Any) -> None:
+    poses, edges = rng.normal(size=(2, 3)), np.array([[0, 1]])
+    measured = relative_poses(poses[:1], poses[1:]) + np.array([[0.3, -0.2, 0.1]])
+    information = np.eye(3)[None] * 25.0
+    plain, robust = empty(2, 1), empty(2, 1)
+    chi2 = add_edges(poses, edges, measured, information, np.array([np.inf]), plain)
+    assert abs(chi2 - 25.0 * (0.3**2 + 0.2**2 + 0.1**2)) < 1e-9
+    weighted = add_edges(poses, edges, measured, information, np.array([2.0]), robust)
+    weight = 4.0 / (4.0 + chi2)
+    np.testing.assert_allclose(weighted, weight * chi2)
+    for got, want in zip(robust, plain, strict=True):
+        np.testing.assert_allclose(got, weight * want)

@@ -65,7 +65,8 @@ def print_job(summary: Mapping[str, Any]) -> None:
     ]
     print_warnings(found)
     verdict = summary.get("metrics", {}).get("verdict")
-    lines = [] if verdict is None else [f"verdict: {verdict}"]
+    lines = [] if verdict is None else [f"verdict: {summary.get('verdict_text', verdict)}"]
+    lines += [summary["headline"]] if "headline" in summary else []
     lines += [f"  {reason_text(from_json(VerdictReason, each))}" for each in summary.get("verdict_reasons", ())]
     _print(lines + _table([Row(each["name"], tuple(each["values"])) for each in summary.get("figures", ())]))
 
@@ -84,10 +85,12 @@ def _print(lines: Iterable[str]) -> None:
 
 def summary_lines(metrics: RunMetrics, timings: RunTimings, folder: Path) -> list[str]:
     """The lines of `print_summary`."""
-    from hsloc.report.table import format_duration, format_length, reason_text, table_rows
+    from hsloc.report.summary import ResultSummary
+    from hsloc.report.table import format_duration, format_length
 
-    lines = [f"verdict: {metrics.verdict}", *(f"  {reason_text(reason)}" for reason in metrics.verdict_reasons)]
-    lines += _table(table_rows(metrics))
+    summary = ResultSummary.of(metrics)
+    lines = [f"verdict: {summary.verdict_text}", summary.headline, *(f"  {reason}" for reason in summary.reasons)]
+    lines += _table(summary.figures)
     if metrics.errors is not None:
         lines.append(
             f"compared with the reference: {metrics.errors.matched} pairs, alignment {metrics.errors.alignment}"

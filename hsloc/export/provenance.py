@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from hsloc.config import dump, preset
 from hsloc.options import OPTIONS, written
 from hsloc.replay.map_sources import map_files
-from hsloc.report.html import Provenance
+from hsloc.report.data import Provenance
 from hsloc.version import __version__
 
 if TYPE_CHECKING:

@@ -6,6 +6,7 @@ fails, or is interrupted, leaves nothing half-written behind.
 
 from __future__ import annotations
 
+import csv
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,19 +18,26 @@ from hsloc.errors import OutputError
 from hsloc.evaluation import write_json, write_tum
 from hsloc.export.provenance import config_text, provenance
 from hsloc.export.run_mcap import RunRecording
-from hsloc.export.states_csv import write_states
 from hsloc.maps import save_map
+from hsloc.report.data import ReportParts
 from hsloc.report.html import write_report_html
 from hsloc.report.png import draw_report
 from hsloc.slam.map_state import STATE_FILE, write_state
+from hsloc.trajectory_io.tum import format_stamp
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from os import PathLike
 
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hsloc.localisation.states import StateRows
     from hsloc.replay.run import Result
     from hsloc.run_metrics import RunMetrics, RunTimings
 
+STATES_HEADER = ("t", "state", "probability", "sigma_x", "sigma_y", "sigma_theta", "fitness", "reason")
+"""Columns of states.csv: what is known of each pose of trajectory.tum, line by line in its order."""
 _OF_RESULTS = (("metrics.json", "config.yaml"), ("results.json", "report.md"))
 """Files that a folder of results holds, of a run or of the reproduced experiments, and no other folder."""
 
@@ -100,21 +108,41 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
             write_state(result.mapping.state, folder / STATE_FILE)
     write_json(folder / "metrics.json", analysis.metrics.to_json())
     (folder / "config.yaml").write_text(config_text(result), encoding="utf-8")
-    shown = {
-        "title": " ".join(result.request.names()),
-        "trajectory": result.trajectory,
-        "localised": result.localised,
-        "odometry": analysis.odometry,
-        "reference": result.reference,
-        "grid": result.grid,
-        "diagnostics": result.diagnostics,
-        "metrics": analysis.metrics,
-        "comparison": analysis.comparison,
-    }
-    draw_report(folder / "report.png", **shown)  # type: ignore[arg-type]
-    more = {"provenance": provenance(result), "convergence": analysis.convergence}
-    write_report_html(folder / "report.html", **shown, **more)  # type: ignore[arg-type]
+    parts = ReportParts(
+        title=" ".join(result.request.names()),
+        trajectory=result.trajectory,
+        localised=result.localised,
+        odometry=analysis.odometry,
+        reference=result.reference,
+        grid=result.grid,
+        diagnostics=result.diagnostics,
+        metrics=analysis.metrics,
+        comparison=analysis.comparison,
+        provenance=provenance(result),
+        convergence=analysis.convergence,
+    )
+    draw_report(folder / "report.png", parts)
+    write_report_html(folder / "report.html", parts)
     seconds["reports"] = time.perf_counter() - begin
     timings = run_timings(result, seconds)
     write_json(folder / "timings.json", timings.to_json())
     return WrittenResults(analysis, timings)
+
+
+def write_states(path: Path, stamps_ns: NDArray[np.int64], rows: StateRows) -> None:
+    """Write one line for each of the n stamps: seconds, metres and radians; nan where a figure is unknown."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(STATES_HEADER)
+        columns = zip(
+            stamps_ns.tolist(),
+            rows.state,
+            rows.probability.tolist(),
+            rows.sigma.tolist(),
+            rows.fitness.tolist(),
+            rows.reason,
+            strict=True,
+        )
+        for stamp_ns, state, probability, (x, y, theta), fitness, reason in columns:
+            figures = (f"{probability:.4f}", f"{x:.4f}", f"{y:.4f}", f"{theta:.5f}", f"{fitness:.3f}")
+            writer.writerow((format_stamp(stamp_ns), state.value, *figures, reason))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,16 +14,64 @@ from hsloc.model import IDENTITY, Status
 from hsloc.trajectory_io.tum import NS_PER_S
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from hsloc.evaluation import Comparison
-    from hsloc.model import ScanDiagnostics, Trajectory
+    from hsloc.model import OccupancyGrid, ScanDiagnostics, Trajectory
+    from hsloc.run_metrics import RunMetrics
 
     Floats = NDArray[np.float64]
 
 
 LOG_ABOVE = 25.0
 """A curve whose highest value is this many times its median is drawn on a logarithmic scale."""
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """What it takes to repeat the run: the command as typed, the effective configuration as text, the versions
+    of the programs, and the sha256 of the input files, both by name.
+    """
+
+    command: str = ""
+    config: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    hashes: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class ReportParts:
+    """The parts of a run that report.png and report.html show. All but title and trajectory may be missing.
+
+    All poses are in the map frame, but for the reference, which `comparison` aligns.
+    """
+
+    title: str
+    """Name of the run: the names of its logs."""
+    trajectory: Trajectory
+    """The estimated poses."""
+    odometry: Trajectory | None = None
+    """The odometry, moved as a whole into the map frame."""
+    reference: Trajectory | None = None
+    """The reference in its own frame."""
+    grid: OccupancyGrid | None = None
+    """The map that was used or built."""
+    diagnostics: ScanDiagnostics | None = None
+    """What became of each scan."""
+    metrics: RunMetrics | None = None
+    """All figures."""
+    comparison: Comparison | None = None
+    """Pairs of trajectory and reference, which give the error curves; without it there are no errors."""
+    localised: NDArray[np.bool_] | None = None
+    """Which poses (n,) are known; without it this is derived from the diagnostics."""
+    points: Floats | None = None
+    """Points (n, 2) that are drawn as a map [m]."""
+    provenance: Provenance = field(default_factory=Provenance)
+    """How to repeat the run."""
+    convergence: Mapping[str, tuple[Floats, Floats]] = field(default_factory=dict)
+    """By heading, the best fitness over the number of evaluations: two arrays (n,) each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,18 +148,10 @@ class ReportData:
     scans: Scans | None
 
 
-def prepare(
-    trajectory: Trajectory,
-    odometry: Trajectory | None,
-    reference: Trajectory | None,
-    diagnostics: ScanDiagnostics | None,
-    comparison: Comparison | None = None,
-    localised: NDArray[np.bool_] | None = None,
-) -> ReportData:
-    """Prepare what a report shows; all poses in the map frame, but for the reference, which `comparison` aligns.
-
-    Without `comparison` there are no errors; without `localised` it is derived from the diagnostics.
-    """
+def prepare(parts: ReportParts) -> ReportData:
+    """Prepare what a report shows."""
+    trajectory, reference, odometry = parts.trajectory, parts.reference, parts.odometry
+    diagnostics, comparison, localised = parts.diagnostics, parts.comparison, parts.localised
     start_ns = int(trajectory.stamps_ns.min()) if len(trajectory) else _first(diagnostics)
     seconds = _since(trajectory.stamps_ns, start_ns)
     scans = None if diagnostics is None or not len(diagnostics) else _scans(diagnostics, trajectory, start_ns)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
 from math import degrees
@@ -17,18 +16,18 @@ from hsloc.atomic_write import write_text_atomically
 from hsloc.evaluation.metrics import format_json
 from hsloc.model import Status
 from hsloc.report.data import Curve, prepare, reason_counts, status_counts
+from hsloc.report.summary import ResultSummary
 from hsloc.report.svg import Chart, chart_svg, map_svg, timeline_html
-from hsloc.report.table import DASH, STATUS_WORDS, error_statistics, reason_text, summary, table_rows
+from hsloc.report.table import DASH, STATUS_WORDS, error_statistics
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from numpy.typing import NDArray
 
-    from hsloc.evaluation import Comparison
     from hsloc.evaluation.error_metrics import ErrorMetrics
-    from hsloc.model import OccupancyGrid, ScanDiagnostics, Trajectory
-    from hsloc.report.data import ReportData
+    from hsloc.model import OccupancyGrid
+    from hsloc.report.data import Provenance, ReportData, ReportParts
     from hsloc.run_metrics import LaserMetrics, RunMetrics
 
     Floats = NDArray[np.float64]
@@ -44,56 +43,27 @@ STATUS_COLOURS: dict[str, str] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Provenance:
-    """What it takes to repeat the run: the command as typed, the effective configuration as text, the versions
-    of the programs, and the sha256 of the input files, both by name.
-    """
-
-    command: str = ""
-    config: str = ""
-    versions: Mapping[str, str] = field(default_factory=dict)
-    hashes: Mapping[str, str] = field(default_factory=dict)
-
-
-def write_report_html(
-    path: str | Path,
-    *,
-    title: str,
-    trajectory: Trajectory,
-    odometry: Trajectory | None = None,
-    reference: Trajectory | None = None,
-    grid: OccupancyGrid | None = None,
-    diagnostics: ScanDiagnostics | None = None,
-    metrics: RunMetrics | None = None,
-    comparison: Comparison | None = None,
-    localised: NDArray[np.bool_] | None = None,
-    points: Floats | None = None,
-    provenance: Provenance | None = None,
-    convergence: Mapping[str, tuple[Floats, Floats]] | None = None,
-) -> None:
+def write_report_html(path: str | Path, parts: ReportParts) -> None:
     """Write the report of a run as one self-contained HTML file: the same run gives the same bytes.
 
-    Arguments as for `draw_report`; `convergence` holds, by name, curves of the best fitness over the number of
-    evaluations, two arrays of shape (n,). All text is escaped. Raises `OutputError` where it cannot be written.
+    All text is escaped. Raises `OutputError` where it cannot be written.
     """
-    provenance = Provenance() if provenance is None else provenance
-    data = prepare(trajectory, odometry, reference, diagnostics, comparison, localised)
-    drawing, extent = map_svg(data, grid, points)
+    data, metrics = prepare(parts), parts.metrics
+    summary = None if metrics is None else ResultSummary.of(metrics)
+    drawing, extent = map_svg(data, parts.grid, parts.points)
     charts, end = time_charts(data, drifts=metrics is not None and metrics.run.mode == "slam"), _end(data)
     fragments = {
-        "title": escape(title),
-        "facts": _items([] if metrics is None else summary(metrics)),
+        "title": escape(parts.title),
+        "head": "" if summary is None else _head(summary),
         "map": drawing,
         "aspect": f"{min(max(extent.aspect, 0.7), 3.0):.4g}",
-        "legend": _legend(data, grid, points),
-        "headline": "" if metrics is None else _headline(metrics),
-        "charts": "".join(_figure(chart, end) for chart in charts) + _convergence(convergence),
-        "quality": "" if metrics is None else _quality(metrics),
+        "legend": _legend(data, parts.grid, parts.points),
+        "figures": "" if summary is None else _figures(summary),
+        "charts": "".join(_figure(chart, end) for chart in charts) + _convergence(parts.convergence),
         "read": "" if metrics is None else _what_was_read(metrics),
         "scans": _scans(data, end),
         "statistics": "" if metrics is None else _statistics(metrics),
-        "provenance": _provenance(provenance),
+        "provenance": _provenance(parts.provenance),
         "metrics": "" if metrics is None else escape(format_json(metrics.to_json())),
         "data": _script_json(_page_data(data, charts)),
         "style": _template("report.css"),
@@ -156,9 +126,9 @@ def _figure(chart: Chart, end: float) -> str:
     )
 
 
-def _convergence(convergence: Mapping[str, tuple[Floats, Floats]] | None) -> str:
+def _convergence(convergence: Mapping[str, tuple[Floats, Floats]]) -> str:
     parts = []
-    for index, (name, (evaluations, fitness)) in enumerate((convergence or {}).items()):
+    for index, (name, (evaluations, fitness)) in enumerate(convergence.items()):
         curve = Curve(np.asarray(evaluations, dtype=np.float64), np.asarray(fitness, dtype=np.float64))
         if len(curve.seconds):
             title, unit = f"Convergence: {name}", "median best fitness over evaluations"
@@ -197,18 +167,39 @@ def _legend(data: ReportData, grid: OccupancyGrid | None, points: Floats | None)
     )
 
 
-def _headline(metrics: RunMetrics) -> str:
+def _head(summary: ResultSummary) -> str:
+    """Verdict, headline, facts, the figures that matter most, and what speaks against the result."""
+    key_figures = "".join(
+        f'<div class="key-figure"><dt>{escape(row.label)}</dt><dd>{escape(" / ".join(row.values))}</dd>'
+        f'<dd class="muted">{escape(row.explanation)}</dd></div>'
+        for row in summary.key_figures
+    )
+    reasons = f'<h2>Look at this</h2><ul class="reasons">{_items(summary.reasons)}</ul>' if summary.reasons else ""
+    warnings = f"<h2>Warnings</h2><ul>{_items(summary.warnings)}</ul>" if summary.warnings else ""
+    return (
+        f'<p class="headline"><strong class="verdict {summary.verdict}">{summary.verdict}</strong> '
+        f"<span>{escape(summary.headline)}</span></p>"
+        f'<p class="muted">{escape(summary.verdict_text)}</p><ul class="facts">{_items(summary.facts)}</ul>'
+        f'<dl class="key-figures">{key_figures}</dl><section class="warnings">{reasons}{warnings}</section>'
+    )
+
+
+def _figures(summary: ResultSummary) -> str:
     rows = []
     paired = False
-    for row in table_rows(metrics):
+    for row in summary.figures:
         if len(row.values) == 2 and not paired:
             paired = True
             rows.append('<tr><td></td><th scope="col">translation</th><th scope="col">rotation</th></tr>')
         cells = "".join(f"<td>{escape(value)}</td>" for value in row.values)
         if len(row.values) == 1:
             cells = f'<td colspan="2">{escape(row.values[0])}</td>'
-        rows.append(f'<tr><th scope="row">{escape(row.label)}</th>{cells}</tr>')
-    return f'<table class="headline">{"".join(rows)}</table>' if rows else ""
+        rows.append(f'<tr title="{escape(row.explanation)}"><th scope="row">{escape(row.label)}</th>{cells}</tr>')
+    explained = "".join(f"<dt>{escape(row.label)}</dt><dd>{escape(row.explanation)}</dd>" for row in summary.figures)
+    return (
+        f'<table class="figures">{"".join(rows)}</table>'
+        f"<details><summary>What the figures mean</summary><dl>{explained}</dl></details>"
+    )
 
 
 def _scans(data: ReportData, end: float) -> str:
@@ -264,19 +255,6 @@ def _cell(value: float) -> str:
     return str(value) if isinstance(value, int) else f"{value:.4f}" if value == value else DASH
 
 
-def _quality(metrics: RunMetrics) -> str:
-    """The reasons of the verdict, and all other warnings."""
-    reasons = {(reason.code, reason.text) for reason in metrics.verdict_reasons}
-    warnings = [str(each) for each in metrics.warnings if (each.code, each.text) not in reasons]
-    warnings += [f"log: {line}" for line in metrics.losses.notes]
-    if metrics.evaluation_error is not None:
-        warnings.append(f"no comparison with the reference: {metrics.evaluation_error}")
-    lines = [reason_text(each) for each in metrics.verdict_reasons]
-    verdict = f'<section class="warnings"><h2>Verdict: {metrics.verdict}</h2><ul>{_items(lines)}</ul></section>'
-    listed = f'<section class="warnings"><h2>Warnings</h2><ul>{_items(warnings)}</ul></section>'
-    return (verdict if lines else "") + (listed if warnings else "")
-
-
 def _what_was_read(metrics: RunMetrics) -> str:
     rows = [("scans", _laser(laser)) for laser in metrics.log.lasers]
     rows += [("odometry", metrics.log.odometry or "none"), ("reference", metrics.log.reference or "none")]
@@ -288,7 +266,7 @@ def _what_was_read(metrics: RunMetrics) -> str:
     return f'<section><h2>What was read</h2><div class="scroll"><table>{table}</table></div></section>'
 
 
-def _items(lines: list[str]) -> str:
+def _items(lines: Iterable[str]) -> str:
     return "".join(f"<li>{escape(line)}</li>" for line in lines)
 
 

@@ -15,22 +15,19 @@ from hsloc.report import style
 from hsloc.report.data import prepare
 from hsloc.report.map_image import Extent, shown_extent
 from hsloc.report.png_panels import Panel, draw_map, draw_panel, draw_table, time_panels
-from hsloc.report.table import Row, summary, table_rows
+from hsloc.report.summary import ResultSummary
 
 if TYPE_CHECKING:
-    import numpy as np
     from matplotlib.axes import Axes
-    from numpy.typing import NDArray
+    from matplotlib.text import Text
 
-    from hsloc.evaluation import Comparison
-    from hsloc.model import OccupancyGrid, ScanDiagnostics, Trajectory
-    from hsloc.report.data import ReportData
-    from hsloc.run_metrics import RunMetrics
+    from hsloc.report.data import ReportData, ReportParts
+    from hsloc.report.table import Row
 
 WIDTH, HEIGHT, DPI = 16.0, 10.0, 100
 """The picture is 1600 x 1000 pixels."""
 
-LEFT, LEFT_OF_AXES, RIGHT, BOTTOM, TOP = 0.015, 0.05, 0.985, 0.06, 0.9
+LEFT, LEFT_OF_AXES, RIGHT, BOTTOM, TOP = 0.015, 0.05, 0.985, 0.06, 0.88
 """Edges as parts of the picture: of text, of axes (their numbers are left of them), and of all below the head."""
 
 LINE = 0.031
@@ -42,27 +39,11 @@ WIDE = 2.1
 SETTINGS_THAT_STAY = ("backend", "backend_fallback", "interactive", "toolbar", "webagg", "tk.", "savefig.directory")
 
 
-def draw_report(
-    path: str | Path,
-    *,
-    title: str,
-    trajectory: Trajectory,
-    odometry: Trajectory | None = None,
-    reference: Trajectory | None = None,
-    grid: OccupancyGrid | None = None,
-    diagnostics: ScanDiagnostics | None = None,
-    metrics: RunMetrics | None = None,
-    comparison: Comparison | None = None,
-    localised: NDArray[np.bool_] | None = None,
-    points: NDArray[np.float64] | None = None,
-) -> None:
+def draw_report(path: str | Path, parts: ReportParts) -> None:
     """Draw the report of a run as a PNG of 1600 x 1000 pixels: the same run gives the same bytes.
 
-    `comparison` of trajectory and reference gives the error curves, `localised` (n,) marks the known poses.
-    `points`, shape (n, 2) in metres, are drawn as a map of points. All poses are in the map frame, but for the
-    reference, which `comparison` aligns. Raises `OutputError` where `path` cannot be written.
+    Raises `OutputError` where `path` cannot be written.
     """
-    data = prepare(trajectory, odometry, reference, diagnostics, comparison, localised)
     # A user's matplotlibrc must not change the picture.
     defaults = {
         key: value for key, value in matplotlib.rcParamsDefault.items() if not key.startswith(SETTINGS_THAT_STAY)
@@ -73,52 +54,75 @@ def draw_report(
     ):
         # A letter that the font lacks becomes a box in the picture: the user need not be warned.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
-        figure = _figure(title, data, grid, points, metrics)
+        figure = report_figure(parts)
         # Without the version of matplotlib in the file.
         write_atomically(
             Path(path), lambda stream: figure.savefig(stream, format="png", dpi=DPI, metadata={"Software": None})
         )
 
 
-def _figure(
-    title: str,
-    data: ReportData,
-    grid: OccupancyGrid | None,
-    points: NDArray[np.float64] | None,
-    metrics: RunMetrics | None,
-) -> Figure:
+def report_figure(parts: ReportParts) -> Figure:
+    """The picture before it is drawn."""
     figure = Figure(figsize=(WIDTH, HEIGHT), dpi=DPI, facecolor=style.PAPER)
     FigureCanvasAgg(figure)
-    rows = [] if metrics is None else table_rows(metrics)
-    extent, panels = shown_extent(data, grid, points), time_panels(data)
+    data, summary = prepare(parts), None if parts.metrics is None else ResultSummary.of(parts.metrics)
+    rows = [] if summary is None else list(summary.figures)
+    extent, panels = shown_extent(data, parts.grid, parts.points), time_panels(data)
     left, bottom, width, height = _place(figure, extent, panels, rows, data)
     axes = figure.add_axes((left, bottom, width, height))
     shown = extent.widened(width * WIDTH / (height * HEIGHT))
-    draw_map(axes, data, grid, points, shown, max(width * WIDTH, height * HEIGHT) * DPI)
-    _draw_head(figure, axes, title, [] if metrics is None else summary(metrics))
+    draw_map(axes, data, parts.grid, parts.points, shown, max(width * WIDTH, height * HEIGHT) * DPI)
+    _draw_head(figure, axes, parts.title, summary)
     return figure
 
 
-def _draw_head(figure: Figure, axes: Axes, title: str, facts: list[str]) -> None:
-    """Title, and below it the facts on the left and the legend on the right, as much of them as there is room."""
-    # A dollar sign in a file's name is no formula.
-    heading = figure.text(LEFT, 0.982, "", fontsize=20, fontweight="bold", color=style.INK, va="top", parse_math=False)
-    line = figure.text(LEFT, 0.937, "", fontsize=12, color=style.MUTED, va="top")
+def _draw_head(figure: Figure, axes: Axes, title: str, summary: ResultSummary | None) -> None:
+    """Title and legend, the verdict with the headline and the facts, and the first reason, as much as there is room."""
+    wide = WIDTH * DPI
     handles, labels = axes.get_legend_handles_labels()
     legend = figure.legend(
-        handles, labels, loc="upper right", bbox_to_anchor=(RIGHT, 0.94), ncols=max(len(labels), 1), frameon=False,
+        handles, labels, loc="upper right", bbox_to_anchor=(RIGHT, 0.976), ncols=max(len(labels), 1), frameon=False,
         fontsize=style.TEXT, labelcolor=style.INK, handlelength=2.2, columnspacing=1.3, handletextpad=0.6,
         borderaxespad=0.0, borderpad=0.0,
     )  # fmt: skip
-    taken = legend.get_window_extent().width / (WIDTH * DPI)
-    for most in range(len(title), 0, -1):
-        heading.set_text(title if most == len(title) else f"{title[: most // 2]}…{title[-(most - most // 2) :]}")
-        if heading.get_window_extent().width / (WIDTH * DPI) <= RIGHT - LEFT:
-            break
-    for count in range(len(facts), -1, -1):
-        line.set_text("  ·  ".join(facts[:count]))
-        if line.get_window_extent().width / (WIDTH * DPI) <= RIGHT - LEFT - taken - 0.02:
-            break
+    taken = legend.get_window_extent().width / wide
+    # A dollar sign in a file's name is no formula.
+    heading = figure.text(LEFT, 0.985, "", fontsize=20, fontweight="bold", color=style.INK, va="top", parse_math=False)
+    _fit(heading, [_shortened(title, most) for most in range(len(title), 0, -1)], RIGHT - LEFT - taken - 0.02)
+    if summary is None:
+        return
+    badge = figure.text(
+        LEFT + 0.004, 0.9385, summary.verdict.upper(), fontsize=12, fontweight="bold", color="white", va="top",
+        bbox={"boxstyle": "round,pad=0.25", "facecolor": style.VERDICT[summary.verdict], "linewidth": 0},
+    )  # fmt: skip
+    start = LEFT + 0.02 + badge.get_window_extent().width / wide
+    line = figure.text(start, 0.9385, "", fontsize=12.5, color=style.INK, va="top", parse_math=False)
+    texts = [summary.headline, *summary.facts[1:]]
+    _fit(line, ["  ·  ".join(texts[:count]) for count in range(len(texts), 0, -1)], RIGHT - start)
+    if summary.reasons:
+        more = f" (and {len(summary.reasons) - 1} more)" if len(summary.reasons) > 1 else ""
+        reason = summary.reasons[0]
+        line = figure.text(LEFT, 0.909, "", fontsize=11, color=style.MUTED, va="top", parse_math=False)
+        cuts = [reason + more, *(f"{reason[:most]}…{more}" for most in range(len(reason), 0, -1))]
+        _fit(line, cuts, RIGHT - LEFT)
+
+
+def _shortened(text: str, most: int) -> str:
+    return text if most >= len(text) else f"{text[: most // 2]}…{text[-(most - most // 2) :]}"
+
+
+def _fit(line: Text, texts: list[str], width: float) -> None:
+    """Show the first of the texts that is at most `width` (a part of the picture) wide, else the last."""
+    low, high = 0, len(texts) - 1  # Each is shorter than the one before.
+    while low < high:
+        middle = (low + high) // 2
+        line.set_text(texts[middle])
+        if line.get_window_extent().width / (WIDTH * DPI) <= width:
+            high = middle
+        else:
+            low = middle + 1
+    if texts:
+        line.set_text(texts[low])
 
 
 Box = tuple[float, float, float, float]

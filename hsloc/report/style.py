@@ -16,3 +16,6 @@ TEXT, SMALL = 11.0, 9.5
 
 FONT = "DejaVu Sans"
 """Comes with matplotlib: the same picture on every machine."""
+
+VERDICT: dict[str, str] = {"good": "#1a7f37", "check": "#8a5a00", "failed": "#b42318"}
+"""Ground of a verdict's name, which is written in white: the contrast is 5 to 1 or more."""

@@ -1,9 +1,8 @@
-"""The figures of a run under one name and in one unit: for the terminal, report.png, report.html and the web page."""
+"""The figures of a run: each has one name, value, unit and explanation, wherever it is shown."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from math import degrees, isfinite
 from typing import TYPE_CHECKING
 
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from hsloc.run_metrics import MapMetrics, RunMetrics, ScanCounts
 
 DASH = "–"
-_YEAR_2000_NS, _YEAR_2100_NS = 946_684_800e9, 4_102_444_800e9
 STATUS_WORDS: dict[str, str] = {
     Status.MATCHED: "matched",
     Status.RELOCALISED: "relocalised",
@@ -33,37 +31,19 @@ _LISTED = 3
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A line of the table: a label and one value, or two (translation and rotation)."""
+    """A figure under its name: one value, or two (translation and rotation)."""
 
     label: str
     values: tuple[str, ...]
+    explanation: str = ""
+    """What the figure is and what is usual, in a sentence or two."""
+    sources: tuple[str, ...] = ()
+    """Where metrics.json holds the numbers, as JSON pointers without the first slash: `ape/trans_part/rmse`."""
 
 
 def table_rows(metrics: RunMetrics) -> list[Row]:
     """The most important figures: those with two columns first, then those with one."""
     return [*_error_rows(metrics), *_single_rows(metrics)]
-
-
-def summary(metrics: RunMetrics) -> list[str]:
-    """The facts under the title, the most important first."""
-    log, errors = metrics.log, metrics.errors
-    parts = [f"verdict: {metrics.verdict}", *_how(metrics), f"{format_length(log.path_length_m)} path"]
-    parts += [format_duration(log.duration_s), f"{metrics.scans.total:,} scans".replace(",", " ")]
-    if errors is not None:
-        only = metrics.localised_only
-        where = "" if only is None else f", {format_length(only.ape.trans_part.rmse)} where localised"
-        parts.append(f"APE rmse {format_length(errors.ape.trans_part.rmse)}{where}")
-    return parts
-
-
-def _how(metrics: RunMetrics) -> list[str]:
-    """What was done, and when the log begins where its clock is that of the calendar."""
-    name, stamp = metrics.run.map, metrics.log.first_stamp_ns
-    localised = f"localised on {'the map of the log' if name == 'log' else name}"
-    parts = [localised if metrics.run.mode == "localise" else f"map {name}"]
-    if stamp is not None and _YEAR_2000_NS <= stamp < _YEAR_2100_NS:
-        parts.append(f"{datetime.fromtimestamp(stamp // 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC")
-    return parts
 
 
 def format_length(metres: float | None) -> str:
@@ -81,6 +61,12 @@ def format_length(metres: float | None) -> str:
 def format_angle(angle: float | None) -> str:
     """Three figures and the sign of degrees."""
     return DASH if angle is None or not isfinite(angle) else f"{_three_figures(angle)}°"
+
+
+def format_share(share: float) -> str:
+    """A part from 0 to 1 in per cent; what is less than all is never rounded to 100 %."""
+    text = f"{100.0 * share:.1f}"
+    return "> 99.9 %" if share < 1.0 and text == "100.0" else f"{text} %"
 
 
 def format_duration(seconds: float) -> str:
@@ -135,27 +121,55 @@ def error_statistics(metrics: RunMetrics) -> list[tuple[str, str, Statistics]]:
 def _error_rows(metrics: RunMetrics) -> list[Row]:
     rows = []
 
-    def add(label: str, errors: PoseStatistics, name: str = "rmse") -> None:
+    def add(label: str, errors: PoseStatistics, where: str, explanation: str, name: str = "rmse") -> None:
         values = getattr(errors.trans_part, name), getattr(errors.angle_deg, name)
         if any(isfinite(value) for value in values):
-            rows.append(Row(label, (format_length(values[0]), format_angle(values[1]))))
+            sources = (f"{where}/trans_part/{name}", f"{where}/angle_deg/{name}")
+            rows.append(Row(label, (format_length(values[0]), format_angle(values[1])), explanation, sources))
 
     errors = metrics.errors
     if errors is not None:
-        add("APE rmse", errors.ape)
-        if metrics.localised_only is not None:
-            add("APE rmse where localised", metrics.localised_only.ape)
-        add("APE max", errors.ape, "max")
+        only = metrics.localised_only
+        if only is not None:
+            add("APE rmse where localised", only.ape, "localised_only/ape", _APE_LOCALISED)
+        add("APE rmse", errors.ape, "ape", _APE if only is None else f"{_APE} {_APE_WITH_GUESSES}")
+        add(
+            "APE max", errors.ape, "ape", "Largest distance and angle between an estimated and a reference pose.", "max"
+        )
         if metrics.odometry_alone is not None:
-            add("APE rmse of odometry", metrics.odometry_alone.ape)
+            add("APE rmse of odometry", metrics.odometry_alone.ape, "odometry_alone/ape", _APE_ODOMETRY)
         # A path that is shorter than a metre still has pieces of a second, or from frame to frame.
-        known = [each for each in (errors.rpe_1m, errors.rpe_1s, errors.rpe) if each.statistics.trans_part.count]
-        for relative in known[:1]:
-            add(f"RPE rmse per {relative.delta}", relative.statistics)
+        each = (("rpe_1m", errors.rpe_1m), ("rpe_1s", errors.rpe_1s), ("rpe", errors.rpe))
+        known = [(key, relative) for key, relative in each if relative.statistics.trans_part.count]
+        for key, relative in known[:1]:
+            add(f"RPE rmse per {relative.delta}", relative.statistics, key, _RPE)
     if metrics.relations is not None:
-        add("relations, mean", metrics.relations.statistics, "mean")
-        add("relations, std", metrics.relations.statistics, "std")
+        for name in ("mean", "std"):
+            add(f"relations, {name}", metrics.relations.statistics, "relations", _RELATIONS, name)
     return rows
+
+
+_APE = (
+    "Absolute pose error: root mean square distance and angle between the estimated and the reference poses at the "
+    "same times."
+)
+_APE_WITH_GUESSES = "It counts the poses that are marked as unknown as well."
+_APE_LOCALISED = (
+    "Absolute pose error of the poses that the localiser calls known, without those that it marks as guesses. On a map "
+    "that fits, usually less than a cell of the map."
+)
+_APE_ODOMETRY = (
+    "The same error of the odometry alone, from the first known pose on: what there would be without scans. It should "
+    "be much larger than the APE of the trajectory."
+)
+_RPE = (
+    "Relative pose error: error of the motion over a piece of this length. It shows jumps and local distortion and is "
+    "not affected by drift."
+)
+_RELATIONS = (
+    "Error of the relative poses that the file of relations states, in the metric of Kuemmerle et al. (2009). It says "
+    "whether a map is right between places that are near to each other."
+)
 
 
 def _single_rows(metrics: RunMetrics) -> list[Row]:
@@ -163,44 +177,100 @@ def _single_rows(metrics: RunMetrics) -> list[Row]:
     if metrics.errors is not None:
         axes = metrics.errors.axis_rmse
         values = f"{format_length(axes.x)}, {format_length(axes.y)}, {format_angle(degrees(axes.theta))}"
-        rows.append(Row("rmse x, y, heading", (values,)))
+        explanation = "Root mean square error in x, in y and in heading, in the frame of the reference."
+        sources = tuple(f"axis_rmse/{axis}" for axis in ("x", "y", "theta"))
+        rows.append(Row("rmse x, y, heading", (values,), explanation, sources))
     share = metrics.localised.share_of_poses
-    if share < 1.0:
-        rows.append(Row("localised", (f"{100.0 * share:.1f} % of the poses",)))
+    if metrics.run.mode == "localise":
+        rows.append(
+            Row("localised", (f"{format_share(share)} of the poses",), _LOCALISED, ("localised/share_of_poses",))
+        )
     rows += scan_rows(metrics.scans)
-    if metrics.evaluations.median_per_match is not None:
-        rows.append(Row("evaluations, median", (f"{metrics.evaluations.median_per_match:.0f}",)))
-    if metrics.fitness.median is not None:
-        rows.append(Row("fitness, median", (f"{metrics.fitness.median:.3f}",)))
+    if metrics.run.mode == "localise" and metrics.fitness.median is not None:
+        values = f"{metrics.fitness.median:.3f}"
+        rows.append(Row("fitness of the matches, median", (values,), _FITNESS, ("fitness/median",)))
     return [*rows, *_map_rows(metrics.map)]
+
+
+_LOCALISED = (
+    "Part of the poses that are known. The others are guesses: the robot was lost, off the map, or several places fit. "
+    "100 % is usual on a map that fits."
+)
+_FITNESS = (
+    "How well the matched scans lie on the map, from 0 to 1: the mean score of the beams, which falls with the "
+    "distance to the nearest wall. Above 0.8 is usual on a map that fits; what is not in the map lowers it."
+)
 
 
 def scan_rows(scans: ScanCounts) -> list[Row]:
     """How many scans were matched, and what became of the others: together they are all scans."""
-    rows = [Row("scans matched", (f"{scans.used} of {scans.total}",))]
+    explanation = "Scans whose match was accepted, of all scans of the log."
+    rows = [Row("scans matched", (f"{scans.used} of {scans.total}",), explanation, ("scans/used", "scans/total"))]
     known = [status.value for status in Status]
     names = [name for name in (*known, *sorted(set(scans.by_status) - set(known))) if scans.by_status.get(name)]
     unused = [name for name in names if name not in (Status.MATCHED, Status.RELOCALISED)]
     if unused:
         words = ", ".join(f"{scans.by_status[name]} {STATUS_WORDS.get(name, name)}" for name in unused)
-        rows.append(Row("scans not matched", (words,)))
+        explanation = (
+            "What became of the other scans. Held by the motion gate: the robot had hardly moved since the last match, "
+            "so the scan was not needed; this is no fault."
+        )
+        rows.append(
+            Row("scans not matched", (words,), explanation, tuple(f"scans/by_status/{name}" for name in unused))
+        )
     return rows
 
 
 def _map_rows(found: MapMetrics) -> list[Row]:
     rows, residuals = [], found.residuals
-    if residuals.median is not None and residuals.p95 is not None and residuals.within_15_cm is not None:
+    if residuals.within_15_cm is not None:
+        values = format_share(residuals.within_15_cm)
+        rows.append(Row("points within 15 cm of a wall", (values,), _NEAR_WALL, ("map/residuals/within_0.15_m",)))
+    if residuals.p95 is not None:
         # The distance is that from cell to cell: a point in an occupied cell has no smaller distance.
-        near = ["in the cell" if value == 0.0 else format_length(value) for value in (residuals.median, residuals.p95)]
-        rows.append(Row("scan to map, median, 95 %", (", ".join(dict.fromkeys(near)),)))
-        rows.append(Row("points within 15 cm of a wall", (f"{100.0 * residuals.within_15_cm:.1f} %",)))
-    if found.mapping is not None:
-        loops = f"{found.mapping.keyscans} keyscans, {found.mapping.loops} loops"
-        rows.append(Row("map built from", (loops,)))
+        near = "less than a cell" if residuals.p95 == 0.0 else format_length(residuals.p95)
+        rows.append(Row("scan to map, 95 % of points", (near,), _SCAN_TO_MAP, ("map/residuals/p95",)))
+    mapping = found.mapping
+    if mapping is not None:
+        loops = f"{mapping.loops} of {mapping.loops + mapping.loops_refused} candidates"
+        rows.append(Row("loops closed", (loops,), _LOOPS, ("map/mapping/loops", "map/mapping/loops_refused")))
+        explanation = "Scans that the map was made from: one for each part of a metre or of a turn."
+        rows.append(Row("keyscans", (str(mapping.keyscans),), explanation, ("map/mapping/keyscans",)))
+        if isfinite(mapping.conflict):
+            values = format_share(mapping.conflict)
+            rows.append(Row("points seen through", (values,), _CONFLICT, ("map/mapping/conflict",)))
     if found.crispness is not None and isfinite(found.crispness.wall_thickness_median):
-        rows.append(Row("wall thickness", (format_length(found.crispness.wall_thickness_median),)))
+        values = format_length(found.crispness.wall_thickness_median)
+        rows.append(Row("wall thickness", (values,), _THICKNESS, ("map/crispness/wall_thickness_median",)))
     compared = found.comparison
     if compared is not None and isfinite(compared.precision):
-        values = f"{100.0 * compared.precision:.1f} %, {100.0 * compared.recall:.1f} %"
-        rows.append(Row("map precision, recall", (values,)))
+        values = f"{format_share(compared.precision)}, {format_share(compared.recall)}"
+        sources = ("map/comparison/precision", "map/comparison/recall")
+        rows.append(Row("map precision, recall", (values,), _PRECISION, sources))
     return rows
+
+
+_NEAR_WALL = (
+    "Part of the scan points that lie within 15 cm of a wall of the map. Above 95 % is usual for a map that fits; "
+    "people and furniture that are not in the map lower it."
+)
+_SCAN_TO_MAP = (
+    "Distance to the nearest occupied cell of the map that 95 of 100 scan points stay below. One or two cells are "
+    "usual, 5 to 10 cm on most maps."
+)
+_LOOPS = (
+    "Places that were recognised when the robot came back, of all that were compared. A map without a loop keeps the "
+    "drift of the odometry; refused candidates are usual."
+)
+_CONFLICT = (
+    "Part of the points of the map where another scan looked through. Below 5 % is usual; more means that walls are "
+    "doubled, or that things moved."
+)
+_THICKNESS = (
+    "Median thickness of what is occupied in the built map. 10 to 20 cm are usual, as furniture and both faces of a "
+    "wall count; more than in another run of the same log means that the visits to a place do not lie on each other."
+)
+_PRECISION = (
+    "Precision: part of the built walls that are in the true map. Recall: part of the seen walls of the true map that "
+    "were built."
+)

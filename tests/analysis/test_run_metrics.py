@@ -19,8 +19,11 @@ from hsloc.errors import HslocError
 from hsloc.evaluation.metrics import compare
 from hsloc.model import Trajectory
 from hsloc.model.verdict import Verdict, VerdictReason, verdict_of
-from hsloc.report.table import error_statistics, reason_text, table_rows
-from hsloc.run_metrics import RunMetrics, RunTimings, schema
+from hsloc.report.data import ReportParts
+from hsloc.report.png import report_figure
+from hsloc.report.summary import ResultSummary
+from hsloc.report.table import error_statistics, format_angle, format_length, format_share, reason_text, table_rows
+from hsloc.run_metrics import LocalisedMetrics, RunMetrics, RunTimings, schema
 from hsloc.warnings import RunWarning, WarningCode
 from hsloc_service.execution.worker import summarise
 
@@ -133,27 +136,73 @@ def test_the_worst_reason_is_the_verdict() -> None:
     assert verdict_of([]) == Verdict.GOOD
 
 
-def test_every_figure_is_the_same_on_the_terminal_in_the_report_and_on_the_page(run: Any, metrics: Any) -> None:
+def forms_of(number: float) -> set[str]:
+    """A number of metrics.json as the figures may show it."""
+    shares = {format_share(number)} if 0.0 <= number <= 1.0 else set()
+    zero = {"less than a cell"} if number == 0.0 else set()
+    angles = {format_angle(number), format_angle(np.degrees(number))}
+    return {format_length(number), *angles, str(number), f"{number:.3f}", *shares, *zero}
+
+
+def test_every_figure_is_the_same_in_metrics_on_the_terminal_in_the_reports_and_on_the_page(
+    run: Any, metrics: Any
+) -> None:
     folder, terminal = run
-    report = words((folder / "report.html").read_text())
+    report, shown = words((folder / "report.html").read_text()), words(terminal)
+    written = json.loads((folder / "metrics.json").read_text())
     summary = summarise(metrics, RunTimings(seconds={"replay": 1.0}, times_real_time=None, evaluations_per_second=None))
     on_page = {each["name"]: each["values"] for each in summary["figures"]}
-    rows = table_rows(metrics)
-    assert {"APE rmse", "APE rmse where localised", "APE rmse of odometry", "localised"} <= {row.label for row in rows}
-    for row in rows:
+    parts = ReportParts(title="a", trajectory=Trajectory(np.zeros(0, np.int64), np.zeros((0, 3))), metrics=metrics)
+    picture = report_figure(parts)
+    in_picture = {text.get_text() for axes in picture.axes for text in axes.texts}
+    result = ResultSummary.of(metrics)
+    names = {row.label for row in result.figures}
+    assert {"APE rmse", "APE rmse where localised", "APE rmse of odometry", "localised"} <= names
+    assert [row.label for row in result.key_figures] == [
+        "localised", "APE rmse where localised", "points within 15 cm of a wall"
+    ]  # fmt: skip
+    for row in result.figures:
         line = " ".join([row.label, *row.values])
-        assert line in words(terminal)
+        assert line in shown
         assert line in report
+        assert html.escape(row.explanation) in (folder / "report.html").read_text()
         assert on_page[row.label] == list(row.values)
-    assert f"verdict: {metrics.verdict}" in terminal
-    assert f"Verdict: {metrics.verdict}" in report
+        assert {row.label, *row.values} <= in_picture
+        assert row.sources
+        for pointer in row.sources:
+            number = written
+            for key in pointer.split("/"):
+                number = number[key]
+            assert any(form in " ".join(row.values) for form in forms_of(number)), (row.label, pointer)
+    for text in (result.verdict_text, result.headline, *result.reasons):
+        assert text in shown
+        assert text in report
+    in_head = {text.get_text() for text in picture.texts}
+    assert {"CHECK"} <= in_head
+    assert any(text.startswith(result.headline) for text in in_head)
+    assert (summary["headline"], summary["verdict_text"]) == (result.headline, result.verdict_text)
     assert summary["metrics"]["verdict"] == metrics.verdict
     (reason,) = metrics.verdict_reasons
     assert summary["verdict_reasons"][0]["line"] == reason_text(reason)
-    assert reason_text(reason) in words(terminal)
-    assert reason_text(reason) in report
     for label, unit, values in error_statistics(metrics):
         assert f"{label} [{unit}] {values.rmse:.4f} {values.mean:.4f}" in report
+
+
+def test_the_headline_says_what_was_found() -> None:
+    lost = VerdictReason(Verdict.CHECK, "poses_lost", "x", times=((1.0, 2.0), (5.0, 7.5)))
+    scans = replace(sample_metrics().scans, by_status={"relocalised": 2})
+    metrics = sample_metrics(
+        verdict_reasons=(lost,), verdict=Verdict.CHECK, localised=LocalisedMetrics(share_of_poses=0.9999), scans=scans
+    )
+    assert ResultSummary.of(metrics).headline == (
+        "Localised on the map of the log: > 99.9 % of the poses are known; "
+        "the pose was lost 2 times, for 3.5 s in all, and found again."
+    )
+    nowhere = replace(metrics, localised=LocalisedMetrics(share_of_poses=0.0), verdict=Verdict.FAILED)
+    assert ResultSummary.of(nowhere).headline == "Not localised on the map of the log: every pose is a guess."
+    assert ResultSummary.of(nowhere).verdict_text == "failed: the result is not usable"
+    built = replace(metrics, run=replace(metrics.run, mode="slam", map="built"))
+    assert ResultSummary.of(built).headline == "Built a map from 0 scans."
 
 
 def test_the_error_of_a_kidnapped_robot_is_shown_where_it_is_localised_too(run: Any, metrics: Any) -> None:

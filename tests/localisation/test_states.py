@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from hsloc.export.states_csv import HEADER, write_states
+from hsloc.export.results_folder import STATES_HEADER, write_states
 from hsloc.localisation.states import StateLog, StateRows
 from hsloc.localisation.verdict import localisation_reasons
 from hsloc.model import Estimate, Evidence, Pose2, State, Status, Trajectory
@@ -126,7 +126,7 @@ def test_states_csv_has_a_line_for_each_pose(tmp_path: Path) -> None:
     )
     write_states(tmp_path / "states.csv", np.array((1_500_000_000, 2_000_000_000)), found)
     assert (tmp_path / "states.csv").read_text(encoding="utf-8").splitlines() == [
-        ",".join(HEADER),
+        ",".join(STATES_HEADER),
         "1.500000000,localised,0.9900,0.0100,0.0200,0.00300,0.900,",
         '2.000000000,lost,0.0000,nan,nan,nan,nan,"found, or not"',
     ]

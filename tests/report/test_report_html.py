@@ -18,8 +18,8 @@ from PIL import Image
 from hsloc.errors import OutputError
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
 from hsloc.model.verdict import Verdict, VerdictReason
-from hsloc.report.data import prepare
-from hsloc.report.html import Provenance, time_charts, write_report_html
+from hsloc.report.data import Provenance, ReportParts, prepare
+from hsloc.report.html import time_charts, write_report_html
 from hsloc.report.svg import MOST_MARKS, Chart, chart_svg, map_svg, runs, ticks
 from hsloc.warnings import RunWarning
 
@@ -63,8 +63,12 @@ class Page(HTMLParser):
         return "".join(data for name, data in self.text if name == tag)
 
 
+def parts(trajectory: Trajectory, **others: Any) -> Any:
+    return prepare(ReportParts(title="", trajectory=trajectory, **others))
+
+
 def write(tmp_path: Path, **arguments: Any) -> tuple[str, Page]:
-    write_report_html(tmp_path / "report.html", **{"title": "office.mcap", **arguments})
+    write_report_html(tmp_path / "report.html", ReportParts(**{"title": "office.mcap", **arguments}))
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     return text, Page(text)
 
@@ -169,7 +173,7 @@ def test_the_embedded_map_is_the_map() -> None:
     cells[1:5, 2:7] = 0
     cells[1, 3] = 100
     svg, _ = map_svg(
-        prepare(Trajectory(np.zeros(0, np.int64), np.zeros((0, 3))), None, None, None),
+        parts(Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))),
         OccupancyGrid(cells, 0.5, Pose2(10.0, 20.0, 0.0)),
         None,
     )
@@ -190,7 +194,7 @@ def test_a_path_is_drawn_true_and_thin() -> None:
     n = 200_000
     poses = np.column_stack((np.cumsum(rng.normal(0, 0.01, (n, 2)), axis=0) + 5e5, np.zeros(n)))
     path = Trajectory(np.arange(n, dtype=np.int64) * 10**7, poses)
-    svg, extent = map_svg(prepare(path, None, None, None), None, None)
+    svg, extent = map_svg(parts(path), None, None)
     assert len(svg) < 800_000
     (d,) = re.findall(r'class="trajectory" d="M([^"]*)"', svg)
     drawn = np.array([[float(number) for number in point.split()] for point in d.split("L")])
@@ -209,13 +213,13 @@ def test_many_marks_are_thinned(run: dict[str, Any]) -> None:
     rng = np.random.default_rng(0)
     path = Trajectory(np.arange(n, dtype=np.int64) * 10**8, np.cumsum(rng.normal(0, 1, (n, 3)), axis=0))
     diagnostics = diagnostics_of(rng, path, every=1, rejected=1.0)
-    svg, _ = map_svg(prepare(path, None, None, diagnostics), None, None)
+    svg, _ = map_svg(parts(path, diagnostics=diagnostics), None, None)
     assert svg.count("rejected at") <= MOST_MARKS
 
 
 def test_where_it_cannot_be_written(run: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot be written"):
-        write_report_html(tmp_path / "no" / "report.html", title="a", trajectory=run["trajectory"])
+        write_report_html(tmp_path / "no" / "report.html", ReportParts(title="a", trajectory=run["trajectory"]))
 
 
 def test_charts_by_hand() -> None:
@@ -227,7 +231,7 @@ def test_charts_by_hand() -> None:
 
 
 def test_a_chart_breaks_where_the_pose_was_lost(run: Any) -> None:
-    data = prepare(run["trajectory"], None, None, run["diagnostics"])
+    data = parts(run["trajectory"], diagnostics=run["diagnostics"])
     (fitness,) = [chart for chart in time_charts(data) if chart.name == "fitness"]
     svg = chart_svg(fitness, 30.0)
     (d,) = re.findall(r'class="line green" d="([^"]*)"', svg)
@@ -236,7 +240,7 @@ def test_a_chart_breaks_where_the_pose_was_lost(run: Any) -> None:
 
 
 def test_a_wide_range_is_drawn_on_powers_of_ten(run: Any) -> None:
-    data = prepare(run["trajectory"], None, run["reference"], None, run["comparison"])
+    data = parts(run["trajectory"], reference=run["reference"], comparison=run["comparison"])
     (chart,) = [chart for chart in time_charts(data) if chart.name == "error_cm"]
     chart.curve.values[10] = 5000.0
     labels = re.findall(r'text-anchor="end">([\d.]+)<', chart_svg(Chart("a", "a", "cm", chart.curve), 30.0))

@@ -98,12 +98,16 @@ _MOST_LINES = 50
 def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
     """The summary of a job: the figures as the reports show them, the verdict, and all warnings of the run."""
     from hsloc.dataclass_json import to_json
-    from hsloc.report.table import reason_text, table_rows
+    from hsloc.report.summary import ResultSummary
+    from hsloc.report.table import reason_text
 
-    values = metrics.to_json()
+    values, summary = metrics.to_json(), ResultSummary.of(metrics)
     return {
         "metrics": {key: values[key] for key in _SUMMARISED if key in values},
-        "figures": [{"name": row.label, "values": list(row.values)} for row in table_rows(metrics)],
+        "headline": summary.headline,
+        "verdict_text": summary.verdict_text,
+        "key_figures": [row.label for row in summary.key_figures],
+        "figures": [{"name": row.label, "values": list(row.values)} for row in summary.figures],
         "verdict_reasons": [
             {**_shortened(to_json(each)), "line": reason_text(each)[:500]} for each in metrics.verdict_reasons
         ][:_MOST_LINES],

@@ -17,23 +17,39 @@ from hsloc.cli.progress import ProgressLine
 from hsloc.options import BY_NAME, MATCHER_ALIASES
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from hsloc.config import Config
-    from hsloc.sweep.runs import Outcome
+    from hsloc.sweep.runs import Outcome, SweepRun
+    from hsloc.sweep.shards import Shard
 
 HELP = "replay many logs, configurations and seeds"
 EXAMPLES = """
   hsloc sweep logs/*.mcap --out nightly --jobs 4 --min-localised 0.95
   hsloc sweep run.mcap --out budgets --vary hide.budget=100,200,400 --seeds 0-9
   hsloc sweep run.mcap --out compare --matcher hide --matcher icp --csv
+  hsloc sweep logs/*.mcap --out nightly --shard 0/4 && hsloc sweep --merge --out nightly
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Logs, what to vary, and how."""
-    parser.add_argument("log", nargs="+", type=Path, help="Logs; each is a run of its own.")
+    parser.add_argument("log", nargs="*", type=Path, help="Logs; each is a run of its own. With --merge: folders.")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="Folder of all results.")
     parser.add_argument(
         "--jobs", "-j", type=_positive, default=1, metavar="N", help="Runs at the same time (default: 1)."
+    )
+    parser.add_argument(
+        "--executor", type=_dask_address, metavar="URL",
+        help="Do the runs on the workers of a Dask cluster, dask://HOST:PORT, which see the same folders.",
+    )  # fmt: skip
+    parts = parser.add_argument_group("in parts, on several machines").add_mutually_exclusive_group()
+    parts.add_argument(
+        "--shard", type=_shard, metavar="I/N",
+        help="Do part I of N, from 0; auto/N or auto: the index of an array job of Kubernetes, Slurm or AWS Batch.",
+    )  # fmt: skip
+    parts.add_argument(
+        "--merge", action="store_true", help="Merge the tables of all parts in --out, or in the given folders."
     )
     group = parser.add_argument_group("what to vary, besides --preset, --config, --matcher and --mapper")
     group.add_argument("--seeds", type=seeds, default=(0,), metavar="LIST", help="Seeds: 0,1,2 or 0-9 (default: 0).")
@@ -51,40 +67,74 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Sweep; 1 where a run failed, else 4 where one does not keep a limit, else 3 where part of an input was lost."""
-    from hsloc.cli.main import EXIT_BELOW_LIMIT, EXIT_DATA_LOST, EXIT_FAILED, EXIT_OK
+    from hsloc.cli.main import EXIT_USAGE
     from hsloc.errors import OutputError
-    from hsloc.sweep.process_pool import sweep_in_processes
-    from hsloc.sweep.runs import FAILED, plan
-    from hsloc.sweep.table import as_csv, as_json, as_text
+    from hsloc.sweep.shards import merge, write_shard
+    from hsloc.sweep.table import as_csv, as_json, as_markdown, as_text, rows
 
-    common = {name: value for name, value in values(arguments).items() if not BY_NAME[name].varied and name != "set"}
-    runs = plan(arguments.log, configs(arguments), arguments.seeds, **common)
     folder: Path = arguments.out
+    if not arguments.merge and not arguments.log:
+        print("hsloc sweep: error: no log is given (see hsloc sweep --help)", file=sys.stderr)
+        return EXIT_USAGE
+    if arguments.merge:
+        table = merge(arguments.log or [folder])
+    else:
+        runs = _plan(arguments)
+        part = runs if arguments.shard is None else arguments.shard.part(runs)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        done = 0
-        with ProgressLine(arguments.quiet or arguments.no_progress) as line:
-
-            def tell(outcome: Outcome) -> None:
-                nonlocal done
-                done += 1
-                line.show("sweep", done / len(runs), f"{done} of {len(runs)} runs: {outcome.run.name} {outcome.state}")
-
-            outcomes = sweep_in_processes(runs, folder, min(arguments.jobs, len(runs)), tell)
-        (folder / "sweep.csv").write_text(as_csv(outcomes), encoding="utf-8")
-        (folder / "sweep.json").write_text(as_json(outcomes), encoding="utf-8")
+        if not arguments.merge:
+            outcomes = _sweep(arguments, part)
+            table = rows(outcomes)
+        if arguments.shard is not None:
+            write_shard(folder, arguments.shard, runs, outcomes)
+        else:
+            (folder / "sweep.csv").write_text(as_csv(table), encoding="utf-8")
+            (folder / "sweep.json").write_text(as_json(table), encoding="utf-8")
+            (folder / "sweep.md").write_text(as_markdown(table), encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
     form = as_json if arguments.json else as_csv if arguments.csv else as_text
-    sys.stdout.write(form(outcomes))
-    failed = sum(outcome.state == FAILED for outcome in outcomes)
-    if failed and not arguments.quiet:
-        print(f"hsloc: {failed} of {len(outcomes)} runs failed", file=sys.stderr)
+    sys.stdout.write(form(table))
+    return _exit_code(table, arguments.quiet)
+
+
+def _plan(arguments: argparse.Namespace) -> list[SweepRun]:
+    from hsloc.sweep.runs import plan
+
+    common = {name: value for name, value in values(arguments).items() if not BY_NAME[name].varied and name != "set"}
+    return plan(arguments.log, configs(arguments), arguments.seeds, **common)
+
+
+def _sweep(arguments: argparse.Namespace, runs: list[SweepRun]) -> list[Outcome]:
+    """Do the runs where the arguments say, with a line of progress."""
+    from hsloc.sweep.process_pool import sweep_in_processes, sweep_on_dask
+
+    done = 0
+    with ProgressLine(arguments.quiet or arguments.no_progress) as line:
+
+        def tell(outcome: Outcome) -> None:
+            nonlocal done
+            done += 1
+            line.show("sweep", done / len(runs), f"{done} of {len(runs)} runs: {outcome.run.name} {outcome.state}")
+
+        if arguments.executor is not None:
+            return sweep_on_dask(runs, arguments.out, arguments.executor, tell)
+        return sweep_in_processes(runs, arguments.out, max(min(arguments.jobs, len(runs)), 1), tell)
+
+
+def _exit_code(table: Sequence[Mapping[str, Any]], quiet: bool) -> int:
+    from hsloc.cli.main import EXIT_BELOW_LIMIT, EXIT_DATA_LOST, EXIT_FAILED, EXIT_OK
+    from hsloc.sweep.runs import FAILED
+
+    failed = sum(row["state"] == FAILED for row in table)
+    if failed and not quiet:
+        print(f"hsloc: {failed} of {len(table)} runs failed", file=sys.stderr)
     if failed:
         return EXIT_FAILED
-    if any(outcome.limits for outcome in outcomes):
+    if any(row["limits"] for row in table):
         return EXIT_BELOW_LIMIT
-    return EXIT_DATA_LOST if any(outcome.data_lost for outcome in outcomes) else EXIT_OK
+    return EXIT_DATA_LOST if any(row["data_lost"] for row in table) else EXIT_OK
 
 
 def configs(arguments: argparse.Namespace) -> dict[str, tuple[str, Config]]:
@@ -152,3 +202,20 @@ def _positive(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 1 or more")
     return int(text)
+
+
+def _shard(text: str) -> Shard:
+    from hsloc.sweep.shards import parse_shard
+
+    try:
+        return parse_shard(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def _dask_address(text: str) -> str:
+    """The address of a scheduler as Dask has it."""
+    scheme, sign, address = text.partition("://")
+    if scheme != "dask" or not sign or ":" not in address:
+        raise argparse.ArgumentTypeError(f"{text!r} is not dask://HOST:PORT")
+    return f"tcp://{address}"

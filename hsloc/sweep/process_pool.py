@@ -1,4 +1,4 @@
-"""A sweep in processes of its own: survives runs that take their process with them, and Ctrl-C."""
+"""A sweep in other processes: of its own, which survive runs that end theirs and Ctrl-C, or of a cluster."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPool
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from hsloc.errors import HslocError
 from hsloc.replay.run import interrupts_held_back
 from hsloc.sweep.runs import BROKEN, FAILED, STOP, Outcome, SweepRun, sweep
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _THREADS = "NUMBA_NUM_THREADS"
+DASK_TIMEOUT_S = 10.0
+"""Time within which a scheduler must answer [s]."""
 
 
 def sweep_in_processes(
@@ -41,6 +44,43 @@ def sweep_in_processes(
         for index, outcome in zip(again, repeated, strict=True):
             outcomes[index] = outcome
     return outcomes
+
+
+def sweep_on_dask(
+    runs: Sequence[SweepRun], folder: Path, address: str, progress: Callable[[Outcome], None] | None = None
+) -> list[Outcome]:
+    """As `sweep`, on the workers of the Dask scheduler at `address` (`tcp://HOST:PORT`), which see the same folders.
+
+    A run whose worker dies is begun again on another one, as often as the scheduler's `allowed-failures` says. Raises
+    HslocError without the package `distributed`, and where no scheduler answers.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise HslocError(
+            "--executor dask://...: the package distributed is missing; pip install distributed"
+        ) from error
+    try:
+        client = Client(address, timeout=DASK_TIMEOUT_S, set_as_default=False)
+    except OSError as error:
+        raise HslocError(f"{address}: no Dask scheduler answers there; start one with: dask scheduler") from error
+    with client, client.get_executor(pure=False) as executor:
+        return sweep(runs, folder, _InFolder(executor, os.getcwd()), progress)
+
+
+class _InFolder(Executor):
+    """Every call in the working directory of the caller, to which the paths of a run are relative."""
+
+    def __init__(self, executor: Executor, folder: str) -> None:
+        self._executor, self._folder = executor, folder
+
+    def submit(self, call: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        return self._executor.submit(_call_in, self._folder, call, *arguments, **named)
+
+
+def _call_in(folder: str, call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    os.chdir(folder)
+    return call(*arguments, **named)
 
 
 def _is_broken(outcome: Outcome) -> bool:

@@ -10,7 +10,8 @@ import hashlib
 import json
 import threading
 import traceback
-from concurrent.futures import BrokenExecutor, CancelledError, as_completed
+from concurrent.futures import as_completed
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -143,7 +144,7 @@ def sweep(
             item = runs[waiting[future]]
             try:
                 settle(waiting[future], future.result())
-            except (BrokenExecutor, CancelledError) as error:
+            except Exception as error:  # `do_run` raises none: it is the executor's, and each has its own.
                 settle(waiting[future], _broken(item, folder, error))
     except BaseException:
         for future in waiting:
@@ -174,7 +175,8 @@ def do_run(item: SweepRun, folder: Path, key: str) -> Outcome:
     except Exception as error:  # A defect of ours must not end the sweep; its trace is kept for the report of it.
         reason = (str(error).splitlines() or [""])[0]
         trace = folder / f"{item.name}.error.txt"
-        trace.write_text(traceback.format_exc(), encoding="utf-8")
+        with suppress(OSError):
+            trace.write_text(traceback.format_exc(), encoding="utf-8")
         return Outcome(item, FAILED, target, error=f"{type(error).__name__}: {reason} (see {trace})")
 
 
@@ -202,12 +204,7 @@ def run_key(request: RunRequest, hashes: dict[Path, str] | None = None) -> str:
     `hashes` remembers those of files between calls. Raises HslocError where a file cannot be read.
     """
     hashes = {} if hashes is None else hashes
-    values: dict[str, Any] = {"hsloc": __version__}
-    limits = {option.target for option in OPTIONS if option.place == "check"}
-    for item in fields(request):
-        if item.name not in limits:  # They decide no file.
-            value = getattr(request, item.name)
-            values[item.name] = to_dict(value) if item.name != "logs" else [path.name for path in value]
+    values: dict[str, Any] = {"hsloc": __version__, **request_values(request)}
     if request.map_path is not None:
         values["map_path"] = [
             request.map_path.name,
@@ -220,6 +217,20 @@ def run_key(request: RunRequest, hashes: dict[Path, str] | None = None) -> str:
             values[name] = [Path(path).name, _digest(Path(path), hashes)]
     values["input"] = [_log_digest(path, hashes) for path in request.logs]
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def request_values(request: RunRequest) -> dict[str, Any]:
+    """What a request says, as plain data; of files their names alone, wherever they are."""
+    values: dict[str, Any] = {}
+    limits = {option.target for option in OPTIONS if option.place == "check"}
+    for item in fields(request):
+        if item.name not in limits:  # They decide no file.
+            value = getattr(request, item.name)
+            if item.name == "logs":
+                values[item.name] = [path.name for path in value]
+            else:
+                values[item.name] = value.name if isinstance(value, Path) else to_dict(value)
+    return values
 
 
 def _map_files(path: Path) -> list[Path]:

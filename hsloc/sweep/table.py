@@ -1,4 +1,4 @@
-"""The table of a sweep: a row for each run, as text, CSV or JSON."""
+"""The table of a sweep: a row for each run, as text, CSV, JSON or Markdown."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ import io
 import json
 from typing import TYPE_CHECKING, Any
 
+from hsloc import text_table
+
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from hsloc.sweep.runs import Outcome
+
+    Row = Mapping[str, Any]
 
 COLUMNS = (
     "run",
@@ -83,17 +87,17 @@ def _row(outcome: Outcome) -> dict[str, Any]:
     return {name: None if value != value else value for name, value in values.items()}
 
 
-def as_json(outcomes: Sequence[Outcome]) -> str:
+def as_json(table: Sequence[Row]) -> str:
     """A list of rows."""
-    return json.dumps(rows(outcomes), indent=2) + "\n"
+    return json.dumps(table, indent=2) + "\n"
 
 
-def as_csv(outcomes: Sequence[Outcome]) -> str:
+def as_csv(table: Sequence[Row]) -> str:
     """A header and a line for each run."""
     stream = io.StringIO()
     writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows(outcomes))
+    writer.writerows(table)
     return stream.getvalue()
 
 
@@ -111,16 +115,30 @@ _SHOWN = (
 )
 
 
-def as_text(outcomes: Sequence[Outcome]) -> str:
+def as_text(table: Sequence[Row]) -> str:
     """For people; columns that no run has a value for are left out, and reasons of failures are below."""
-    found = rows(outcomes)
-    shown = [item for item in _SHOWN if any(row[item[0]] is not None for row in found)]
-    lines = [[title for _, title, _ in shown]]
-    lines += [["-" if row[key] is None else form.format(row[key]) for key, _, form in shown] for row in found]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(shown))]
+    lines = _shown(table)
+    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
     text = [
         "  ".join(c.ljust(w) if n < 2 else c.rjust(w) for n, (c, w) in enumerate(zip(line, widths, strict=True)))
         for line in lines
     ]
-    text += [f"{row['run']}: {row['error'] or row['limits']}" for row in found if row["error"] or row["limits"]]
-    return "\n".join(line.rstrip() for line in text) + "\n"
+    return "\n".join(line.rstrip() for line in [*text, *_reasons(table)]) + "\n"
+
+
+def as_markdown(table: Sequence[Row]) -> str:
+    """As `as_text`, for a page: a table, and a list of reasons."""
+    head, *lines = _shown(table)
+    return "\n".join([*text_table.table(head, lines), *(f"- {reason}" for reason in _reasons(table))]).rstrip() + "\n"
+
+
+def _shown(table: Sequence[Row]) -> list[list[str]]:
+    """The titles, and a line for each run."""
+    shown = [item for item in _SHOWN if any(row[item[0]] is not None for row in table)] or list(_SHOWN[:2])
+    lines = [[title for _, title, _ in shown]]
+    lines += [["-" if row[key] is None else form.format(row[key]) for key, _, form in shown] for row in table]
+    return lines
+
+
+def _reasons(table: Sequence[Row]) -> list[str]:
+    return [f"{row['run']}: {row['error'] or row['limits']}" for row in table if row["error"] or row["limits"]]

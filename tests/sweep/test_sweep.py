@@ -24,7 +24,7 @@ from hsloc.log import ReadOptions
 from hsloc.run_metrics import RunMetrics
 from hsloc.sweep.process_pool import sweep_in_processes
 from hsloc.sweep.runs import DONE, FAILED, SKIPPED, Outcome, SweepRun, plan, run_key, sweep
-from hsloc.sweep.table import COLUMNS, as_csv, as_json, as_text
+from hsloc.sweep.table import COLUMNS, as_csv, as_json, as_markdown, as_text, rows
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -145,22 +145,25 @@ def test_a_run_that_ends_its_process_ends_no_other(tmp_path: Path) -> None:
     assert "NUMBA_NUM_THREADS" not in os.environ
 
 
-def test_the_table_in_three_forms(tmp_path: Path) -> None:
+def test_the_table_in_four_forms(tmp_path: Path) -> None:
     outcomes = sweep_in_threads(plan([OFFICE, tmp_path / "missing.mcap"], DEFAULT, read=SHORT), tmp_path)
-    good, bad = json.loads(as_json(outcomes))
+    good, bad = json.loads(as_json(rows(outcomes)))
     assert tuple(good) == COLUMNS
     assert good["ape_m"] == outcomes[0].metrics.errors.ape.trans_part.rmse
     assert good["localised"] == 1.0
     assert good["verdict"] == "good"
     assert good["rpe_m"] is not None
     assert (bad["state"], bad["ape_m"]) == ("failed", None)
-    table = list(csv.DictReader(io.StringIO(as_csv(outcomes))))
+    table = list(csv.DictReader(io.StringIO(as_csv(rows(outcomes)))))
     assert [row["run"] for row in table] == ["office-default-seed0", "missing-default-seed0"]
     assert float(table[0]["ape_m"]) == good["ape_m"]
-    lines = as_text(outcomes).splitlines()
+    lines = as_text(rows(outcomes)).splitlines()
     assert "APE [m]" in lines[0]
     assert "rel. [m]" not in lines[0]
     assert lines[-1].startswith("missing-default-seed0: ")
+    markdown = as_markdown(rows(outcomes)).splitlines()
+    assert markdown[0].split("|")[1:4] == [" run                   ", " state  ", " verdict "]
+    assert markdown[-1] == f"- {lines[-1]}"
 
 
 def command(capsys: pytest.CaptureFixture[str], *argv: Path | str) -> tuple[int, str, str]:

@@ -100,9 +100,14 @@ def summary_lines(metrics: RunMetrics, timings: RunTimings, folder: Path) -> lis
     lines.append(f"path {format_length(metrics.log.path_length_m)} in {format_duration(metrics.log.duration_s)}")
     if timings.times_real_time:
         work = timings.seconds["replay"] + timings.seconds.get("finish", 0.0)
-        lines.append(f"replay: {work:.2f} s, {timings.times_real_time:.0f}x real time")
+        lines.append(f"replay: {work:.2f} s, {_multiple(timings.times_real_time)}x real time")
     lines.append(f"results: {folder}")
     return lines
+
+
+def _multiple(value: float) -> str:
+    """A whole number, or two figures where that would say 0 or 1."""
+    return f"{value:.0f}" if value >= 9.5 else f"{value:.2g}"
 
 
 def _table(rows: Sequence[Row]) -> list[str]:

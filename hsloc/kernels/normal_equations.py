@@ -117,55 +117,82 @@ def add_relative_term(pose_j: F64, rel: F64, term: Term, blocks: Blocks, ha: F64
     gj[2] += rel[1] * gradient[0] - rel[0] * gradient[1] - gradient[2]
 
 
-@njit(cache=True, nogil=True)
-def assemble_pairs(
-    poses: F64,
-    pairs: I64,
-    pair_weights: F64,
-    scans: ScanArrays,
-    gate: float,
-    scale: float,
-    equations: Equations,
-    counts: F64,
-) -> float:
-    """The equations of all pairs (m, 2) of scans, either scan against the other, at `poses` (n, 3).
+class PairTerms(NamedTuple):
+    """Terms of m pairs of scans, in the pose of the second seen from the first; both directions together."""
 
-    Adds to the diagonal and the right side of `equations`; overwrites its off-diagonal blocks, and `counts` (m, 5), the
-    sum over both directions (see `pair_terms`). Returns the sum of weighted squares.
+    information: F64
+    """Shape (m, 3, 3)."""
+    gradient: F64
+    """Shape (m, 3)."""
+    counts: F64
+    """Shape (m, 5), as in `pair_terms`, the sum over both directions."""
+
+
+@njit(cache=True, nogil=True)
+def add_inverse_term(rel: F64, term: Term, information: F64, gradient: F64) -> None:
+    """Add a term in the inverse of `rel` (3,), as one in `rel` itself, to `information` (3, 3) and `gradient` (3,)."""
+    c = cos(rel[2])
+    s = sin(rel[2])
+    x = rel[0]
+    y = rel[1]
+    # Derivative of the inverse (-R^T t, -theta) by (t, theta).
+    derivative = ((-c, -s, s * x - c * y), (s, -c, c * x + s * y), (0.0, 0.0, -1.0))
+    for a in range(3):
+        for k in range(3):
+            gradient[a] += derivative[k][a] * term.gradient[k]
+        for b in range(3):
+            value = 0.0
+            for k in range(3):
+                for m in range(3):
+                    value += derivative[k][a] * term.information[k, m] * derivative[m][b]
+            information[a, b] += value
+
+
+@njit(cache=True, nogil=True)
+def evaluate_pairs(poses: F64, pairs: I64, scans: ScanArrays, gate: float, scale: float, terms: PairTerms) -> None:
+    """Overwrite `terms` with those of all pairs (m, 2) of scans, either scan against the other, at `poses` (n, 3)."""
+    one = Term(np.empty((3, 3)), np.empty(3))
+    rel = np.empty(3)
+    back = np.empty(3)
+    tally = np.empty(5)
+    for m in range(len(pairs)):
+        j = pairs[m, 0]
+        i = pairs[m, 1]
+        relative(poses[j], poses[i], rel)
+        pair_terms(i, j, rel, scans, gate, scale, one, tally)
+        terms.information[m] = one.information
+        terms.gradient[m] = one.gradient
+        terms.counts[m] = tally
+        relative(poses[i], poses[j], back)
+        pair_terms(j, i, back, scans, gate, scale, one, tally)
+        add_inverse_term(rel, one, terms.information[m], terms.gradient[m])
+        terms.counts[m] += tally
+
+
+@njit(cache=True, nogil=True)
+def add_pairs(poses: F64, pairs: I64, terms: PairTerms, weight: float, equations: Equations) -> None:
+    """The equations of pairs (m, 2) with `terms` that were evaluated at `poses`, times `weight` (1/m^2).
+
+    Adds to the diagonal and the right side of `equations`; overwrites its off-diagonal blocks.
     """
     diagonal = equations.diagonal
     off_diagonal = equations.off_diagonal
     right = equations.right
+    rel = np.empty(3)
+    ha = np.empty((3, 3))
     information = np.empty((3, 3))
     gradient = np.empty(3)
-    term = Term(information, gradient)
-    rel = np.empty(3)
-    tally = np.empty(5)
-    total = 0.0
-    transposed = np.empty((3, 3))
-    ha = np.empty((3, 3))
     for m in range(len(pairs)):
-        off_diagonal[m] = 0.0
-        counts[m] = 0.0
-        weight = pair_weights[m]
-        for direction in range(2):
-            j = pairs[m, direction]
-            i = pairs[m, 1 - direction]
-            relative(poses[j], poses[i], rel)
-            pair_terms(i, j, rel, scans, gate, scale, term, tally)
-            counts[m] += tally
-            total += weight * tally[3]
-            information *= weight
-            gradient *= weight
-            if direction == 0:
-                blocks = Blocks(diagonal[j], off_diagonal[m], diagonal[i], right[j], right[i])
-                add_relative_term(poses[j], rel, term, blocks, ha)
-            else:
-                transposed[:] = 0.0
-                blocks = Blocks(diagonal[j], transposed, diagonal[i], right[j], right[i])
-                add_relative_term(poses[j], rel, term, blocks, ha)
-                off_diagonal[m] += transposed.T
-    return total
+        j = pairs[m, 0]
+        i = pairs[m, 1]
+        relative(poses[j], poses[i], rel)
+        for a in range(3):
+            gradient[a] = weight * terms.gradient[m, a]
+            for b in range(3):
+                information[a, b] = weight * terms.information[m, a, b]
+                off_diagonal[m, a, b] = 0.0
+        blocks = Blocks(diagonal[j], off_diagonal[m], diagonal[i], right[j], right[i])
+        add_relative_term(poses[j], rel, Term(information, gradient), blocks, ha)
 
 
 @njit(cache=True, nogil=True)

@@ -113,11 +113,12 @@ class Result:
     def pose_covariances(self) -> NDArray[np.float64]:
         """Covariance (n, 3, 3) of each pose of `trajectory` over (x, y, theta) in the map frame (m^2, m rad, rad^2).
 
-        Those of the matched scans, propagated by the odometry; NaN where a pose is not localised, before the first
-        match, and in a map of the graph mapper, which does not compute them.
+        Those of the matched scans, propagated by the odometry; NaN where a pose is not localised, and before the first
+        match. Of a map that was built: of the solved pose graph, relative to the first pose; NaN without any scan.
         """
         if self.mapping is not None:
-            return np.full((len(self.trajectory), 3, 3), np.nan)
+            at_scans = self.follows_scans
+            return self.mapping.scan_covariances if at_scans else self.mapping.odometry_covariances
         config = self.request.config
         noise = config.localiser.noise() if self.mode == "localise" else config.point_mapper.odometry_noise
         return pose_covariances(self.trajectory, self.localised, self.diagnostics, noise.covariance)
@@ -242,7 +243,7 @@ def _run_with(
         odometry=history.odometry(),
         reference=history.reference() if reference is None else reference,
         grid=require_map(grid),
-        diagnostics=history.diagnostics(),
+        diagnostics=_diagnostics(history, mapping),
         losses=log.losses,
         warnings=(*log.summary.warnings, *warnings, *events.warnings()),
         seconds=seconds,
@@ -290,6 +291,16 @@ def _mapped(history: RunHistory, mapping: MappingResult) -> tuple[Trajectory, ND
     if len(stamps) == 0:
         stamps, poses = history.diagnostics().stamps_ns, mapping.scan_poses
     return Trajectory(stamps, poses), np.ones(len(stamps), dtype=np.bool_)
+
+
+def _diagnostics(history: RunHistory, mapping: MappingResult | None) -> ScanDiagnostics:
+    """What became of each scan; of a map that was built, with the covariances of the solved graph."""
+    diagnostics = history.diagnostics()
+    if mapping is None:
+        return diagnostics
+    covariances = mapping.scan_covariances
+    sigma = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
+    return replace(diagnostics, covariance=covariances, sigma=sigma)
 
 
 def _events(request: RunRequest, log: Log, lidar_only: bool, localise: bool) -> Iterable[Event]:

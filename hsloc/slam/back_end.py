@@ -17,6 +17,7 @@ from hsloc.slam.loop_closer import TORN, LoopCloser, loop_edges
 from hsloc.slam.map_extension import connect, unconnected
 from hsloc.slam.map_session import from_front_end
 from hsloc.slam.map_state import MapState, fingerprint
+from hsloc.slam.marginals import all_edges, marginal_covariances
 from hsloc.slam.occupancy_mapper import build_grid
 from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
 from hsloc.slam.result import MappingQuality, MappingResult
@@ -70,11 +71,13 @@ def finish(
         raise MapError(unconnected(resume.state))
     edges = Edges.concatenate([gathered.steps, loop_edges])
     refined, passes = _refine(poses, gathered.scans, edges, parameters, lambda part: report(0.5 + 0.4 * part))
+    covariances = marginal_covariances(refined, edges)
     grid = build_grid(refined.poses, gathered.scans, parameters.occupancy)
     report(1.0)
     of_log = refined.poses[gathered.first :]
     calibration = track.calibrated(of_log) if parameters.use_odometry else OdometryCalibration()
     odometry_poses, scan_poses = track.corrected(of_log, calibration)
+    odometry_covariances, scan_covariances = track.covariances(covariances[gathered.first :])
     return MappingResult(
         odometry_poses=odometry_poses,
         scan_poses=scan_poses,
@@ -82,7 +85,10 @@ def finish(
         keyscan_stamps_ns=gathered.stamps_ns,
         keyscan_poses=refined.poses,
         grid=grid,
-        graph=PoseGraph(gathered.stamps_ns, refined.poses, edges),
+        keyscan_covariances=covariances,
+        odometry_covariances=odometry_covariances,
+        scan_covariances=scan_covariances,
+        graph=PoseGraph(gathered.stamps_ns, refined.poses, all_edges(refined, edges)),
         loops=tuple(loops),
         quality=_quality(refined, passes, loops, loop_edges, grid, gathered.scans),
         calibration=calibration,
@@ -221,6 +227,7 @@ def _empty(track: EventLog) -> MappingResult:
     """No scan had a return: odometry is all there is."""
     nan = float("nan")
     odometry_poses, scan_poses = track.corrected(np.zeros((0, 3)))
+    odometry_covariances, scan_covariances = track.covariances(np.zeros((0, 3, 3)))
     none = np.zeros(0, dtype=np.int64)
     return MappingResult(
         odometry_poses=odometry_poses,
@@ -228,6 +235,9 @@ def _empty(track: EventLog) -> MappingResult:
         revision=(),
         keyscan_stamps_ns=none,
         keyscan_poses=np.zeros((0, 3)),
+        keyscan_covariances=np.zeros((0, 3, 3)),
+        odometry_covariances=odometry_covariances,
+        scan_covariances=scan_covariances,
         grid=OccupancyGrid(np.full((1, 1), -1, dtype=np.int8), 0.05),
         graph=PoseGraph(none, np.zeros((0, 3)), Edges.none()),
         loops=(),

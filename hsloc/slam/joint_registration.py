@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.normal_equations import Equations, add_edges, assemble_pairs
+from hsloc.kernels.normal_equations import Equations, PairTerms, add_edges, add_pairs, evaluate_pairs
 from hsloc.model.pose2 import wrap_angles
 from hsloc.parameters import Count, CountOrNone, NonNegative, Parameters, Positive
 from hsloc.slam.pose_graph import apply_increment, solve_anchored
@@ -60,20 +60,34 @@ class JointRegistrationParameters(Parameters):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """What a pass found; `counts` (m, 5) of the pairs (m, 2) as in `kernels.point_to_line.pair_terms`."""
+    """What a pass found: the final `poses` (n, 3), and the `terms` of the `pairs` (m, 2) in its last round.
+
+    `linearised_at` (n, 3) are the poses at which those were evaluated, before the last, small, step.
+    """
 
     poses: F64
     pairs: I64
-    counts: F64
+    terms: PairTerms
+    linearised_at: F64
+    weight: float
+    """Weight of one paired point [1/m^2] in the equations."""
+    gate: float
+    """Gate of the last round [m]."""
+    scale: float
+    """Scale of the Geman-McClure weight in it [m]."""
     rounds: int
     moved: float
     """What 99 of 100 poses moved less than in the last round (m; rad: a fifth)."""
 
     @property
+    def counts(self) -> F64:
+        """Shape (m, 5), as in `kernels.point_to_line.pair_terms`."""
+        return self.terms.counts
+
+    @property
     def rms(self) -> float:
         """Root mean square distance of points to the walls of other scans, robustly weighted (m)."""
-        weights = self.counts[:, 4].sum()
-        return float(np.sqrt(self.counts[:, 3].sum() / weights)) if weights > 0.0 else float("nan")
+        return _rms(self.counts)
 
     @property
     def conflict(self) -> float:
@@ -96,25 +110,36 @@ def refine(
         len(poses), np.concatenate((pairs[:, 0], edges.pairs[:, 0])), np.concatenate((pairs[:, 1], edges.pairs[:, 1]))
     )
     arrays = scans.arrays(p.points_per_scan)
-    weights = np.full(len(pairs), 1.0 / (p.sigma**2 * p.correlated_points))
-    counts = np.zeros((len(pairs), 5))
-    pair_blocks, edge_blocks = np.empty((len(pairs), 3, 3)), np.empty((len(edges), 3, 3))
-    moved, rounds = 0.0, 0
+    terms = PairTerms(np.empty((len(pairs), 3, 3)), np.empty((len(pairs), 3)), np.zeros((len(pairs), 5)))
+    weight = 1.0 / (p.sigma**2 * p.correlated_points)
+    before, gate, moved, rounds = poses, p.gates[0], 0.0, 0
     for rounds in range(1, p.rounds + 1):
         gate = p.gates[min(rounds, len(p.gates)) - 1]
-        diagonal, right = np.zeros((len(poses), 3, 3)), np.zeros((len(poses), 3))
-        of_edges = Equations(diagonal, edge_blocks, right)
-        add_edges(poses, edges.pairs, edges.measured, edges.information, edges.scale, of_edges)
-        of_pairs = Equations(diagonal, pair_blocks, right)
-        assemble_pairs(poses, pairs, weights, arrays, gate, p.scale_of_gate * gate, of_pairs, counts)
-        step = solve_anchored(system, diagonal, np.concatenate((pair_blocks, edge_blocks)), right)
-        poses = apply_increment(poses, step)
+        evaluate_pairs(poses, pairs, arrays, gate, p.scale_of_gate * gate, terms)
+        diagonal, off_diagonal, right = normal_equations(poses, pairs, terms, weight, edges)
+        step = solve_anchored(system, diagonal, off_diagonal, right)
+        before, poses = poses, apply_increment(poses, step)
         moved = moved_scans(step)
         if progress is not None:
             progress(rounds / p.rounds)
         if rounds >= len(p.gates) and moved < p.convergence_tolerance:
             break
-    return Registration(poses, pairs, counts, rounds, moved)
+    return Registration(poses, pairs, terms, before, weight, gate, p.scale_of_gate * gate, rounds, moved)
+
+
+def normal_equations(poses: F64, pairs: I64, terms: PairTerms, weight: float, edges: Edges) -> tuple[F64, F64, F64]:
+    """Blocks on the diagonal (n, 3, 3) and off it (pairs, then edges), and the right side (n, 3) of both together."""
+    diagonal, right = np.zeros((len(poses), 3, 3)), np.zeros((len(poses), 3))
+    off_diagonal = np.empty((len(pairs) + len(edges), 3, 3))
+    of_edges = Equations(diagonal, off_diagonal[len(pairs) :], right)
+    add_edges(poses, edges.pairs, edges.measured, edges.information, edges.scale, of_edges)
+    add_pairs(poses, pairs, terms, weight, Equations(diagonal, off_diagonal[: len(pairs)], right))
+    return diagonal, off_diagonal, right
+
+
+def _rms(counts: F64) -> float:
+    weights = counts[:, 4].sum()
+    return float(np.sqrt(counts[:, 3].sum() / weights)) if weights > 0.0 else float("nan")
 
 
 def moved_scans(step: F64) -> float:

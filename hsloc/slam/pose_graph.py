@@ -76,15 +76,18 @@ class PoseGraph:
         return PoseGraph(self.stamps_ns, solve_edges(self.poses, self.edges, rounds), self.edges)
 
     def write_g2o(self, path: str | Path) -> None:
-        """Write `VERTEX_SE2`, `FIX` of the first, and `EDGE_SE2` lines. Raises OutputError."""
+        """Write `VERTEX_SE2`, `FIX` of the first, and `EDGE_SE2` lines. Raises OutputError.
+
+        The information of a g2o edge is that of the second node seen from where it was measured: turned by that pose.
+        """
         lines = [f"VERTEX_SE2 {k} {x!r} {y!r} {t!r}" for k, (x, y, t) in enumerate(self.poses.tolist())]
         lines.append("FIX 0")
         upper = np.triu_indices(3)
-        for (i, j), pose, information in zip(
-            self.edges.pairs.tolist(), self.edges.measured.tolist(), self.edges.information, strict=True
-        ):
-            numbers = [*pose, *information[upper].tolist()]
-            lines.append(f"EDGE_SE2 {i} {j} " + " ".join(repr(number) for number in numbers))
+        information = _turned(self.edges.information, self.edges.measured[:, 2])[:, upper[0], upper[1]]
+        numbers = np.concatenate((self.edges.measured, information), axis=1)
+        form = "EDGE_SE2 %d %d %.9f %.9f %.12f" + " %.9g" * 6
+        for pair, row in zip(self.edges.pairs.tolist(), numbers.tolist(), strict=True):
+            lines.append(form % (*pair, *row))
         try:
             Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")
         except OSError as error:
@@ -123,6 +126,7 @@ class PoseGraph:
         rows, columns = np.triu_indices(3)
         for k, (_, _, numbers) in enumerate(edges):
             information[k, rows, columns] = information[k, columns, rows] = numbers[3:]
+        information = _turned(information, -measured[:, 2])
         pairs = np.array([(index[a], index[b]) for a, b, _ in edges], dtype=np.int64).reshape(-1, 2)
         trusted = np.full(len(edges), np.inf)
         stamps = np.zeros(len(poses), dtype=np.int64)
@@ -157,11 +161,15 @@ def solve_edges(
 
 
 def solve_anchored(system: BlockSystem, diagonal: F64, off_diagonal: F64, gradient: F64) -> F64:
-    """The Gauss-Newton step (n, 3) that leaves the first pose where it is; changes `diagonal`."""
-    diagonal[0] += 1e9 * np.eye(3)
-    # So little on all others that it holds only what nothing else holds.
-    diagonal += 1e-3 * np.eye(3)
-    return -system.solve(diagonal, off_diagonal, gradient)
+    """The Gauss-Newton step (n, 3) that leaves the first pose where it is."""
+    return -system.solve(anchored(diagonal), off_diagonal, gradient)
+
+
+def anchored(diagonal: F64) -> F64:
+    """The blocks on the diagonal (n, 3, 3) with the first pose held, and the others where nothing else holds them."""
+    held = diagonal + 1e-3 * np.eye(3)
+    held[0] += 1e9 * np.eye(3)
+    return held
 
 
 def apply_increment(poses: F64, step: F64) -> F64:
@@ -182,6 +190,13 @@ def edge_errors(poses: F64, edges: Edges) -> tuple[F64, F64, F64]:
     error[:, 2] = wrap_angles(error[:, 2])
     chi2 = np.einsum("mi,mij,mj->m", error, edges.information, error)
     return np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2]), np.sqrt(np.maximum(chi2, 0.0))
+
+
+def _turned(information: F64, angle: F64) -> F64:
+    """Information (m, 3, 3) in frames that are turned by `angle` (m,)."""
+    c, s, zero = np.cos(angle), np.sin(angle), np.zeros(len(angle))
+    turn = np.stack((c, -s, zero, s, c, zero, zero, zero, zero + 1.0), axis=1).reshape(-1, 3, 3)
+    return np.asarray(np.einsum("mki,mkl,mlj->mij", turn, information, turn), dtype=np.float64)
 
 
 def _numbers(fields: list[str], count: int) -> list[float]:

@@ -61,6 +61,9 @@ class MappingResult:
     `odometry_poses` (k, 3) and `scan_poses` (m, 3) are the base in the map at every odometry message and at every
     scan, in the order of the log. `revision` says the same as pairs (k, T_map_odom), each valid from the k-th odometry
     message (from 0) on; empty without odometry. `keyscan_poses` (n, 3) are the nodes of `graph`.
+
+    Covariances (…, 3, 3) are over (x, y, theta) in the map frame (m^2, m rad, rad^2), relative to the first keyscan's
+    pose: marginals of the solved graph at the keyscans (`hsloc.slam.marginals`), interpolated at scans and odometry.
     """
 
     odometry_poses: F64
@@ -68,6 +71,9 @@ class MappingResult:
     revision: tuple[tuple[int, Pose2], ...]
     keyscan_stamps_ns: NDArray[np.int64]
     keyscan_poses: F64
+    keyscan_covariances: F64
+    odometry_covariances: F64
+    scan_covariances: F64
     grid: OccupancyGrid
     graph: PoseGraph
     loops: tuple[Loop, ...]

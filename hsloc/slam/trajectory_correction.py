@@ -62,14 +62,8 @@ class EventLog:
             return odometry[~is_scan], odometry[is_scan]
         if calibration is not None:
             odometry = apply(calibration, self._index(), odometry)
-        steps = relative_poses(odometry[:-1], odometry[1:])
-        lengths = np.hypot(steps[:, 0], steps[:, 1]) + self._turn_length * np.abs(steps[:, 2])
-        path_length = np.concatenate(([0.0], np.cumsum(lengths)))
         keys = np.array(self._keys, dtype=np.int64)
-        before = np.clip(np.searchsorted(keys, np.arange(len(odometry)), side="right") - 1, 0, len(keys) - 1)
-        after = np.minimum(before + 1, len(keys) - 1)
-        span = path_length[keys[after]] - path_length[keys[before]]
-        fraction = np.clip((path_length - path_length[keys[before]]) / np.maximum(span, 1e-12), 0.0, 1.0)
+        before, after, fraction = self._between(odometry, keys)
         from_before = compose_poses(key_poses[before], relative_poses(odometry[keys[before]], odometry))
         from_after = compose_poses(key_poses[after], relative_poses(odometry[keys[after]], odometry))
         apart = from_after - from_before
@@ -77,6 +71,31 @@ class EventLog:
         poses = from_before + fraction[:, None] * apart
         poses[:, 2] = wrap_angles(poses[:, 2])
         return poses[~is_scan], poses[is_scan]
+
+    def covariances(self, key_covariances: F64) -> tuple[F64, F64]:
+        """Covariances of all odometry messages (k, 3, 3) and of all scans (m, 3, 3), from those of the keyscans.
+
+        Interpolated along the path, as if the errors of two keyscans were equal: never too small. NaN without keyscans.
+        """
+        is_scan = np.array(self._is_scan, dtype=bool)
+        if len(self._keys) == 0:
+            unknown = np.full((len(is_scan), 3, 3), np.nan)
+            return unknown[~is_scan], unknown[is_scan]
+        before, after, fraction = self._between(np.array(self._poses).reshape(-1, 3), np.array(self._keys))
+        part = fraction[:, None, None]
+        found = (1.0 - part) * key_covariances[before] + part * key_covariances[after]
+        return found[~is_scan], found[is_scan]
+
+    def _between(self, odometry: F64, keys: I64) -> tuple[I64, I64, F64]:
+        """Of each event the keyscans before and after it, and the part of the path between them that was driven."""
+        steps = relative_poses(odometry[:-1], odometry[1:])
+        lengths = np.hypot(steps[:, 0], steps[:, 1]) + self._turn_length * np.abs(steps[:, 2])
+        path_length = np.concatenate(([0.0], np.cumsum(lengths)))
+        before = np.clip(np.searchsorted(keys, np.arange(len(odometry)), side="right") - 1, 0, len(keys) - 1)
+        after = np.minimum(before + 1, len(keys) - 1)
+        span = path_length[keys[after]] - path_length[keys[before]]
+        fraction = np.clip((path_length - path_length[keys[before]]) / np.maximum(span, 1e-12), 0.0, 1.0)
+        return before, after, fraction
 
     def _index(self) -> F64:
         """For each event the number of odometry messages before it, a scan between two messages being half-way."""

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from hsloc.analysis import Analysis, analyse, run_timings
 from hsloc.atomic_write import whole_folder
 from hsloc.errors import OutputError
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from os import PathLike
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from hsloc.localisation.states import StateRows
@@ -103,6 +104,7 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
     if result.mode == "slam":
         save_map(result.grid, folder)
     if result.mapping is not None:
+        write_covariances(folder / "covariances.csv", result.trajectory.stamps_ns, result.pose_covariances())
         result.mapping.graph.write_g2o(folder / "graph.g2o")
         if result.mapping.state is not None:
             write_state(result.mapping.state, folder / STATE_FILE)
@@ -146,3 +148,16 @@ def write_states(path: Path, stamps_ns: NDArray[np.int64], rows: StateRows) -> N
         for stamp_ns, state, probability, (x, y, theta), fitness, reason in columns:
             figures = (f"{probability:.4f}", f"{x:.4f}", f"{y:.4f}", f"{theta:.5f}", f"{fitness:.3f}")
             writer.writerow((format_stamp(stamp_ns), state.value, *figures, reason))
+
+
+COVARIANCES_HEADER = "t,xx,xy,xtheta,yy,ytheta,thetatheta"
+
+
+def write_covariances(path: Path, stamps_ns: NDArray[np.int64], covariances: NDArray[np.float64]) -> None:
+    """Write one line for each of the n stamps: seconds, and the upper triangle of (n, 3, 3) in m^2, m rad and rad^2."""
+    rows, columns = np.triu_indices(3)
+    upper = covariances[:, rows, columns]
+    lines = [COVARIANCES_HEADER]
+    for stamp_ns, row in zip(stamps_ns.tolist(), upper.tolist(), strict=True):
+        lines.append(f"{format_stamp(stamp_ns)},%.4g,%.4g,%.4g,%.4g,%.4g,%.4g" % tuple(row))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

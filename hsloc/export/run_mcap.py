@@ -26,6 +26,8 @@ _PATH_POSES = 2000
 class RunRecording:
     """Writes map, scans, transforms, poses and the path of a result; the events come from a second pass over the log.
 
+    Of a map that was built also the covariance of the pose of each scan.
+
     A context manager: the file is complete when it ends. `seconds` is the time spent in writing.
     """
 
@@ -33,6 +35,7 @@ class RunRecording:
         self._result = result
         self._start = int(result.trajectory.stamps_ns[0])
         self._mountings: set[str] = set()
+        self._scans = 0
         self._writer = LogWriter(path)
         self.seconds = 0.0
 
@@ -71,6 +74,10 @@ class RunRecording:
             if self._result.follows_scans:
                 self._write_pose(scan.stamp_ns, IDENTITY, posed.T_map_base, posed.T_map_base)
             self._writer.scan(scan)
+            if self._result.mapping is not None:
+                covariance = self._result.mapping.scan_covariances[self._scans]
+                self._writer.pose_with_covariance(scan.stamp_ns, posed.T_map_base, covariance, "/pose_with_covariance")
+            self._scans += 1
         else:
             self._write_pose(event.stamp_ns, posed.T_map_odom, event.T_odom_base, posed.T_map_base)
         self.seconds += time.perf_counter() - begin

@@ -51,7 +51,7 @@ def write_report_html(path: str | Path, parts: ReportParts) -> None:
     data, metrics = prepare(parts), parts.metrics
     summary = None if metrics is None else ResultSummary.of(metrics)
     drawing, extent = map_svg(data, parts.grid, parts.points)
-    charts, end = time_charts(data, drifts=metrics is not None and metrics.run.mode == "slam"), _end(data)
+    charts, end = time_charts(data, is_built=metrics is not None and metrics.run.mode == "slam"), _end(data)
     fragments = {
         "title": escape(parts.title),
         "head": "" if summary is None else _head(summary),
@@ -72,12 +72,12 @@ def write_report_html(path: str | Path, parts: ReportParts) -> None:
     write_text_atomically(Path(path), _fill(_template("report.html"), fragments))
 
 
-def time_charts(data: ReportData, drifts: bool = False) -> list[Chart]:
+def time_charts(data: ReportData, is_built: bool = False) -> list[Chart]:
     """All that is known over time: errors where there is truth, fitness, standard deviations, effort.
 
-    With `drifts` the standard deviations are those of a map being built, before its loops are closed.
+    The standard deviations of a map that was built (`is_built`) are relative to its first pose.
     """
-    of = ", before loops are closed" if drifts else ""
+    of = ", relative to the first pose" if is_built else ""
     charts = []
     lost = () if data.scans is None else data.scans.lost
     if data.errors is not None:

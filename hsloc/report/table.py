@@ -236,6 +236,10 @@ def _map_rows(found: MapMetrics) -> list[Row]:
         rows.append(Row("loops closed", (loops,), _LOOPS, ("map/mapping/loops", "map/mapping/loops_refused")))
         explanation = "Scans that the map was made from: one for each part of a metre or of a turn."
         rows.append(Row("keyscans", (str(mapping.keyscans),), explanation, ("map/mapping/keyscans",)))
+        if isfinite(mapping.sigma_max):
+            values = f"{format_length(mapping.sigma_median)}, {format_length(mapping.sigma_max)}"
+            sources = ("map/mapping/sigma_median", "map/mapping/sigma_max")
+            rows.append(Row("standard deviation, median, max", (values,), _SIGMA, sources))
         if isfinite(mapping.conflict):
             values = format_share(mapping.conflict)
             rows.append(Row("points seen through", (values,), _CONFLICT, ("map/mapping/conflict",)))
@@ -261,6 +265,10 @@ _SCAN_TO_MAP = (
 _LOOPS = (
     "Places that were recognised when the robot came back, of all that were compared. A map without a loop keeps the "
     "drift of the odometry; refused candidates are usual."
+)
+_SIGMA = (
+    "How well the positions of the scans are known relative to the first one, by the walls, steps and loops that hold "
+    "them; wrong stamps and moved walls are not in it. covariances.csv has it for each pose."
 )
 _CONFLICT = (
     "Part of the points of the map where another scan looked through. Below 5 % is usual; more means that walls are "

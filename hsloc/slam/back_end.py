@@ -90,7 +90,7 @@ def finish(
         scan_covariances=scan_covariances,
         graph=PoseGraph(gathered.stamps_ns, refined.poses, all_edges(refined, edges)),
         loops=tuple(loops),
-        quality=_quality(refined, passes, loops, loop_edges, grid, gathered.scans),
+        quality=_quality(refined, covariances, passes, loops, loop_edges, grid, gathered.scans),
         calibration=calibration,
         state=_state(gathered, refined.poses, loop_edges, grid, parameters),
         evidence=weigh(_recorded(gathered, refined, loops, parameters.use_odometry)),
@@ -186,12 +186,19 @@ def _revision(odometry_poses: F64, track: EventLog) -> tuple[tuple[int, Pose2], 
 
 
 def _quality(
-    refined: Registration, passes: int, loops: list[Loop], edges: Edges, grid: OccupancyGrid, scans: KeyScans
+    refined: Registration,
+    covariances: F64,
+    passes: int,
+    loops: list[Loop],
+    edges: Edges,
+    grid: OccupancyGrid,
+    scans: KeyScans,
 ) -> MappingQuality:
     nan = float("nan")
     distance, angle, _ = edge_errors(refined.poses, edges)
     residuals = _residuals(refined.poses, scans, grid)
     median, p95 = np.percentile(residuals, (50.0, 95.0)) if len(residuals) else (nan, nan)
+    sigma = np.sqrt(np.trace(covariances[:, :2, :2], axis1=1, axis2=2))
     return MappingQuality(
         residual_median=float(median),
         residual_p95=float(p95),
@@ -203,6 +210,9 @@ def _quality(
         loop_max=float(distance.max()) if len(edges) else nan,
         loop_angle_median_deg=float(np.degrees(np.median(angle))) if len(edges) else nan,
         loop_angle_max_deg=float(np.degrees(angle.max())) if len(edges) else nan,
+        sigma_median=float(np.median(sigma)),
+        sigma_max=float(sigma.max()),
+        sigma_angle_max_deg=float(np.degrees(np.sqrt(covariances[:, 2, 2].max()))),
         keyscans=len(scans),
         passes=passes,
         moved=refined.moved,
@@ -241,7 +251,7 @@ def _empty(track: EventLog) -> MappingResult:
         grid=OccupancyGrid(np.full((1, 1), -1, dtype=np.int8), 0.05),
         graph=PoseGraph(none, np.zeros((0, 3)), Edges.none()),
         loops=(),
-        quality=MappingQuality(nan, nan, nan, nan, 0, 0, nan, nan, nan, nan, 0, 0, 0.0),
+        quality=MappingQuality(nan, nan, nan, nan, 0, 0, nan, nan, nan, nan, nan, nan, nan, 0, 0, 0.0),
         calibration=OdometryCalibration(),
         state=None,
         evidence=nothing_seen(),

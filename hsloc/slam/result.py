@@ -46,6 +46,12 @@ class MappingQuality:
     """Median angle between a loop's measurement and the final map [deg]."""
     loop_angle_max_deg: Measured
     """Largest angle between a loop's measurement and the final map [deg]."""
+    sigma_median: Measured
+    """Median standard deviation of a keyscan's position relative to the first one [m]."""
+    sigma_max: Measured
+    """Largest standard deviation of a keyscan's position relative to the first one [m]."""
+    sigma_angle_max_deg: Measured
+    """Largest standard deviation of a keyscan's heading relative to the first one [deg]."""
     keyscans: int
     """Number of scans that the map was built from."""
     passes: int

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from hsloc.kernels.normal_equations import Blocks, Equations, add_edges, add_relative_term, relative
+from hsloc.kernels.normal_equations import Blocks, Equations, add_edges, add_inverse_term, add_relative_term, relative
 from hsloc.kernels.point_to_line import Term
 from hsloc.model.pose2 import relative_poses
 
@@ -86,3 +86,21 @@ def test_an_edge_that_contradicts_the_graph_weighs_less_by_cauchy(rng: Any) -> N
     np.testing.assert_allclose(weighted, weight * chi2)
     for got, want in zip(robust, plain, strict=True):
         np.testing.assert_allclose(got, weight * want)
+
+
+def test_a_term_in_the_inverse_pose_is_one_in_the_pose(rng: Any) -> None:
+    """The residual `q - m` of the inverse pose q, seen as one of the pose itself."""
+    rel, root, measured = rng.normal(size=3), rng.normal(size=(3, 3)), rng.normal(size=3)
+
+    def inverse(pose: Any) -> Any:
+        out = np.empty(3)
+        relative(pose, np.zeros(3), out)
+        return out
+
+    steps = 1e-6 * np.eye(3)
+    derivative = np.column_stack([(inverse(rel + step) - inverse(rel - step)) / 2e-6 for step in steps])
+    weight, error = root @ root.T, inverse(rel) - measured
+    information, gradient = np.ones((3, 3)), np.ones(3)
+    add_inverse_term(rel, Term(weight, weight @ error), information, gradient)
+    np.testing.assert_allclose(information, 1.0 + derivative.T @ weight @ derivative, atol=1e-6)
+    np.testing.assert_allclose(gradient, 1.0 + derivative.T @ weight @ error, atol=1e-6)

@@ -11,7 +11,9 @@ from drives import ape_rmse, drive
 
 from hsloc.dataclass_json import to_json
 from hsloc.model import IDENTITY, Estimate, Odometry, PairedScan, Pose2, Scan, Status
+from hsloc.model.pose2 import relative_poses, wrap_angles
 from hsloc.slam.mapper import Mapper
+from hsloc.slam.marginals import noise_of
 from hsloc.slam.parameters import GraphMapperParameters
 
 if TYPE_CHECKING:
@@ -83,6 +85,38 @@ def test_a_long_loop_is_closed_without_a_wrong_one(loop: Any, loop_map: tuple[Ma
         [e.T_map_base.to_array() for e, event in zip(said, events, strict=True) if isinstance(event, PairedScan)]
     )
     assert ape_rmse(events, online, truth) > ape_rmse(events, result.scan_poses, truth)
+
+
+def test_the_graph_that_is_written_is_at_its_optimum(loop_map: Any) -> None:
+    graph = loop_map[0].graph
+    assert len(graph.edges) > 5 * len(graph.poses)
+    assert np.abs(graph.optimised().poses - graph.poses).max() < 0.002
+
+
+def test_covariances_hold(loop: Any, loop_map: Any) -> None:
+    """Relative to the first pose, as the error is; it grows along the way and shrinks where the loop closes."""
+    result, truth = loop_map[0], loop[1]
+    first = int(np.searchsorted(truth.stamps_ns, result.keyscan_stamps_ns[0]))
+    at = np.clip(np.searchsorted(truth.stamps_ns, result.keyscan_stamps_ns), 0, len(truth) - 1)
+    error = result.keyscan_poses - relative_poses(truth.poses[first : first + 1].repeat(len(at), 0), truth.poses[at])
+    error[:, 2] = wrap_angles(error[:, 2])
+    covariances = result.keyscan_covariances
+    squared = np.einsum("ni,nij,nj->n", error[1:], np.linalg.inv(covariances[1:]), error[1:])
+    assert 0.3 < squared.mean() < 10.0
+    assert np.abs(covariances[0]).max() == 0.0
+    sigma = np.sqrt(np.trace(covariances[:, :2, :2], axis1=1, axis2=2))
+    assert sigma.max() > 1.5 * sigma[-1]
+    assert result.scan_covariances.shape == (len(result.scan_poses), 3, 3)
+    assert result.odometry_covariances.shape == (len(result.odometry_poses), 3, 3)
+    assert (np.linalg.eigvalsh(result.scan_covariances).min(axis=1) > -1e-12).all()
+
+
+@pytest.mark.parametrize("sigma", [0.005, 0.01, 0.02, 0.03])
+def test_the_noise_of_points_is_found_behind_robust_weights(sigma: float) -> None:
+    distance = np.random.default_rng(0).normal(0.0, sigma, 100_000)
+    weights = 1.0 / (1.0 + (distance / 0.05) ** 2) ** 2 * (np.abs(distance) < 0.15)
+    rms = float(np.sqrt((weights * distance**2).sum() / weights.sum()))
+    assert abs(noise_of(rms, 0.15, 0.05) / sigma - 1.0) < 0.03
 
 
 def test_loops_say_why_they_were_refused(loop_map: Any) -> None:

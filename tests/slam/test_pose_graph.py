@@ -107,9 +107,22 @@ def test_g2o_is_read_as_it_was_written(tmp_path: Path) -> None:
     read = PoseGraph.read_g2o(tmp_path / "graph.g2o")
     np.testing.assert_array_equal(read.poses, true)
     np.testing.assert_array_equal(read.edges.pairs, graph.edges.pairs)
-    np.testing.assert_array_equal(read.edges.measured, graph.edges.measured)
-    np.testing.assert_array_equal(read.edges.information, graph.edges.information)
+    np.testing.assert_allclose(read.edges.measured, graph.edges.measured, atol=1e-9)
+    np.testing.assert_allclose(read.edges.information, graph.edges.information, atol=1e-3)
     assert (tmp_path / "graph.g2o").read_text().startswith("VERTEX_SE2 0 5.0 0.0 ")
+
+
+def test_the_information_of_a_g2o_edge_is_in_the_frame_of_its_second_node(tmp_path: Path) -> None:
+    """An edge that turns left by a right angle, well known along x of the first node: that is -y of the second."""
+    turned = Edges(
+        np.array([[0, 1]]), np.array([[1.0, 0.0, np.pi / 2]]), np.diag((100.0, 1.0, 5.0))[None], np.array([np.inf])
+    )
+    graph = PoseGraph(np.zeros(2, int), np.array([[0.0, 0.0, 0.0], [1.0, 0.0, np.pi / 2]]), turned)
+    graph.write_g2o(tmp_path / "graph.g2o")
+    numbers = [float(word) for word in (tmp_path / "graph.g2o").read_text().splitlines()[-1].split()[6:]]
+    np.testing.assert_allclose(numbers, (1.0, 0.0, 0.0, 100.0, 0.0, 5.0), atol=1e-9)
+    read = PoseGraph.read_g2o(tmp_path / "graph.g2o")
+    np.testing.assert_allclose(read.edges.information, turned.information, atol=1e-9)
 
 
 @pytest.mark.parametrize(

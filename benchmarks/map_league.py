@@ -1,0 +1,132 @@
+"""Maps of simulated drives: errors, verdicts, and whether the covariances hold.
+
+    python benchmarks/map_league.py [--first SEED] [--count N] [--slips]
+
+Each seed draws a world, a range (8 to 20 m), a noise of the ranges (1 to 3 cm), an odometry, a number of laps and, with
+--slips, one to six moments in which the odometry counts 0.3 to 1 m, or 20 to 90 deg, that were not driven. A line for
+each drive: error of the keyscans relative to the first (rmse and largest), their standard deviation, the mean
+normalised error squared (3 is expected), and the verdict. Then means over all drives, with the coverage of the ellipsoids.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.config import Config
+from hsloc.evaluation.association import interpolate_poses
+from hsloc.model import Trajectory, Truth, wrap_angles
+from hsloc.model.pose2 import relative_poses
+from hsloc.replay.engine import replay
+from hsloc.simulation import presets
+from hsloc.simulation.built_in import built_in
+from hsloc.simulation.odometer import OdometryNoise, Slip
+from hsloc.simulation.simulator import events
+from hsloc.slam.mapper import Mapper
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hsloc.simulation.scenario import Scenario
+    from hsloc.slam.result import MappingResult
+
+WORLDS = ("corridor-loop", "corridor-loop", "figure-of-eight", "office", "hall", "symmetric-corridor")
+CHI2 = {50: 2.366, 90: 6.251, 95: 7.815}
+"""Quantiles (%) of the chi-squared distribution of three degrees of freedom."""
+WRONG_M = 0.25
+
+
+def scenario(seed: int, with_slips: bool) -> Scenario:
+    random = np.random.default_rng(seed)
+    world = WORLDS[random.integers(len(WORLDS))]
+    base = presets.SCENARIOS[world]
+    sensor = replace(
+        base.sensor,
+        range_max=float(random.choice([8.0, 12.0, 20.0])),
+        range_noise=float(random.choice([0.01, 0.02, 0.03])),
+    )
+    odometry = (OdometryNoise(), presets.DRIFTING)[random.integers(2)]
+    laps = float(random.choice([1.05, 1.05, 1.3, 2.05]))
+    drive = replace(base, seed=seed, sensor=sensor, odometry=odometry, laps=laps, duration_s=None)
+    duration = built_in(world).lap_length() * laps / drive.robot.speed
+    if world in ("office", "hall"):
+        duration = 90.0
+        drive = replace(drive, duration_s=duration, laps=1.0)
+    slips = tuple(slip(random, duration, drive.robot.speed) for _ in range(random.integers(1, 7))) if with_slips else ()
+    return replace(drive, slips=slips)
+
+
+def slip(random: np.random.Generator, duration: float, speed: float) -> Slip:
+    seconds = random.uniform(0.5, 2.0)
+    at = random.uniform(3.0, duration - 3.0)
+    if random.random() < 0.5:
+        metres = random.uniform(0.3, 1.0) * random.choice([-1, 1])
+        return Slip(at, seconds, 1.0 + metres / (speed * seconds), 0.0)
+    angle = np.radians(random.uniform(20.0, 90.0)) * random.choice([-1, 1])
+    return Slip(at, seconds, 1.0, angle / seconds)
+
+
+def mapped(drive: Scenario) -> tuple[MappingResult, NDArray[np.float64]]:
+    """The map, and the true poses of its keyscans (n, 3) relative to the first."""
+    mapper = Mapper(Config().graph_mapper, np.random.default_rng(0))
+    log = list(events(drive, built_in(drive.world)))
+    truth = [event for event in log if isinstance(event, Truth)]
+    for _ in replay(log, mapper):
+        pass
+    result = mapper.finish()
+    known = Trajectory(
+        np.array([event.stamp_ns for event in truth]), np.array([event.T_map_base.to_array() for event in truth])
+    )
+    poses = interpolate_poses(known, result.keyscan_stamps_ns)
+    return result, relative_poses(poses[:1].repeat(len(poses), 0), poses)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--count", type=int, default=60)
+    parser.add_argument("--slips", action="store_true")
+    arguments = parser.parse_args()
+    means, verdicts = [], Counter[tuple[str, str]]()
+    for seed in range(arguments.first, arguments.first + arguments.count):
+        begin = time.process_time()
+        drive = scenario(seed, arguments.slips)
+        result, truth = mapped(drive)
+        error = result.keyscan_poses - truth
+        error[:, 2] = wrap_angles(error[:, 2])
+        covariances = result.keyscan_covariances
+        squared = np.einsum("ni,nij,nj->n", error[1:], np.linalg.inv(covariances[1:]), error[1:])
+        distance, sigma = (
+            np.hypot(error[:, 0], error[:, 1]),
+            np.sqrt(np.trace(covariances[:, :2, :2], axis1=1, axis2=2)),
+        )
+        verdict = result.evidence.verdict
+        verdicts["wrong" if distance.max() > WRONG_M else "right", verdict] += 1
+        rmse = float(np.sqrt((distance**2).mean()))
+        means.append((squared.mean(), rmse, sigma.mean(), *((squared < limit).mean() for limit in CHI2.values())))
+        codes = ", ".join(reason.code for reason in result.evidence.reasons)
+        print(
+            f"{seed:4d} {drive.world:18s} {drive.sensor.range_max:4.0f} m, {len(drive.slips)} slips: rmse {rmse:.3f}, "
+            f"max {distance.max():.3f}, sigma {sigma.mean():.3f} to {sigma.max():.3f} m, NEES {squared.mean():6.2f}, "
+            f"{verdict} {codes} ({time.process_time() - begin:.1f} s)",
+            flush=True,
+        )
+    nees, rmse, sigma, *coverage = np.mean(means, axis=0)
+    print(
+        f"NEES {nees:.2f} (median drive {np.median([row[0] for row in means]):.2f}), rmse {rmse:.3f}, sigma {sigma:.3f}"
+    )
+    print(
+        "coverage "
+        + ", ".join(f"{100.0 * share:.0f} % of {level}" for level, share in zip(CHI2, coverage, strict=True))
+    )
+    for (truth_word, verdict), count in sorted(verdicts.items()):
+        print(f"{truth_word} ({WRONG_M} m) and called {verdict}: {count}")
+
+
+if __name__ == "__main__":
+    main()

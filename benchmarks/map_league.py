@@ -5,7 +5,8 @@
 Each seed draws a world, a range (8 to 20 m), a noise of the ranges (1 to 3 cm), an odometry, a number of laps and, with
 --slips, one to six moments in which the odometry counts 0.3 to 1 m, or 20 to 90 deg, that were not driven. A line for
 each drive: error of the keyscans relative to the first (rmse and largest), their standard deviation, the mean
-normalised error squared (3 is expected), and the verdict. Then means over all drives, with the coverage of the ellipsoids.
+normalised error squared (3 is expected), and the verdict. Then means over all drives, with the coverage of the
+ellipsoids.
 """
 
 from __future__ import annotations

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
     F64 = NDArray[np.float64]
 
-_CORRELATED_POINTS = 12.0
+_CORRELATED_POINTS = 15.0
 """Number of paired points that count as one independent measurement: neighbouring beams share their errors, and each
-scan is in several pairs. Of 60 simulated drives, with noise of 1 to 3 cm in five worlds, the mean normalised squared
-error is 2.8 with it, where 3 is expected."""
+scan is in several pairs. Of 100 simulated drives, with noise of 1 to 3 cm in five worlds, the mean normalised squared
+error is 2.7 with it, where 3 is expected."""
 _NOISES = np.geomspace(0.003, 0.1, 60)
 """Standard deviations (m) of points that are told apart: from a good lidar's on a flat wall to that of rubble."""
 _SAMPLES = 300

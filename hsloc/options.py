@@ -75,7 +75,7 @@ class Option:
     @property
     def is_upload(self) -> bool:
         """Whether HTTP takes the id of one uploaded file."""
-        return "http" in self.doors and self.name in ("relations", "reference")
+        return "http" in self.doors and self.name in ("relations", "reference", "calibration")
 
 
 _READING, _ALGORITHMS, _LIMITS = "reading the log", "algorithms", "limits for unattended use (exit code 4)"
@@ -142,6 +142,11 @@ OPTIONS: tuple[Option, ...] = (
     Option(
         name="laser_pose", flag="--laser-pose", kind="pose", place="read", group=_READING,
         help="Pose of the laser in the base frame, instead of the log's: x, y [m], yaw [rad].",
+    ),
+    Option(
+        name="calibration", flag="--calibration", kind="path", metavar="FILE", group=_READING,
+        help="Calibration that corrects odometry, mounting and stamps: a YAML file of `hsloc calibrate`.",
+        http="Id of an uploaded calibration, a YAML file of `hsloc calibrate`.",
     ),
     Option(
         name="deskew", flag="--deskew", kind="switch", default=False, place="read", group=_READING,

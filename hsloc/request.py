@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.config import Config, combined, differences, preset
 from hsloc.errors import ConfigError
-from hsloc.log import ReadOptions
+from hsloc.log import ReadOptions, read_calibration
 from hsloc.model.pose2 import Pose2, wrap_angle
 from hsloc.options import ALIGNMENTS, BY_NAME, MATCHERS, MODES, OPTIONS, PRESETS, VERDICTS, merged
 
@@ -30,14 +30,14 @@ class RunRequest:
 
     With `resume`, the results of an earlier mapping run, that run's map is extended: the new map and trajectory are in
     its frame. `mode` is "localise", "slam" or "auto": localise if there is a map, `map_path` or the log's own, else
-    build one. With `no_odometry` the log's odometry is not
-    read: motion is estimated from the scans. The start is `initial_pose`, else the one
-    that the log states for the time of the first event, else unknown; with `unknown_start` it is unknown whatever the
-    log states. `reference` names poses to compare with, see `hsloc.replay.references`; otherwise they are those in the
-    log. `alignment` and `relations` are for the evaluation. `own_matcher` is used instead of the one that `config`
-    names. `min_localised`, `max_ape`, `max_warnings` and `fail_if` are limits that the result must keep, see
-    `hsloc.analysis.limits`. `labels` are the names of the logs in reports; with `bare_names` no folder is written into
-    the results, so that they are the same wherever the files are.
+    build one. With `no_odometry` the log's odometry is not read: motion is estimated from the scans. The start is
+    `initial_pose`, else the one that the log states for the time of the first event, else unknown; with `unknown_start`
+    it is unknown whatever the log states. `reference` names poses to compare with, see `hsloc.replay.references`;
+    otherwise they are those in the log. `alignment` and `relations` are for the evaluation. `own_matcher` is used
+    instead of the one that `config` names. `calibration` is a file of `hsloc calibrate`. `min_localised`, `max_ape`,
+    `max_warnings` and `fail_if` are limits that the result must keep, see `hsloc.analysis.limits`. `labels` are the
+    names of the logs in reports; with `bare_names` no folder is written into the results, so that they are the same
+    wherever the files are.
     """
 
     logs: tuple[Path, ...]
@@ -55,6 +55,7 @@ class RunRequest:
     reference: str | None = None
     alignment: str | None = None
     relations: Path | None = None
+    calibration: Path | None = None
     own_matcher: Matcher | None = None
     min_localised: float | None = None
     max_ape: float | None = None
@@ -66,7 +67,7 @@ class RunRequest:
         if isinstance(self.logs, str | os.PathLike):
             object.__setattr__(self, "logs", (self.logs,))
         object.__setattr__(self, "logs", tuple(Path(log) for log in self.logs))
-        for name in ("map_path", "resume", "relations"):
+        for name in ("map_path", "resume", "relations", "calibration"):
             if isinstance(getattr(self, name), str):
                 object.__setattr__(self, name, Path(getattr(self, name)))
         if self.own_matcher is not None and not callable(getattr(self.own_matcher, "match", None)):
@@ -182,7 +183,8 @@ class RunRequest:
 
     def reading(self) -> ReadOptions:
         """How this run reads its logs, each time it does: odometry may be missing where it is not looked at."""
-        return replace(self.read, require_odometry=not self.no_odometry)
+        calibration = self.read.calibration if self.calibration is None else read_calibration(self.calibration)
+        return replace(self.read, require_odometry=not self.no_odometry, calibration=calibration)
 
     def names(self) -> tuple[str, ...]:
         """What to call the logs in reports; of a name that is no text (UTF-8) the odd bytes as `\\xfc`."""

@@ -34,6 +34,7 @@ COMMANDS = (
     "eval",
     "sweep",
     "convert",
+    "calibrate",
     "reproduce",
     "bench",
     "config",

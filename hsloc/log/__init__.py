@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from hsloc.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from hsloc.log.calibration_file import read_calibration
     from hsloc.log.checks.checker import CheckReport, check_log
     from hsloc.log.checks.findings import Finding, Severity
     from hsloc.log.checks.topics import LEAST_JUMP, LONGEST_JUMP_S, MAX_SPEED
@@ -47,9 +48,11 @@ __all__ = [
     "is_log",
     "is_static_topic",
     "open_log",
+    "read_calibration",
 ]
 
 _MODULES = {
+    "calibration_file": ("read_calibration",),
     "checks.checker": ("CheckReport", "check_log"),
     "checks.findings": ("Finding", "Severity"),
     "checks.topics": ("LEAST_JUMP", "LONGEST_JUMP_S", "MAX_SPEED"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from itertools import tee
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ from hsloc.errors import LogError, LogFormatError
 from hsloc.log.files import NO_LOG, LogFile, Scratch
 from hsloc.log.files import expand as _expand
 from hsloc.log.summary import NANOSECONDS, LogSummary, Losses, ReadOptions
+from hsloc.model.calibration import NO_CORRECTION, corrected_odometry
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from hsloc.log.container import Container
     from hsloc.log.source import Observation, Source
     from hsloc.model import Event, OccupancyGrid, Pose2
+    from hsloc.model.calibration import OdometryCorrection
 
 
 class Log:
@@ -49,6 +52,9 @@ class Log:
         """
         self.losses = losses = self._source.losses_at_opening.copy()
         events = self._source.events(losses)
+        calibration = self._options.calibration
+        if calibration is not None and calibration.odometry != NO_CORRECTION:
+            events = _corrected(events, calibration.odometry)
         start, end = (
             None if seconds is None else self.summary.origin_ns + round(seconds * NANOSECONDS)
             for seconds in (self._options.start_s, self._options.end_s)
@@ -94,6 +100,14 @@ class Log:
             except OSError as error:
                 raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
         return digest.hexdigest()
+
+
+def _corrected(events: Iterator[tuple[int, Event]], correction: OdometryCorrection) -> Iterator[tuple[int, Event]]:
+    """The same with the odometry corrected."""
+    stamps, plain = tee(events)
+    return zip(
+        (stamp for stamp, _ in stamps), corrected_odometry((event for _, event in plain), correction), strict=True
+    )
 
 
 def open_log(paths: Path | str | Sequence[Path | str], options: ReadOptions | None = None) -> Log:

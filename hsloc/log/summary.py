@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from hsloc.model.calibration import Calibration
     from hsloc.warnings import RunWarning
 
 NANOSECONDS = 1_000_000_000
@@ -36,7 +37,8 @@ class ReadOptions:
     `scan_fix` overrides fields of scans (see `hsloc.log.session.scan_geometry.ScanFixes`). `slice` are two heights
     above the base [m], `LOW,HIGH`: point clouds are read as scans, the nearest point of each direction between them.
     `time_offset` (`TOPIC=SECONDS`, several with commas, or `auto`) is added to the stamps of a topic. With `stamps`
-    "log" the log's times are used in place of the header stamps.
+    "log" the log's times are used in place of the header stamps. `calibration` corrects the odometry, and mounting and
+    stamps of the lidars that it names; a `laser_pose` is used instead of its mounting, a `time_offset` in addition.
     """
 
     scan_topic: str | None = None
@@ -53,6 +55,7 @@ class ReadOptions:
     slice: str | None = None
     time_offset: str | None = None
     stamps: str = "header"
+    calibration: Calibration | None = None
 
     def __post_init__(self) -> None:
         if self.stamps not in STAMPS:
@@ -75,6 +78,8 @@ class ReadOptions:
     def offsets_s(self) -> dict[str, float]:
         """Seconds to add by topic, its name without the leading slash. Raises ConfigError."""
         found: dict[str, float] = {}
+        if self.calibration is not None:
+            found = {topic.lstrip("/"): lidar.time_offset_s for topic, lidar in self.calibration.lidars}
         if self.time_offset is None or self.time_offset == AUTO:
             return found
         for item in self.time_offset.split(","):
@@ -88,7 +93,8 @@ class ReadOptions:
                     f"--time-offset {item}: must be auto, or TOPIC=SECONDS with at most {LONGEST_OFFSET_S:g} seconds; "
                     "--stamps log is the way out for clocks that are farther apart"
                 )
-            found[topic.strip().lstrip("/")] = value
+            name = topic.strip().lstrip("/")
+            found[name] = found.get(name, 0.0) + value
         return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import degrees, radians
 from typing import TYPE_CHECKING
 
@@ -11,12 +12,19 @@ from hsloc.model import IDENTITY, Pose2
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from hsloc.log.container import Container
     from hsloc.log.session.transform_topics import TransformTopics
+    from hsloc.model.calibration import Calibration
 
 TILT_WARNING = radians(3.0)
+
+
+def calibrated_mountings(calibration: Calibration | None, frames: Iterable[tuple[str, str]]) -> dict[str, Pose2]:
+    """Mountings by frame, of the lidars that a calibration names; `frames` are pairs of topic and frame."""
+    lidars = {} if calibration is None else {frame: calibration.lidar(topic) for topic, frame in frames}
+    return {frame: each.T_base_laser for frame, each in lidars.items() if each and each.T_base_laser}
 
 
 class Extrinsics:
@@ -29,12 +37,15 @@ class Extrinsics:
         base_frame: str | None,
         override: Pose2 | None,
         assumed: Collection[str] = (),
+        calibrated: Mapping[str, Pose2] | None = None,
     ) -> None:
-        """`assumed` are laser frames whose mounting was assumed when the log was written."""
+        """`assumed` are laser frames whose mounting was assumed when the log was written; `calibrated` are mountings by
+        frame that are known better."""
         self._containers = containers
         self._topics = topics
         self._override = override
         self._assumed = assumed
+        self._calibrated = {} if calibrated is None else calibrated
         self._static = FrameTree()
         self.warnings: list[RunWarning] = []
         for link in read_links(containers, topics.static, warnings=self.warnings):
@@ -46,7 +57,7 @@ class Extrinsics:
 
     def of(self, laser_frame: str, T_frame_laser: Transform3 | None = None) -> Mounting:
         """The mounting of a laser's frame, or of a laser that stands elsewhere in the frame."""
-        if T_frame_laser is None or self._override is not None:
+        if T_frame_laser is None or self._override is not None or laser_frame in self._calibrated:
             return self.found(laser_frame)[0]
         self.found(laser_frame)
         return laser_mounting(self._spatial.get(laser_frame, Transform3()) @ T_frame_laser)
@@ -55,8 +66,13 @@ class Extrinsics:
         """T_base_frame in space, the identity where it is not known; a mounting that was given is in the plane."""
         if self._override is not None:
             return Transform3.from_pose2(self._override)
-        self.found(frame)
-        return self._spatial.get(frame, Transform3())
+        stated = self.found(frame)[0]
+        in_space = self._spatial.get(frame, Transform3())
+        if frame not in self._calibrated:
+            return in_space
+        # Height and tilt stay as the log states them.
+        moved = stated.T_base_laser @ in_space.to_pose2().inverse()
+        return Transform3.from_pose2(moved) @ in_space
 
     def found(self, laser_frame: str) -> tuple[Mounting, str]:
         """The mounting, and where it comes from: `option`, topics of transforms, `same frame` or `identity`."""
@@ -82,6 +98,12 @@ class Extrinsics:
     def _find(self, laser: str) -> tuple[Mounting, str]:
         if self._override is not None:
             return Mounting(self._override), "option"
+        if laser in self._calibrated:
+            return replace(self._stated(laser)[0], T_base_laser=self._calibrated[laser]), "calibration"
+        return self._stated(laser)
+
+    def _stated(self, laser: str) -> tuple[Mounting, str]:
+        """What the log says."""
         base = self.base_frame
         if base is not None and base == laser:
             return Mounting(IDENTITY), "same frame"

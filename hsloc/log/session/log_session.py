@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hsloc.log.messages import definitions, foxglove
 from hsloc.log.messages.decoders import Undecodable, canonical_type, decoder_for, is_decodable
-from hsloc.log.session.extrinsics import Extrinsics
+from hsloc.log.session.extrinsics import Extrinsics, calibrated_mountings
 from hsloc.log.session.scan_geometry import ScanFixes, ScanSurvey, survey
 from hsloc.log.session.split_recordings import check_parts
 from hsloc.log.session.topic_selection import (
@@ -110,7 +110,8 @@ class LogSession:
         assumed = {
             frame for c in containers for frame in c.metadata.get(CONVERTED, {}).get("assumed_mountings", "").split(",")
         }
-        self.mountings = Extrinsics(containers, self.transforms, self._base_frame(), options.laser_pose, assumed)
+        base, known = self._base_frame(), calibrated_mountings(options.calibration, frames)
+        self.mountings = Extrinsics(containers, self.transforms, base, options.laser_pose, assumed, known)
         self.T_child_base = self._child_to_base()
         # A truth that speaks of the same frame as the odometry moves with it.
         truth_child = getattr(self.truth.message, "child_frame_id", None) if self.truth is not None else None

@@ -92,6 +92,9 @@ class TextSource:
         # Laser lines, which may have several keywords, are of one clock.
         offsets = options.offsets_s()
         self._scan_offset_ns = round(1e9 * sum(value for name, value in offsets.items() if name != "ODOM"))
+        calibration = options.calibration
+        known = [] if calibration is None else [lidar for topic, lidar in calibration.lidars if topic != "ODOM"]
+        self._given_mounting = options.laser_pose or (known[0].T_base_laser if known else None)
         self._has_odometry_lines = False
         self.losses_at_opening = Losses()
         self.summary = self._survey()
@@ -115,7 +118,7 @@ class TextSource:
         ):
             yield line.odometry
         if line.scan is not None:
-            mounting = self._options.laser_pose or line.scan.T_base_laser
+            mounting = self._given_mounting or line.scan.T_base_laser
             yield replace(
                 line.scan,
                 stamp_ns=line.scan.stamp_ns + self._scan_offset_ns,
@@ -176,8 +179,8 @@ class TextSource:
         scan_keyword: str,
     ) -> LogSummary:
         extrinsics, warnings = "identity", list[RunWarning]()
-        if self._options.laser_pose is not None:
-            extrinsics = "option"
+        if self._given_mounting is not None:
+            extrinsics = "calibration" if self._options.laser_pose is None else "option"
         elif scan_keyword in self._format.states_mounting:
             extrinsics = "file format"
         elif scan is not None:
@@ -189,7 +192,7 @@ class TextSource:
                     "give --laser-pose x,y,yaw",
                 )
             )
-        mounting = self._options.laser_pose or (scan.T_base_laser if scan else IDENTITY)
+        mounting = self._given_mounting or (scan.T_base_laser if scan else IDENTITY)
         odometry = kinds["odometry"]
         if self._has_odometry_lines and not self._format.laser_odometry:
             odometry = {keyword: None for keyword in odometry if keyword not in kinds["scan"]}

@@ -189,7 +189,8 @@ def explain(error: Exception) -> dict[str, Any]:
 
 def plain_names(text: str) -> str:
     """A message with the files' own names: the folder is the server's business, and differs from run to run."""
-    return re.sub(rf"{re.escape(str(Path.cwd()))}/(?:(?:input(?:-\d+)?|map|relations|reference|output)/)?", "", text)
+    folders = "|".join((r"input(?:-\d+)?", "map", "output", *(name for name in BY_NAME if BY_NAME[name].is_upload)))
+    return re.sub(rf"{re.escape(str(Path.cwd()))}/(?:(?:{folders})/)?", "", text)
 
 
 def _throttled(tell: Callable[[dict[str, Any]], None]) -> Callable[[str, float, float, int], None]:

@@ -99,7 +99,7 @@ async function submit() {
     if (!yaml || !image || files.length !== 2) throw new SyntaxError("a map is two files: its YAML and its image");
     wanted.map = { yaml: await send(yaml), image: await send(image) };
   }
-  const others = ["relations", "reference"].filter((name) => $(name).files.length);
+  const others = ["relations", "reference", "calibration"].filter((name) => $(name).files.length);
   for (const name of others) wanted[name] = await send($(name).files[0]);
   const logs = [];
   for (const file of $("log").files) logs.push(await send(file));

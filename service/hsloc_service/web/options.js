@@ -1,6 +1,6 @@
 // The form of a run's options, made from /v1/options: whatever the server offers can be chosen here.
 
-const FILES = ["relations", "reference", "resume"]; // chosen elsewhere on the page
+const FILES = ["relations", "reference", "calibration", "resume"]; // chosen elsewhere on the page
 
 function control(option) {
   let made;

@@ -1,0 +1,107 @@
+"""From a log to its calibration: passes over the log until its scans are deskewed by what they say themselves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from hsloc.calibration.estimator import Undetermined, estimate
+from hsloc.calibration.laser_track import tracks
+from hsloc.errors import LogError, TopicError
+from hsloc.log import open_log
+from hsloc.model.calibration import Calibration, LidarCalibration
+from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.options import AUTO
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from hsloc.calibration.estimator import Estimate
+    from hsloc.log import LogSummary, ReadOptions
+    from hsloc.slam.parameters import GraphMapperParameters
+
+_MOST_PASSES = 4
+"""Passes over a log; each one deskews by the estimate of the one before."""
+_SETTLED_S = 0.002
+"""Change of the time offset (s) with which the passes end: a beam is then moved by 2 mm at 1 m/s."""
+
+_WORSE = 1.2
+"""Ratio of what is left of the steps, from which on a pass made it worse. Internal: beyond its variation by chance."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogCalibration:
+    """What a log says of one lidar and the odometry.
+
+    `time_offset_s` is to be added to the stamps of `topic`. `nominal` is the mounting that the log states, which holds
+    where `estimate` determines none. `passes` is how often the log was read.
+    """
+
+    topic: str
+    estimate: Estimate
+    time_offset_s: float
+    nominal: Pose2
+    summary: LogSummary
+    passes: int
+
+    def calibration(self) -> Calibration:
+        """What replaces the log's values; what is not determined keeps its value."""
+        found = self.estimate
+        mounting = found.T_base_laser if found.determined[3:6].any() else None
+        offset = self.time_offset_s if found.determined[6] else 0.0
+        return Calibration(found.correction, ((self.topic, LidarCalibration(mounting, offset)),))
+
+
+def calibrate(
+    paths: Sequence[Path],
+    options: ReadOptions,
+    parameters: GraphMapperParameters,
+    progress: Callable[[int, float], None] | None = None,
+) -> LogCalibration:
+    """Calibrate the odometry and the lidar of a log, the one of `scan_topic` where it has several.
+
+    `progress` is called with the pass, from 1, and the part of it that is done. Raises LogError where the log does not
+    hold what is compared, TopicError as `open_log`.
+    """
+    summary = open_log(paths, options).summary
+    topics = (summary.scan_topic or "").split(",")
+    if len(topics) > 1:
+        raise TopicError(
+            f"{paths[0]}: several lidars ({', '.join(topics)}); they are calibrated one at a time, as with "
+            f"--scan-topic {topics[0]}"
+        )
+    topic = topics[0].partition(" + ")[0]
+    # As if the laser stood at the origin of the base: what is mapped then is its own path.
+    at_origin = Calibration(lidars=((topic, LidarCalibration(IDENTITY)),))
+    given = None if options.time_offset == AUTO else options.time_offset
+    reading = replace(options, calibration=at_origin, laser_pose=None)
+    begin, span = summary.start_ns, max(summary.end_ns - summary.start_ns, 1)
+    nominal = options.laser_pose or summary.T_base_laser
+    found: Estimate | None = None
+    offset_s = 0.0
+    for number in range(1, _MOST_PASSES + 1):
+
+        def tell(stamp_ns: int, number: int = number) -> None:
+            if progress is not None:
+                progress(number, min(max((stamp_ns - begin) / span, 0.0), 1.0))
+
+        items = [] if given is None else [given]
+        if found is not None:
+            items.append(f"{topic}={offset_s!r}")
+        log = open_log(paths, replace(reading, time_offset=",".join(items) or None))
+        try:
+            seen = tracks(log.events(), parameters, found, tell)
+            now = estimate(seen.laser, seen.odometry, nominal)
+        except Undetermined as error:
+            raise LogError(f"{paths[0]}: nothing can be calibrated: {error}") from None
+        if found is not None and now.residual_rad > _WORSE * found.residual_rad:
+            # The times of the beams are wrong: deskewed by them, scans fit less well than as they are.
+            now, number = found, number - 1
+            break
+        found = now
+        change = -float(now.values[6])
+        offset_s += change
+        if not seen.is_swept or (number > 1 and abs(change) < _SETTLED_S):
+            break
+    return LogCalibration(topic, now, offset_s, nominal, summary, number)

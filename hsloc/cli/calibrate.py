@@ -1,0 +1,72 @@
+"""Calibrate a robot from its own log: scale and track of the odometry, place and clock of a lidar.
+
+The motion that the scans show is compared with the odometry; no map and no target is needed. What the robot's motion
+does not determine is named.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hsloc.cli.arguments import add_read_arguments, read_options
+from hsloc.cli.progress import ProgressLine
+
+if TYPE_CHECKING:
+    import argparse
+
+HELP = "calibrate odometry and lidar from a log"
+EXAMPLES = """
+  hsloc calibrate run.mcap                     calibration.yaml and calibration.urdf
+  hsloc calibrate run.mcap --scan-topic /front/scan --out front.yaml
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `hsloc calibrate`."""
+    parser.add_argument("log", nargs="+", type=Path, metavar="LOG", help="Log: a file, its parts, or a folder.")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE.yaml", default=Path("calibration.yaml"),
+        help="File to write, with FILE.urdf beside it (default: calibration.yaml).",
+    )  # fmt: skip
+    add_read_arguments(parser)
+    parser.add_argument("--force", action="store_true", help="Overwrite the files.")
+    parser.add_argument("--json", action="store_true", help="Print everything as JSON.")
+    parser.add_argument("-q", "--quiet", action="store_true", help="Print errors only.")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Calibrate; returns the exit code."""
+    from json import dumps
+
+    from hsloc.atomic_write import write_text_atomically
+    from hsloc.calibration import calibrate, written
+    from hsloc.errors import OutputError
+    from hsloc.slam.parameters import GraphMapperParameters
+
+    targets = (arguments.out, arguments.out.with_suffix(".urdf"))
+    if arguments.out.suffix == ".urdf":
+        raise OutputError(f"{arguments.out}: the URDF is written beside the YAML; name a .yaml file")
+    for target in targets:
+        if target.exists() and not arguments.force:
+            raise OutputError(f"{target}: exists; give --force to overwrite it, or name another file with --out")
+        if not target.parent.is_dir():
+            raise OutputError(f"{target}: its folder does not exist; create it, or name another file with --out")
+    options = read_options(arguments)
+    with ProgressLine(arguments.quiet or arguments.json or arguments.no_progress) as line:
+        found = calibrate.calibrate(
+            arguments.log, options, GraphMapperParameters(), lambda number, share: line.show(f"pass {number}", share)
+        )
+    write_text_atomically(targets[0], written.as_yaml(found))
+    write_text_atomically(targets[1], written.as_urdf(found))
+    if arguments.json:
+        print(dumps(written.as_json(found), indent=2))
+    elif not arguments.quiet:
+        for warning in found.summary.warnings:
+            print(f"hsloc: warning: {warning}", file=sys.stderr)
+        print("\n".join(written.as_lines(found)))
+        if found.estimate.determined[3:6].any():
+            print(written.as_static_transform(found))
+        print(f"written: {targets[0]}, {targets[1]}")
+    return 0

@@ -302,7 +302,7 @@ def test_the_form_offers_what_the_server_does(make_live: Callable[..., Live], op
     with live.client() as client:
         offered = {each["name"] for each in client.get("/v1/options", timeout=60.0).json()["run"]}
     built = set(page.evaluate("() => [...document.querySelectorAll('[data-option]')].map((e) => e.dataset.option)"))
-    assert built == offered - {"relations", "reference", "resume"}
+    assert built == offered - {"relations", "reference", "calibration", "resume"}
     page.click("summary >> text=Map and options")
     for group in ("reading the log", "algorithms"):
         page.click(f"summary >> text={group}")

@@ -15,7 +15,7 @@ from hsloc.log.messages import cdr_batch_decode as columns
 from hsloc.log.messages import decode, definitions, encode
 from hsloc.log.reader import open_log
 from hsloc.log.session import message_source as ros_source
-from hsloc.log.session import topic_reader as route
+from hsloc.log.session import message_source as route
 from hsloc.log.summary import ReadOptions
 from hsloc.log.writer import LogWriter
 from hsloc.model import Odometry, Pose2, Scan, Truth

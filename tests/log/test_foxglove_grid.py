@@ -129,7 +129,7 @@ def test_a_map_beside_the_log_is_told_but_not_taken(tmp_path: Path, capsys: pyte
     assert main(["replay", log, *options]) == 0
     captured = capsys.readouterr()
     assert f"so a map is built; to localise on a map give it with --map {tmp_path / 'floor.yaml'}" in captured.err
-    assert "map built from" in captured.out
+    assert "Built a map from" in captured.out
     # Asked for, or with the map of the log, there is nothing to tell.
     assert main(["replay", log, *options, "--mode", "slam"]) == 0
     assert "built" not in capsys.readouterr().err

@@ -1,0 +1,183 @@
+"""Kinds of logs from public reports that were misread: transforms, frames of maps, orientations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import log_formats
+import numpy as np
+import pytest
+from log_builders import MOUNTING, START, describe, make_scan, write_run
+
+from hsloc.log import LogWriter, ReadOptions, check_log, convert_log, open_log
+from hsloc.log.messages import definitions
+from hsloc.log.summary import Losses
+from hsloc.model import OccupancyGrid, Pose2
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("reported") / "run.mcap")
+
+
+def assert_alike(a: Pose2, b: Pose2) -> None:
+    np.testing.assert_allclose(a.to_array(), b.to_array(), atol=1e-9)
+
+
+def write_robot(
+    path: Path, space: str, prefix: str = "", odom: str = "odom", topic: bool = True, mounting: Pose2 = MOUNTING
+) -> Path:
+    """A run whose topics are in a namespace, and whose frames may have a prefix."""
+    with LogWriter(path) as log:
+        _add_robot(log, space, prefix, odom, topic, MOUNTING)
+    return path
+
+
+def _add_robot(log: LogWriter, space: str, prefix: str, odom: str, topic: bool, mounting: Pose2) -> None:
+    base, laser = f"{prefix}base_link", f"{prefix}laser"
+    log.transforms(START, [(base, laser, mounting)], static=True, topic=f"{space}/tf_static")
+    for number in range(30):
+        stamp = START + number * SECOND // 10
+        pose = Pose2(0.1 * number, 0.0, 0.0)
+        log.transforms(stamp, [(f"{prefix}{odom}", base, pose)], topic=f"{space}/tf")
+        if topic:
+            log.odometry(stamp, pose, topic=f"{space}/odom", frame_id=f"{prefix}{odom}", child_frame_id=base)
+        log.scan(make_scan(stamp + SECOND // 100, number), frame_id=laser, topic=f"{space}/scan")
+
+
+@pytest.mark.parametrize("prefix", ["", "robot1/"])
+@pytest.mark.parametrize("odom", ["odom", "odom_combined"])
+@pytest.mark.parametrize("topic", [True, False])
+@pytest.mark.parametrize("space", ["/robot1", "/fleet/robot1", ""])
+def test_transforms_are_found_in_any_namespace_with_any_prefix(
+    tmp_path: Path, space: str, prefix: str, odom: str, topic: bool
+) -> None:
+    log = open_log(write_robot(tmp_path / "a.mcap", space, prefix, odom, topic))
+    assert_alike(log.summary.T_base_laser, MOUNTING)
+    assert log.summary.extrinsics == f"{space}/tf_static"
+    assert log.summary.odom_topic == (f"{space}/odom" if topic else f"{space}/tf")
+    assert log.summary.warnings == ()
+    assert sum(kind == "odometry" for kind, *_ in map(describe, log.events())) == 30
+
+
+def test_of_two_robots_the_one_whose_scans_are_read_counts(tmp_path: Path) -> None:
+    other = Pose2(-0.3, 0.1, 1.0)
+    with LogWriter(tmp_path / "two.mcap") as log:
+        _add_robot(log, "/robot1", "", "odom", False, MOUNTING)
+        _add_robot(log, "/robot2", "", "odom", False, other)
+    for name, mounting in (("/robot1", MOUNTING), ("/robot2", other)):
+        found = open_log(tmp_path / "two.mcap", ReadOptions(scan_topic=f"{name}/scan"))
+        assert_alike(found.summary.T_base_laser, mounting)
+        assert found.summary.odom_topic == f"{name}/tf"
+
+
+def test_transforms_can_be_named_in_place_of_an_odometry_topic(tmp_path: Path) -> None:
+    path = write_robot(tmp_path / "a.mcap", "/robot1")
+    log = open_log(path, ReadOptions(odom_topic="/robot1/tf", base_frame="base_link"))
+    assert log.summary.odom_topic == "/robot1/tf"
+    assert sum(kind == "odometry" for kind, *_ in map(describe, log.events())) == 30
+
+
+def test_static_transforms_stated_twice_are_both_named(tmp_path: Path) -> None:
+    path = tmp_path / "two.mcap"
+    with LogWriter(path) as log:
+        log.transforms(START, [("base_link", "laser", Pose2(0.18, 0.0, 0.0))], static=True)
+        _add_robot(log, "", "", "odom", True, Pose2(0.0, 0.0, 0.0))
+    (warning,) = open_log(path).summary.warnings
+    for part in ("0.180,0.000,0.000", "0.000,0.000,0.000", "--laser-pose"):
+        assert part in str(warning)
+    assert any("0.180,0.000,0.000" in finding.text for finding in check_log(open_log(path)).findings)
+
+
+def test_a_frame_with_two_parents_is_looked_up_by_the_one_that_leads_to_the_base(tmp_path: Path) -> None:
+    path = tmp_path / "parents.mcap"
+    with LogWriter(path) as log:
+        _add_robot(log, "", "", "odom", True, MOUNTING)
+        log.transforms(START + SECOND, [("camera_mount", "laser", Pose2(5.0, 0.0, 0.0))], static=True)
+    summary = open_log(path).summary
+    assert_alike(summary.T_base_laser, MOUNTING)
+    assert any("camera_mount" in str(warning) for warning in summary.warnings)
+
+
+def test_a_mounting_that_was_assumed_stays_an_assumption_after_conversion(tmp_path: Path) -> None:
+    source = write_run(tmp_path / "a.mcap", mounting=None)
+    convert_log(open_log(source), tmp_path / "b.mcap")
+    for path in (source, tmp_path / "b.mcap"):
+        log = open_log(path)
+        assert log.summary.extrinsics == "identity"
+        assert any("--laser-pose" in str(warning) for warning in log.summary.warnings)
+        assert any(finding.code == "no_extrinsic" for finding in check_log(log).findings)
+    before, after = ([describe(event) for event in open_log(path).events()] for path in (source, tmp_path / "b.mcap"))
+    assert before == after
+
+
+# Frames of maps.
+
+GRID = OccupancyGrid(np.zeros((4, 6), dtype=np.int8), 0.05, Pose2(1.0, 2.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("topic", "frame", "is_map"),
+    [
+        ("/map", "map", True),
+        ("/robot1/map", "robot1/map", True),
+        ("/floor_plan", "map", True),
+        ("/local_costmap/costmap", "odom", False),
+        ("/global_costmap/costmap", "map", False),
+        ("/grid", "odom", False),
+    ],
+)
+def test_a_costmap_is_no_map(tmp_path: Path, topic: str, frame: str, is_map: bool) -> None:
+    path = tmp_path / "map.mcap"
+    with LogWriter(path) as log:
+        _add_robot(log, "", "", "odom", True, MOUNTING)
+        log.occupancy_grid(GRID, START, topic=topic, frame_id=frame)
+    log_ = open_log(path)
+    assert (log_.map() is not None) is is_map
+    assert any(topic in str(warning) for warning in log_.summary.warnings) is not is_map
+
+
+@pytest.mark.parametrize("transform", [True, False])
+def test_a_start_pose_in_the_frame_of_the_odometry_is_moved_or_left_out(tmp_path: Path, transform: bool) -> None:
+    T_map_odom = Pose2(3.0, 4.0, 0.5)
+    path = tmp_path / "start.mcap"
+    with LogWriter(path) as log:
+        if transform:
+            log.transforms(START, [("map", "odom", T_map_odom)])
+        _add_robot(log, "", "", "odom", True, MOUNTING)
+        log.pose_with_covariance(START + SECOND, Pose2(1.0, 0.0, 0.0), topic="/initialpose", frame_id="odom")
+    found = open_log(path)
+    if transform:
+        start = found.initial_pose()
+        assert start is not None
+        assert np.allclose(start[1].to_array(), (T_map_odom @ Pose2(1.0, 0.0, 0.0)).to_array())
+    else:
+        assert found.initial_pose() is None
+        assert any("frame odom" in str(warning) for warning in found.summary.warnings)
+
+
+def test_orientations_of_zeros_are_counted(tmp_path: Path, plain: Path) -> None:
+    def zeroed(number: int, name: str, data: bytes) -> bytes:
+        if name != definitions.ODOMETRY or number >= 40:
+            return data
+        pose = len(data) - 680
+        return data[: pose + 24] + bytes(32) + data[pose + 56 :]
+
+    items = [(s, c, t, zeroed(n, s.name, data)) for n, (s, c, t, data) in enumerate(log_formats.messages(plain))]
+    log = open_log(log_formats.write(tmp_path / "zeros.mcap", items))
+    events = list(log.events())
+    assert (
+        sum(not getattr(event, "has_heading", True) for event in events) == log.losses.orientations_unset["/odom"] > 5
+    )
+    assert replace_losses(log.losses) == Losses()
+
+
+def replace_losses(losses: Losses) -> Losses:
+    """The losses but for the count of unset orientations."""
+    return replace(losses, orientations_unset=Losses().orientations_unset)

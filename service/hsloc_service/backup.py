@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from sqlalchemy import select
 
-from hsloc_service.db.database import Database
+from hsloc_service.db.database import SQLITE, Database
 from hsloc_service.db.tables import AssetRow, FileRow, JobRow
 from hsloc_service.jobs.repository import delete_job
 from hsloc_service.settings import SettingsError
@@ -47,7 +47,7 @@ def back_up(data: Path, target: Path) -> BackupReport:
     Raises SettingsError where `data` is no data folder, `target` is there already, the copy fails, or a file does not
     have the SHA-256 that the database names.
     """
-    if not (data / "hsloc.db").is_file():
+    if not (data / SQLITE).is_file():
         raise SettingsError(f"{data}: no data folder of hsloc; name it with --data")
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise SettingsError(f"{target}: exists already; name a new folder for the backup")
@@ -58,7 +58,7 @@ def back_up(data: Path, target: Path) -> BackupReport:
         for name in ("uploads", "results"):
             (partial / name).mkdir(parents=True, mode=0o700)
         partial.chmod(0o700)
-        _copy_database(data / "hsloc.db", partial / "hsloc.db")
+        _copy_database(data / SQLITE, partial / SQLITE)
         with suppress(FileNotFoundError):
             shutil.copyfile(data / "instance", partial / "instance")
         report = _copy_files(data, partial)
@@ -92,7 +92,7 @@ def _copy_database(source: Path, target: Path) -> None:
 
 def _copy_files(data: Path, target: Path) -> BackupReport:
     """Copy what the copied database names; what was deleted meanwhile is deleted from it, too."""
-    database = Database(target / "hsloc.db")
+    database = Database(target / SQLITE)
     size = deleted = 0
     try:
         with database.write() as session:

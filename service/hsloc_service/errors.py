@@ -38,8 +38,9 @@ def no_space(message: str) -> ServiceError:
 
 
 def is_disk_full(error: OperationalError) -> bool:
-    """Whether SQLite failed because the disk is full, by its error code and not by its words."""
-    return getattr(error.orig, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
+    """Whether SQLite or PostgreSQL failed because its disk is full, by its error code and not by its words."""
+    full = getattr(error.orig, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
+    return full or getattr(error.orig, "sqlstate", None) == "53100"
 
 
 class BrokenAnswer(Exception):

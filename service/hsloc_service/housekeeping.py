@@ -58,8 +58,13 @@ class Housekeeping:
                 log("housekeeping.error", error=f"{type(error).__name__}: {error}")
 
     def tidy(self, now: float) -> None:
-        """One round."""
+        """One round; of the servers that share a database one at a time does what concerns them all."""
         self._storage.restore_ballast()
+        with self._database.elected("housekeeping") as mine:
+            if mine:
+                self._tidy_database(now)
+
+    def _tidy_database(self, now: float) -> None:
         self._expire_uploads(now)
         if self._settings.retention_s is not None:
             self._delete_old(now - self._settings.retention_s)
@@ -89,6 +94,7 @@ class Housekeeping:
 
     def _expire_uploads(self, now: float) -> None:
         with self._database.write() as session:
+            self._database.lock(session, "tenants")
             rows = session.scalars(select(FileRow).where(FileRow.state == "receiving", FileRow.expires < now)).all()
             for row in rows:
                 delete_upload(session, row)
@@ -109,6 +115,7 @@ class Housekeeping:
         """Delete a batch of jobs; the `seq` of the last one, None if there are no more."""
         query = select(JobRow).where(JobRow.state.in_(ENDED), JobRow.ended < before, JobRow.seq > after)
         with self._database.write() as session:
+            self._database.lock(session, "tenants")
             jobs = session.scalars(query.order_by(JobRow.seq).limit(BATCH)).all()
             extended = base_job(session, *(job.id for job in jobs))
             delete_job(session, *(job for job in jobs if job.id not in extended))
@@ -118,6 +125,7 @@ class Housekeeping:
         """Delete a batch of uploads; the id of the last one, None if there are no more."""
         query = select(FileRow).where(FileRow.state == "complete", FileRow.created < before, FileRow.id > after)
         with self._database.write() as session:
+            self._database.lock(session, "tenants")
             files, needed = session.scalars(query.order_by(FileRow.id).limit(BATCH)).all(), needed_files(session)
             for row in files:
                 if row.id not in needed:

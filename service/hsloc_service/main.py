@@ -11,13 +11,14 @@ import socket
 import sys
 import time
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import uvicorn
 
 from hsloc_service.auth import SCOPES, Tokens
 from hsloc_service.backup import back_up
-from hsloc_service.db.database import Database
+from hsloc_service.db.database import database_place, open_database
 from hsloc_service.http.app import create_app
 from hsloc_service.http.timeouts import protocol_class
 from hsloc_service.logs import configure
@@ -26,7 +27,6 @@ from hsloc_service.storage import Storage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from fastapi import FastAPI
 
@@ -116,7 +116,7 @@ def with_tokens(settings: Settings, host: str, open_to_all: bool, first_token: b
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     # A server that holds the folder must not find its database migrated, or its token gone, by one that may not start.
     Storage(settings.data, settings.min_free_bytes).close()
-    database = Database(settings.data / "hsloc.db")
+    database = open_database(settings)
     try:
         tokens = Tokens(database)
         if secret is not None:
@@ -139,6 +139,10 @@ def with_tokens(settings: Settings, host: str, open_to_all: bool, first_token: b
 
 def back_up_folder(settings: Settings, target: Path) -> int:
     """Make a backup and show what it holds; works while the service runs. Raises SettingsError."""
+    if settings.database_url:
+        raise SettingsError(
+            "--backup is for a data folder with its own database; back up HSLOC_DATABASE_URL by pg_dump"
+        )
     report = back_up(settings.data, target)
     lost = f"; {report.deleted} were deleted meanwhile" if report.deleted else ""
     counts = f"{report.uploads} uploads, {report.jobs} jobs, {report.results} results, {report.bytes} bytes"
@@ -149,7 +153,7 @@ def back_up_folder(settings: Settings, target: Path) -> int:
 def new_token(settings: Settings, tenant: str, scopes: str = ",".join(SCOPES), days: float | None = None) -> int:
     """Make a token and show it; works while the service runs. Raises SettingsError."""
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
-    database = Database(settings.data / "hsloc.db")
+    database = open_database(settings)
     try:
         chosen = tuple(part.strip() for part in scopes.split(",") if part.strip())
         expires = None if days is None else time.time() + days * 86400.0
@@ -184,10 +188,10 @@ def revoke_token(settings: Settings, ident: str) -> int:
 @contextmanager
 def _tokens(settings: Settings) -> Iterator[Tokens]:
     """The tokens of a data folder that exists already."""
-    path = settings.data / "hsloc.db"
-    if not path.is_file():
+    place = database_place(settings)
+    if isinstance(place, Path) and not place.is_file():
         raise SettingsError(f"{settings.data}: no data folder of hsloc; name it with --data")
-    database = Database(path)
+    database = open_database(settings)
     try:
         yield Tokens(database)
     finally:

@@ -30,9 +30,10 @@ def reconcile(database: Database, storage: Storage, deletions: DeletionQueue) ->
 
     For the start only, when no job runs and nobody uploads.
     """
-    for file_id in reopen_uploads(database):
-        with suppress(OSError):
-            storage.upload_path(file_id).chmod(0o600)
+    if not database.shared:  # else other servers may receive them just now; and none of those was that old
+        for file_id in reopen_uploads(database):
+            with suppress(OSError):
+                storage.upload_path(file_id).chmod(0o600)
     _restore(database, storage)
     deletions.clear_uploads()
     for path in storage.work.iterdir():

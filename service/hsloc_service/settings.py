@@ -29,6 +29,8 @@ class Settings:
 
     data: Path = Path("hsloc-data")
     """Folder of the database, the uploads and the results; on a local disk."""
+    database_url: str = field(default="", repr=False)
+    """Database that several servers share, such as `postgresql://user@host/hsloc`; empty: SQLite in the data folder."""
     results_url: str = ""
     """Where results go instead of the data folder, as fsspec knows it: `s3://bucket/prefix`, `file:///mnt/results`."""
     store_timeout_s: float = 30.0

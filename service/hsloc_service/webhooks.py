@@ -119,22 +119,26 @@ class WebhookSender:
 
         A thousand webhooks of one tenant, whose receiver does not answer, would else hold up everybody's for hours.
         """
-        is_due = (DeliveryRow.state == "pending", DeliveryRow.next_at <= time.time())
         with self._database.read() as session:
+            now = self._database.now(session)
+            is_due = (DeliveryRow.state == "pending", DeliveryRow.next_at <= now)
             tenants = session.scalars(select(DeliveryRow.tenant).where(*is_due).distinct()).all()
-            if not tenants:
-                return False
-            self._last = min((each for each in tenants if each > self._last), default=min(tenants))
-            query = select(DeliveryRow).where(*is_due, DeliveryRow.tenant == self._last)
-            due = session.scalar(query.order_by(DeliveryRow.next_at).limit(1))
-        if due is None:
+        if not tenants:
             return False
+        self._last = min((each for each in tenants if each > self._last), default=min(tenants))
+        query = select(DeliveryRow).where(*is_due, DeliveryRow.tenant == self._last).order_by(DeliveryRow.next_at)
         with self._database.write() as session:
+            due = session.scalar(query.limit(1).with_for_update(skip_locked=True))
+            if due is None:
+                return True  # another server has it; there may be more
+            self._database.lock(session, f"secret {due.tenant}")
             secret = secret_of(session, due.tenant)
+            if self._database.shared:
+                due.next_at = now + 2.0 * WITHIN_S  # nobody else tries it meanwhile; if we die, somebody does
         status, error = self._post(due, secret)
         with self._database.write() as session:
-            row = session.get(DeliveryRow, due.id)
-            if row is not None:
+            row = session.get(DeliveryRow, due.id, with_for_update=True)
+            if row is not None and row.attempts == due.attempts:
                 self._note(row, status, error)
         return True
 

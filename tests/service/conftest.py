@@ -6,6 +6,7 @@ import contextlib
 import signal
 from typing import TYPE_CHECKING, Any
 
+import postgresql as postgresql_server
 import pytest
 from fastapi.testclient import TestClient
 from live_service import Live, settings
@@ -47,3 +48,19 @@ def make_live(tmp_path: Path) -> Iterator[Callable[..., Live]]:
     for each in made:
         if each.process is not None and each.process.poll() is None:
             each.end(signal.SIGKILL)
+
+
+@pytest.fixture(scope="session")
+def postgresql() -> Iterator[postgresql_server.Server]:
+    """A PostgreSQL, started when the first test asks for it."""
+    with postgresql_server.running() as server:
+        yield server
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database_url(request: pytest.FixtureRequest) -> str:
+    """The database's URL for the settings: of each kind in turn."""
+    if request.param == "sqlite":
+        return ""
+    server: postgresql_server.Server = request.getfixturevalue("postgresql")
+    return server.new_database()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -10,8 +12,10 @@ from live_service import settings, submit, wait
 from sqlalchemy import update
 
 from hsloc_service.auth import ANYBODY, Principal
-from hsloc_service.db.database import Database
+from hsloc_service.db.database import open_database
 from hsloc_service.db.tables import JobRow
+from hsloc_service.errors import ServiceError
+from hsloc_service.execution.job_process import parse_line
 from hsloc_service.jobs.leases import Leases
 from hsloc_service.jobs.repository import Jobs
 from hsloc_service.results.store import Asset
@@ -28,10 +32,10 @@ OTHER = Principal("other", ANYBODY.scopes)
 
 
 class Parts:
-    def __init__(self, folder: Path) -> None:
-        chosen = settings(folder)
+    def __init__(self, folder: Path, database_url: str = "") -> None:
+        chosen = settings(folder, database_url=database_url)
         chosen.data.mkdir()
-        self.database = Database(chosen.data / "hsloc.db")
+        self.database = open_database(chosen)
         self.storage = Storage(chosen.data)
         self.files = Files(self.database, self.storage, chosen)
         self.jobs = Jobs(self.database, self.storage, chosen)
@@ -46,8 +50,8 @@ class Parts:
 
 
 @pytest.fixture
-def parts(tmp_path: Path) -> Iterator[Parts]:
-    made = Parts(tmp_path)
+def parts(tmp_path: Path, database_url: str) -> Iterator[Parts]:
+    made = Parts(tmp_path, database_url)
     yield made
     made.database.close()
     made.storage.close()
@@ -92,8 +96,8 @@ def test_a_job_that_kills_its_server_is_given_up(parts: Parts) -> None:
     job = parts.submit()
     leases = parts.leases(max_attempts=3)
     for owner in "abc":
-        assert leases.claim(owner) is not None
-        leases.recover("the next server")
+        assert leases.claim(f"folder:{owner}") is not None
+        leases.recover("folder:the next server")
     found = parts.jobs.get(ANYBODY, job)
     assert (found.state, found.reason) == ("crashed", "attempts")
     assert leases.claim("d") is None
@@ -122,9 +126,9 @@ def test_cancel_wins_over_success(parts: Parts) -> None:
 def test_cancelled_while_its_server_dies(parts: Parts) -> None:
     job = parts.submit()
     leases = parts.leases()
-    leases.claim("a")
+    leases.claim("folder:a")
     parts.jobs.cancel(ANYBODY, job)
-    leases.recover("b")
+    leases.recover("folder:b")
     assert parts.jobs.get(ANYBODY, job).state == "cancelled"
 
 
@@ -136,7 +140,8 @@ def test_a_tenant_with_many_jobs_does_not_hold_up_another(parts: Parts) -> None:
     assert order == [many[0], single, many[1]]
 
 
-def test_the_journal_is_durable(parts: Parts) -> None:
+def test_the_journal_is_durable(tmp_path: Path) -> None:
+    parts = Parts(tmp_path)
     with parts.database.read() as session:
         connection = session.connection()
         assert connection.exec_driver_sql("PRAGMA journal_mode").scalar_one() == "wal"
@@ -178,3 +183,73 @@ def test_leases_are_measured_by_the_database(parts: Parts, monkeypatch: pytest.M
     now = time.time()
     monkeypatch.setattr(time, "time", lambda: now + 3600.0)
     assert parts.leases().recover() == []
+
+
+def test_a_server_that_starts_leaves_the_jobs_of_another_data_folder_alone(parts: Parts) -> None:
+    """On a shared database; one in a data folder is held by one server at a time."""
+    job = parts.submit()
+    leases = parts.leases()
+    assert leases.claim("folder:a") is not None
+    assert leases.recover("elsewhere:b") == ([] if parts.database.shared else [job])
+    parts.submit()
+    assert leases.claim("elsewhere:b") is not None
+
+
+def test_of_many_claims_at_once_each_gets_a_job_of_its_own(parts: Parts) -> None:
+    jobs = {parts.submit() for _ in range(12)}
+    leases = parts.leases()
+    with ThreadPoolExecutor(6) as pool:
+        claims = [claim for claim in pool.map(lambda k: leases.claim(f"folder:{k}"), range(16)) if claim is not None]
+    # A row that another one takes at this moment is skipped: a claim may come back with nothing, and is tried again.
+    while (claim := leases.claim("folder:again")) is not None:
+        claims.append(claim)
+    assert sorted(claim.job_id for claim in claims) == sorted(jobs)
+
+
+def test_of_many_submissions_with_one_key_at_once_one_makes_a_job(parts: Parts) -> None:
+    file = parts.files.create(ANYBODY, "run.mcap", 0)
+    parts.files.complete(file.id, 0, "00")
+    with ThreadPoolExecutor(6) as pool:
+        made = list(pool.map(lambda _: parts.jobs.submit(ANYBODY, {"log": file.id, "map": None}, "key"), range(12)))
+    assert len({submitted.job.id for submitted in made}) == 1
+    assert sum(submitted.created for submitted in made) == 1
+
+
+def test_of_many_submissions_at_once_no_more_wait_than_allowed(parts: Parts) -> None:
+    jobs = replace(parts.jobs, settings=replace(parts.jobs.settings, max_queued=3))
+    file = parts.files.create(ANYBODY, "run.mcap", 0)
+    parts.files.complete(file.id, 0, "00")
+
+    def submit_one(_: int) -> int | None:
+        try:
+            return jobs.submit(ANYBODY, {"log": file.id, "map": None}).job.seq
+        except ServiceError:
+            return None
+
+    with ThreadPoolExecutor(6) as pool:
+        made = [seq for seq in pool.map(submit_one, range(10)) if seq is not None]
+    assert sorted(made) == [1, 2, 3]
+
+
+def test_a_success_whose_answer_was_lost_may_be_written_again(parts: Parts) -> None:
+    parts.submit()
+    leases = parts.leases()
+    claim = leases.claim("folder:a")
+    assert claim is not None
+    assert leases.succeed(claim, f"{claim.job_id}.1", ASSET, {})
+    assert leases.succeed(claim, f"{claim.job_id}.1", ASSET, {})
+    assert not leases.succeed(claim, f"{claim.job_id}.2", ASSET, {})
+
+
+def test_one_housekeeper_at_a_time(parts: Parts) -> None:
+    with parts.database.elected("housekeeping") as first, parts.database.elected("housekeeping") as second:
+        assert first
+        assert second is not parts.database.shared
+    with parts.database.elected("housekeeping") as again:
+        assert again
+
+
+def test_a_text_that_postgresql_does_not_take(parts: Parts) -> None:
+    file = parts.files.create(ANYBODY, "a\0b.mcap", 0)
+    assert parts.files.get(ANYBODY, file.id).name == "ab.mcap"
+    assert parse_line(b'{"failed": "a\\u0000b"}') == {"failed": "a\ufffdb"}

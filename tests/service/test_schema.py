@@ -206,7 +206,7 @@ def test_a_full_disk_does_not_keep_a_server_from_starting(old: Path, monkeypatch
     ballast = old.with_name("ballast")
     ballast.write_bytes(bytes(10))
 
-    def migrate(connection: Connection, path: Path) -> tuple[int, int]:
+    def migrate(connection: Connection, path: str) -> tuple[int, int]:
         if ballast.exists() or full:
             raise sqlite3.OperationalError("database or disk is full")
         return migrations.migrate(connection, path)

@@ -1,7 +1,12 @@
-"""From one schema of the database to the next. The version is SQLite's `user_version`, set in the same transaction."""
+"""From one schema of the database to the next, in one transaction. SQLite's `user_version` has its version, too.
+
+Up to schema 4 there was SQLite only, and the statements are here. From then on each has a script of Alembic in
+`scripts/versions`, whose number is its revision.
+"""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sqlalchemy import inspect
@@ -10,8 +15,6 @@ from hsloc_service.db.tables import SCHEMA_VERSION, Base
 from hsloc_service.settings import SettingsError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from sqlalchemy import Connection
 
 STEPS: dict[int, tuple[str, ...]] = {
@@ -33,34 +36,73 @@ STEPS: dict[int, tuple[str, ...]] = {
     3: ("CREATE INDEX ix_idempotency_job_id ON idempotency (job_id)",),
 }
 """What leads from a version to the next one; tables that are new are made afterwards, by `create_all`."""
+FIRST_OF_ALEMBIC = 4
 
 
-def migrate(connection: Connection, path: Path) -> tuple[int, int]:
+VERSION_TABLE = "alembic_version"
+
+
+def migrate(connection: Connection, name: str) -> tuple[int, int]:
     """Bring the database to `SCHEMA_VERSION`, in the caller's transaction; the versions before and after.
 
-    A new file gets the tables of today. Raises SettingsError, with nothing changed, for a database of a newer hsloc or
-    of something else, and for one whose tables are not what its version says.
+    An empty one gets the tables of today. Raises SettingsError, with nothing changed, for a database of a newer hsloc
+    or of something else, and for one whose tables are not what its version says.
     """
-    before = int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
     tables = set(inspect(connection).get_table_names())
+    before = _version(connection, tables)
     if before > SCHEMA_VERSION:
         raise SettingsError(
-            f"{path}: written by a newer hsloc (schema {before}, known up to {SCHEMA_VERSION}); "
-            "install that version, or give another --data"
+            f"{name}: written by a newer hsloc (schema {before}, known up to {SCHEMA_VERSION}); "
+            "install that version, or give another --data or database"
         )
     if before == 0 and tables:
-        raise SettingsError(f"{path}: not a database of hsloc (no schema version); give another --data")
+        raise SettingsError(f"{name}: not a database of hsloc (no schema version); give another --data or database")
     if before < SCHEMA_VERSION:  # else nothing is written: a server must start on a full disk, too
-        for version in range(before or SCHEMA_VERSION, SCHEMA_VERSION):
-            for statement in STEPS[version]:
-                connection.exec_driver_sql(statement)
+        if before > 0:
+            for version in range(before, FIRST_OF_ALEMBIC):
+                for statement in STEPS[version]:
+                    connection.exec_driver_sql(statement)
         Base.metadata.create_all(connection)
-        connection.exec_driver_sql(f"PRAGMA user_version={SCHEMA_VERSION}")
-    _need_columns(connection, path, before or SCHEMA_VERSION)
+        if before > 0:
+            _run_scripts(connection, stamped=VERSION_TABLE in tables)
+        else:
+            _stamp(connection, SCHEMA_VERSION)
+        if connection.dialect.name == "sqlite":
+            connection.exec_driver_sql(f"PRAGMA user_version={SCHEMA_VERSION}")
+    _need_columns(connection, name, before or SCHEMA_VERSION)
     return before, SCHEMA_VERSION
 
 
-def _need_columns(connection: Connection, path: Path, version: int) -> None:
+def _version(connection: Connection, tables: set[str]) -> int:
+    """The version of the schema; 0 if there is none. SQLite's is in the file's header, as before Alembic."""
+    if connection.dialect.name == "sqlite":
+        return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
+    if VERSION_TABLE not in tables:
+        return 0
+    found = str(connection.exec_driver_sql(f"SELECT version_num FROM {VERSION_TABLE}").scalar_one_or_none())
+    return int(found) if found.isdecimal() else 0
+
+
+def _stamp(connection: Connection, version: int) -> None:
+    """Note the version as Alembic does, which takes long to import."""
+    connection.exec_driver_sql(f"CREATE TABLE {VERSION_TABLE} (version_num VARCHAR(32) NOT NULL PRIMARY KEY)")
+    connection.exec_driver_sql(f"INSERT INTO {VERSION_TABLE} VALUES ('{version}')")
+
+
+def _run_scripts(connection: Connection, stamped: bool) -> None:
+    """Run those of Alembic's scripts that the database has not had."""
+    from alembic import command
+    from alembic.config import Config
+
+    if not stamped:
+        _stamp(connection, FIRST_OF_ALEMBIC)
+    config = Config()
+    config.set_main_option("script_location", str(Path(__file__).with_name("scripts")).replace("%", "%%"))
+    config.attributes["connection"] = connection
+    command.upgrade(config, "head")
+
+
+def _need_columns(connection: Connection, place: str, version: int) -> None:
     """Raises SettingsError unless the tables have the columns that the code names."""
     found = inspect(connection)
     tables = set(found.get_table_names())
@@ -69,6 +111,6 @@ def _need_columns(connection: Connection, path: Path, version: int) -> None:
         missing = {column.name for column in table.columns} - there
         if missing:
             raise SettingsError(
-                f"{path}: calls itself schema {version}, but table {name} has no column {', '.join(sorted(missing))}; "
-                "restore it from a backup, or give another --data"
+                f"{place}: calls itself schema {version}, but table {name} has no column {', '.join(sorted(missing))}; "
+                "restore it from a backup, or give another --data or database"
             )

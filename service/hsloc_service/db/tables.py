@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from sqlalchemy import JSON, Index, Text, UniqueConstraint
+from sqlalchemy import JSON, BigInteger, Index, Integer, Text, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 SCHEMA_VERSION = 4
@@ -15,10 +15,14 @@ ACTIVE: tuple[JobState, ...] = ("queued", "running", "cancelling")
 ENDED: tuple[JobState, ...] = ("succeeded", "failed", "crashed", "cancelled")
 
 
+LONG = BigInteger().with_variant(Integer, "sqlite")
+"""64 bits; SQLite's integers always have them, and number rows by themselves only if they are called INTEGER."""
+
+
 class Base(DeclarativeBase):
     """Base of the tables."""
 
-    type_annotation_map = {dict[str, Any]: JSON, list[str]: JSON}  # noqa: RUF012
+    type_annotation_map = {dict[str, Any]: JSON, list[str]: JSON, int: LONG}  # noqa: RUF012
 
 
 class TokenRow(Base):

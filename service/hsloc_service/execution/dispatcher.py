@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import threading
 import time
-import uuid
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -17,6 +16,7 @@ from sqlalchemy.exc import OperationalError
 
 from hsloc_service.execution.processes import kill_marked
 from hsloc_service.execution.supervisor import Supervisor
+from hsloc_service.jobs.leases import new_owner
 from hsloc_service.logs import log
 from hsloc_service.reconciliation import reconcile
 
@@ -90,7 +90,7 @@ class LocalDispatcher:
         self._leases, self._storage, self._settings, self._deletions = leases, storage, settings, deletions
         self._supervisor = Supervisor(leases, storage, settings, stores, sandbox, store_failed)
         self._ended = ended
-        self._owner = uuid.uuid4().hex
+        self._owner = new_owner(storage.instance)
         self._stop = threading.Event()
         self._work = threading.Condition()
         self._claiming = threading.Lock()

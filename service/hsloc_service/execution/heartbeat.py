@@ -5,6 +5,10 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
+from sqlalchemy.exc import DBAPIError
+
+from hsloc_service.db.database import is_unreachable
+
 if TYPE_CHECKING:
     import threading
 
@@ -25,6 +29,7 @@ class Heartbeat:
         self._progress: dict[str, Any] | None = None
         self._written: dict[str, Any] | None = None
         self._checked = self._renewed = 0.0
+        self._held_until = time.monotonic() + leases.lease_s
         self._begin = time.monotonic()
 
     def begin(self) -> None:
@@ -55,7 +60,14 @@ class Heartbeat:
         if not fresh and now < self._renewed + self._interval_s and not cancelled:
             return None
         self._renewed = now
-        reply = self._leases.beat(self._claim, self._next_progress(now) if fresh else None)
+        try:
+            reply = self._leases.beat(self._claim, self._next_progress(now) if fresh else None)
+        except DBAPIError as error:
+            if not self._leases.database.shared or not is_unreachable(error):
+                raise
+            # Until the lease ends nobody takes the job; a database that restarts is back by then.
+            return None if time.monotonic() < self._held_until else "lost"
+        self._held_until = now + self._leases.lease_s
         return "lost" if not reply.mine else "cancelled" if reply.cancel else None
 
     def _next_progress(self, now: float) -> dict[str, Any]:

@@ -146,7 +146,8 @@ class JobProcess:
 def parse_line(line: bytes) -> dict[str, Any]:
     """An object of JSON from a process that is not trusted, in values that the database and every JSON reader take.
 
-    NaN, infinity and integers of more than 64 bits become null; half a surrogate pair becomes a question mark. Raises
+    NaN, infinity and integers of more than 64 bits become null; half a surrogate pair becomes a question mark,
+    and NUL, which PostgreSQL does not take, a replacement character. Raises
     ValueError or RecursionError for what is no object of JSON, or nested too deeply.
     """
     found = _plain(json.loads(line), MAX_LINE_DEPTH)
@@ -159,7 +160,7 @@ def _plain(value: Any, depth: int) -> Any:
     if depth == 0:
         raise ValueError("nested too deeply")
     if isinstance(value, str):
-        return value.encode("utf-8", "replace").decode()
+        return value.encode("utf-8", "replace").decode().replace("\0", "\ufffd")
     if isinstance(value, dict):
         return {_plain(key, depth): _plain(each, depth - 1) for key, each in value.items()}
     if isinstance(value, list):

@@ -13,7 +13,7 @@ from fastapi.staticfiles import StaticFiles
 from hsloc.version import __version__
 from hsloc_service.auth import Tokens
 from hsloc_service.call_timeout import BoundedExecutor
-from hsloc_service.db.database import Database
+from hsloc_service.db.database import open_database
 from hsloc_service.execution.dispatcher import LocalDispatcher
 from hsloc_service.execution.sandbox import choose_sandbox
 from hsloc_service.execution.warm_up import WarmUp
@@ -102,7 +102,7 @@ def open_context(settings: Settings) -> Context:
     storage = Storage(settings.data, settings.min_free_bytes)
     try:
         sandbox = choose_sandbox(settings.sandbox, settings.data, settings.worker_command)
-        database, stores = Database(settings.data / "hsloc.db"), ResultStores(storage, settings)
+        database, stores = open_database(settings), ResultStores(storage, settings)
     except SettingsError:
         storage.close()
         raise

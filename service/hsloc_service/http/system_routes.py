@@ -80,6 +80,7 @@ def options(who: Reader) -> Options:
 def webhook_secret(ctx: Ctx, who: Admin) -> SecretView:
     """The key that signs your webhooks; made when first asked for. Needs the scope `admin`."""
     with ctx.database.write() as session:
+        ctx.database.lock(session, f"secret {who.tenant}")
         return SecretView(secret=secret_of(session, who.tenant))
 
 

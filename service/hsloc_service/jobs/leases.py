@@ -8,23 +8,32 @@ itself, so that a clock that is set forward ends no lease of a job that runs.
 
 from __future__ import annotations
 
+import time
+import uuid
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from sqlalchemy import func, select
+from sqlalchemy import func, or_, select
+from sqlalchemy.exc import DBAPIError
 
+from hsloc_service.db.database import is_unreachable
 from hsloc_service.db.tables import AssetRow, FileRow, JobRow
 from hsloc_service.jobs.events import record
 from hsloc_service.jobs.repository import finish_job
 from hsloc_service.stored_request import MAP_STATE, files_of
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Callable, Collection
 
     from sqlalchemy.orm import Session
 
     from hsloc_service.db.database import Database
     from hsloc_service.results.store import Asset
+
+
+T = TypeVar("T")
+RETRY_S = 1.0
+"""Wait between two attempts to reach the database [s]."""
 
 
 class Source(NamedTuple):
@@ -104,10 +113,17 @@ class Leases:
 
         The results, which the store has already, become visible by this commit.
         """
+        return self._patiently(lambda: self._succeed(claim, folder, assets, summary, store))
+
+    def _succeed(
+        self, claim: Claim, folder: str, assets: list[Asset], summary: dict[str, Any], store: str | None
+    ) -> bool:
         with self.database.write() as session:
             job = _held(session, claim)
             if job is None or job.cancel:
-                return False
+                # A commit whose answer was lost may be tried again.
+                done = (JobRow.id == claim.job_id, JobRow.state == "succeeded", JobRow.folder == folder)
+                return session.scalar(select(JobRow.seq).where(*done)) is not None
             job.folder, job.store, job.summary = folder, store, summary
             job.bytes = sum(asset.size for asset in assets)
             for asset in assets:
@@ -125,14 +141,28 @@ class Leases:
 
     def fail(self, claim: Claim, state: str, reason: str, message: str) -> bool:
         """End a job otherwise: failed, crashed or cancelled."""
-        with self.database.write() as session:
-            job = _held(session, claim)
-            if job is None:
-                return False
-            finish_job(
-                session, job, "cancelled" if job.cancel else state, "cancelled" if job.cancel else reason, message
-            )
-            return True
+
+        def fail() -> bool:
+            with self.database.write() as session:
+                job = _held(session, claim)
+                if job is None:
+                    return False
+                ended = ("cancelled", "cancelled") if job.cancel else (state, reason)
+                finish_job(session, job, *ended, message)
+                return True
+
+        return self._patiently(fail)
+
+    def _patiently(self, work: Callable[[], T]) -> T:
+        """The result of `work`, tried again while a shared database is away, for as long as a lease lasts."""
+        until = time.monotonic() + self.lease_s
+        while True:
+            try:
+                return work()
+            except DBAPIError as error:
+                if not (self.database.shared and is_unreachable(error) and time.monotonic() < until):
+                    raise
+            time.sleep(RETRY_S)
 
     def release(self, claim: Claim, reason: str, counts: bool = True) -> None:
         """Put a job back into the queue: its process or its server was ended from outside."""
@@ -144,16 +174,20 @@ class Leases:
     def recover(self, owner: str | None = None, held: Collection[str] = ()) -> list[str]:
         """Requeue the jobs whose lease has ended, except those in `held`, which the caller runs itself; their ids.
 
-        With `owner` also those of every other owner: at the start, when the lock of the data folder proves that every
-        other owner is dead.
+        With `owner` also those of every other owner of the same data folder: at the start, when the lock of the folder
+        proves that they are dead. On a shared database others may live.
         """
         with self.database.write() as session:
-            now = self.database.now(session)
-            running = session.scalars(select(JobRow).where(JobRow.state.in_(("running", "cancelling")))).all()
+            ended = or_(JobRow.lease_until.is_(None), JobRow.lease_until <= self.database.now(session))
+            if owner is not None:
+                gone = JobRow.owner != owner
+                if self.database.shared:
+                    gone = gone & JobRow.owner.startswith(f"{instance_of(owner)}:", autoescape=True)
+                ended = or_(ended, gone)
+            query = select(JobRow).where(JobRow.state.in_(("running", "cancelling")), ended)
             found = []
-            for job in running:
-                ended = (job.lease_until or 0.0) <= now or (owner is not None and job.owner != owner)
-                if ended and job.id not in held:
+            for job in session.scalars(query.with_for_update(skip_locked=True)).all():
+                if job.id not in held:
                     self._again(session, job, "the server was gone", counts=True)
                     found.append(job.id)
             return found
@@ -167,6 +201,16 @@ class Leases:
             job.state = "queued"
             job.owner = job.lease_until = None
             record(session, job, "state", {"state": "queued", "reason": "requeued", "message": reason})
+
+
+def new_owner(instance: str) -> str:
+    """A name for the leases of a server or worker that starts now on the data folder `instance`."""
+    return f"{instance}:{uuid.uuid4().hex}"
+
+
+def instance_of(owner: str) -> str:
+    """The data folder of an owner of leases."""
+    return owner.partition(":")[0]
 
 
 def _next() -> Any:
@@ -197,18 +241,21 @@ def _next() -> Any:
         .where(JobRow.state == "queued")
         .order_by(running, func.coalesce(served, 0.0), JobRow.seq)
         .limit(1)
-        .with_for_update(skip_locked=True)
+        .with_for_update(skip_locked=True, of=JobRow)
     )
 
 
 def _held(session: Session, claim: Claim) -> JobRow | None:
+    """The job, if the claim still holds; nobody else changes it then until the transaction ends."""
     return session.scalar(
-        select(JobRow).where(
+        select(JobRow)
+        .where(
             JobRow.id == claim.job_id,
             JobRow.owner == claim.owner,
             JobRow.attempt == claim.attempt,
             JobRow.state.in_(("running", "cancelling")),
         )
+        .with_for_update()
     )
 
 

@@ -54,6 +54,7 @@ class Jobs:
         """
         digest = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
         with self.database.write() as session:
+            self.database.lock_tenant(session, who.tenant)
             known = None if key is None else session.get(IdempotencyRow, (who.tenant, key))
             if known is not None:
                 if known.sha256 != digest:
@@ -69,6 +70,7 @@ class Jobs:
     def rerun(self, who: Principal, job_id: str, request: dict[str, Any]) -> JobRow:
         """The job again, with what the caller made of its request."""
         with self.database.write() as session:
+            self.database.lock_tenant(session, who.tenant)
             old = _job(session, who, job_id)
             self._need_room(session, who)
             return self._insert(session, who, request, old.id)
@@ -115,7 +117,7 @@ class Jobs:
     def cancel(self, who: Principal, job_id: str) -> JobRow:
         """Ask for the end of a job. A waiting job is cancelled at once; a running one when its processes are dead."""
         with self.database.write() as session:
-            job = _job(session, who, job_id)
+            job = _job(session, who, job_id, lock=True)
             if job.state == "queued":
                 finish_job(session, job, "cancelled", "cancelled", "cancelled before it started")
             elif job.state == "running":
@@ -129,7 +131,8 @@ class Jobs:
         Raises ServiceError 409 while it is active, or while an active job extends its map.
         """
         with self.database.write() as session:
-            job = _job(session, who, job_id)
+            self.database.lock_tenant(session, who.tenant)
+            job = _job(session, who, job_id, lock=True)
             if job.state in ACTIVE:
                 raise conflict("active", f"the job is {job.state}; cancel it first")
             if base_job(session, job_id):
@@ -155,6 +158,7 @@ class Jobs:
                 _complete_file(session, who, request[name], name)
         if request.get("resume") is not None:
             _need_map(session, _job(session, who, request["resume"]))
+        self.database.lock(session, SEQ)
         job = JobRow(
             seq=_next_seq(session),
             id=str(uuid.uuid4()),
@@ -176,11 +180,14 @@ class Jobs:
         return job
 
 
+SEQ = "job.seq"
+
+
 def _next_seq(session: Session) -> int:
-    """A number that no job had, also none that was deleted: it is a cursor of clients. Needs a writing session."""
-    counter = session.get(CounterRow, "job.seq")
+    """A number that no job had, also none that was deleted: it is a cursor of clients. Needs the lock `SEQ`."""
+    counter = session.get(CounterRow, SEQ)
     if counter is None:
-        counter = CounterRow(name="job.seq", value=0)
+        counter = CounterRow(name=SEQ, value=0)
         session.add(counter)
     counter.value = max(counter.value, session.scalar(select(func.max(JobRow.seq))) or 0) + 1
     return counter.value
@@ -220,8 +227,10 @@ def _need_map(session: Session, job: JobRow) -> None:
         )
 
 
-def _job(session: Session, who: Principal, job_id: str) -> JobRow:
-    job = session.scalar(select(JobRow).where(JobRow.id == job_id, JobRow.tenant == who.tenant))
+def _job(session: Session, who: Principal, job_id: str, lock: bool = False) -> JobRow:
+    """A job of the principal; with `lock` nobody else changes it until the transaction ends."""
+    query = select(JobRow).where(JobRow.id == job_id, JobRow.tenant == who.tenant)
+    job = session.scalar(query.with_for_update() if lock else query)
     if job is None:
         raise not_found("job", job_id)
     return job

@@ -42,6 +42,7 @@ class Files:
             self.need_size(size)
         now = time.time()
         with self.database.write() as session:
+            self.database.lock_tenant(session, who.tenant)
             self._need_room(session, who, size or 0)
             taken = None if file_id is None else session.get(FileRow, file_id)
             if taken is not None:
@@ -49,7 +50,7 @@ class Files:
             row = FileRow(
                 id=file_id or str(uuid.uuid4()),
                 tenant=who.tenant,
-                name=name[:255] or "log",
+                name=name.replace("\0", "")[:255] or "log",
                 state="receiving",
                 size=size,
                 received=0,
@@ -96,7 +97,7 @@ class Files:
     def advance(self, file_id: str, received: int | None = None) -> None:
         """Write the number of bytes that are on the disk, if it has changed, and put off the upload's expiry."""
         with self.database.write() as session:
-            row = session.get(FileRow, file_id)
+            row = session.get(FileRow, file_id, with_for_update=True)
             if row is not None:
                 row.received = row.received if received is None else received
                 row.expires = time.time() + self.settings.upload_ttl_s
@@ -104,7 +105,7 @@ class Files:
     def complete(self, file_id: str, size: int, sha256: str) -> FileRow:
         """The file is whole. Raises ServiceError 404 if it was deleted meanwhile."""
         with self.database.write() as session:
-            row = session.get(FileRow, file_id)
+            row = session.get(FileRow, file_id, with_for_update=True)
             if row is None:
                 raise not_found("file", file_id)
             row.state, row.size, row.received, row.sha256, row.expires = "complete", size, size, sha256, None
@@ -115,6 +116,7 @@ class Files:
         if size is not None:
             self.need_size(size)
         with self.database.write() as session:
+            self.database.lock_tenant(session, who.tenant)
             row = _file(session, who, file_id)
             if row.state == "complete":
                 raise conflict("complete", "this upload is finished and cannot be changed")
@@ -126,6 +128,7 @@ class Files:
     def delete(self, who: Principal, file_id: str) -> None:
         """Remove an upload. Raises ServiceError 409 while an active job needs it."""
         with self.database.write() as session:
+            self.database.lock_tenant(session, who.tenant)
             row = _file(session, who, file_id)
             if file_id in needed_files(session):
                 raise conflict("in_use", "an active job needs this file; cancel it first")

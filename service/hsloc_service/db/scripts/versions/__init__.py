@@ -1,0 +1,1 @@
+"""One script for each schema of the database since 4."""

@@ -1,0 +1,88 @@
+"""A PostgreSQL of Debian's packages on a Unix socket, started by the tests; a database of its own for each of them."""
+
+from __future__ import annotations
+
+import os
+import pwd
+import shutil
+import subprocess
+import tempfile
+import uuid
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@cache
+def programs() -> Path | None:
+    """The folder with initdb and postgres; None where there is no PostgreSQL."""
+    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
+    on_path = shutil.which("initdb")
+    return found[-1].parent if found else Path(on_path).parent if on_path else None
+
+
+def need_postgresql() -> Path:
+    pytest.importorskip("psycopg", reason="POSTGRESQL IS NOT TESTED: pip install 'psycopg[binary]'")
+    found = programs()
+    if found is None:
+        pytest.skip("POSTGRESQL IS NOT TESTED: apt-get install postgresql")
+    return found
+
+
+class Server:
+    """A running PostgreSQL."""
+
+    def __init__(self, folder: Path, programs: Path) -> None:
+        self.folder, self._programs = folder, programs
+        self._user = None
+        if os.getuid() == 0:  # PostgreSQL does not run as root
+            self._user = "postgres"
+            found = pwd.getpwnam("postgres")
+            os.chown(folder, found.pw_uid, found.pw_gid)
+        self._run("initdb", "-D", str(folder / "db"), "-U", "hsloc", "--auth=trust", "--no-sync", "-E", "UTF8")
+
+    def start(self) -> None:
+        options = f"-k {self.folder} -c listen_addresses= -c fsync=off -c shared_buffers=16MB -c max_connections=200"
+        self._run("pg_ctl", "-D", str(self.folder / "db"), "-w", "-o", options, "-l", str(self.folder / "log"), "start")
+
+    def stop(self, mode: str = "fast") -> None:
+        self._run("pg_ctl", "-D", str(self.folder / "db"), "-w", "-m", mode, "stop")
+
+    def new_database(self) -> str:
+        """The URL of an empty database."""
+        name = f"test_{uuid.uuid4().hex}"
+        self._run("createdb", "-h", str(self.folder), "-U", "hsloc", name)
+        return f"postgresql://hsloc@/{name}?host={self.folder}"
+
+    def _run(self, program: str, *arguments: str) -> None:
+        subprocess.run(
+            [str(self._programs / program), *arguments],
+            user=self._user,
+            group=self._user,
+            extra_groups=[] if self._user else None,
+            cwd=self.folder,
+            env={"PATH": os.environ["PATH"], "LC_ALL": "C.UTF-8"},
+            check=True,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            timeout=120,
+        )
+
+
+@contextmanager
+def running() -> Iterator[Server]:
+    """A server that ends with the block. Its socket's path must be short."""
+    with tempfile.TemporaryDirectory(prefix="hsloc-pg-", ignore_cleanup_errors=True) as folder:
+        server = Server(Path(folder), need_postgresql())
+        server.start()
+        try:
+            yield server
+        finally:
+            server.stop("immediate")

@@ -19,6 +19,7 @@ from hsloc.analysis.metrics import (
     scan_counts,
 )
 from hsloc.analysis.quality import offset_warnings, quality_warnings, verdict_reasons
+from hsloc.analysis.scan_overlay import ScanOverlayBuilder
 from hsloc.analysis.scan_statistics import ConvergenceSample, ExtrinsicsCheck, Residuals
 from hsloc.analysis.second_pass import posed_events
 from hsloc.errors import EvaluationError
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.analysis.scan_overlay import ScanOverlay
     from hsloc.analysis.second_pass import PosedEvent
     from hsloc.evaluation import Comparison, RelationsResult
     from hsloc.replay.run import Result
@@ -53,7 +55,8 @@ class Analysis:
     `comparison` pairs the trajectory with the reference, and `odometry_alone` the odometry: None where there is no
     reference, or where they do not meet in time. `odometry` is the odometry in the frame of the map, moved as a whole
     to the trajectory's first localised pose. `convergence` holds, by heading, the median best fitness over the
-    evaluations of the search. Whatever shows errors over time uses these pairs: association happens here alone.
+    evaluations of the search. `overlay` are the scans to be looked at on the map.
+    Whatever shows errors over time uses these pairs: association happens here alone.
     """
 
     metrics: RunMetrics
@@ -61,6 +64,7 @@ class Analysis:
     odometry_alone: Comparison | None
     odometry: Trajectory | None
     convergence: Convergence
+    overlay: ScanOverlay
 
 
 def analyse(
@@ -80,12 +84,14 @@ def analyse(
     residuals = Residuals(result.grid)
     check = ExtrinsicsCheck(likelihood, matcher, scans, lasers)
     sample = ConvergenceSample(likelihood, matcher, scans)
+    overlay = ScanOverlayBuilder(residuals, scans, _not_matched(result))
     for posed in posed_events(result, progress):
         if observer is not None:
             observer(posed)
-        if posed.localised and isinstance(posed.event, PairedScan):
-            for statistics in (residuals, check, sample):
+        if isinstance(posed.event, PairedScan):
+            for statistics in (residuals, check, sample) if posed.localised else ():
                 statistics.add(posed.event.scan, posed.T_map_base)
+            overlay.add(posed.event.scan, posed.T_map_base)
     errors = _Errors(result, request.alignment or ("se2" if result.mode == "slam" else "none"))
     found = (*quality_warnings(result), *offset_warnings(result), *residuals.warnings(), *check.warnings())
     warnings = (*result.warnings, *found)
@@ -111,8 +117,19 @@ def analyse(
         relations=_relations(result),
     )
     return Analysis(
-        metrics, errors.whole, errors.odometry_alone, errors.odometry, sample.curves(request.matcher_name.upper())
+        metrics=metrics,
+        comparison=errors.whole,
+        odometry_alone=errors.odometry_alone,
+        odometry=errors.odometry,
+        convergence=sample.curves(request.matcher_name.upper()),
+        overlay=overlay.overlay(),
     )
+
+
+def _not_matched(result: Result) -> NDArray[np.int64]:
+    """Stamps of the scans that were refused or searched for, or ended a search."""
+    wanted = ("rejected", "searching", "relocalised")
+    return result.diagnostics.stamps_ns[np.isin(result.diagnostics.status, wanted)]
 
 
 def _likelihood(result: Result) -> LikelihoodField | None:

@@ -61,14 +61,19 @@ class Residuals:
         self._T_grid_map = grid.origin.inverse()
         self._by_laser: dict[str, NDArray[np.int64]] = {}
 
-    def add(self, scan: Scan, T_map_base: Pose2) -> None:
-        """Count the points of a scan; those outside the map count as far from any wall."""
+    def distances(self, scan: Scan, T_map_base: Pose2) -> NDArray[np.float32]:
+        """Distance of each point of a scan (n,) to the nearest occupied cell [m]; outside the map, the largest one."""
         local = (self._T_grid_map @ T_map_base) @ scan.points_base()
         cells = np.floor(local / self._grid.resolution).astype(np.int64)
         height, width = self._distance.shape
         inside = (cells[:, 0] >= 0) & (cells[:, 0] < width) & (cells[:, 1] >= 0) & (cells[:, 1] < height)
         distance = np.full(len(cells), _MAX_DISTANCE_M, dtype=np.float32)
         distance[inside] = self._distance[cells[inside, 1], cells[inside, 0]]
+        return distance
+
+    def add(self, scan: Scan, T_map_base: Pose2) -> None:
+        """Count the points of a scan; those outside the map count as far from any wall."""
+        distance = self.distances(scan, T_map_base)
         bins = np.minimum(distance / _BIN_M, _BINS - 1).astype(np.int64)
         counts = self._by_laser.setdefault(scan.frame_id, np.zeros(_BINS, dtype=np.int64))
         counts += np.bincount(bins, minlength=_BINS)

@@ -45,10 +45,11 @@ _OF_RESULTS = (("metrics.json", "config.yaml"), ("results.json", "report.md"))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WrittenResults:
-    """What was written: the analysis of the run, and its wall times."""
+    """What was written: the analysis of the run, its wall times, and what the reports show."""
 
     analysis: Analysis
     timings: RunTimings
+    parts: ReportParts
 
     @property
     def metrics(self) -> RunMetrics:
@@ -110,7 +111,18 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
             write_state(result.mapping.state, folder / STATE_FILE)
     write_json(folder / "metrics.json", analysis.metrics.to_json())
     (folder / "config.yaml").write_text(config_text(result), encoding="utf-8")
-    parts = ReportParts(
+    parts = report_parts(result, analysis)
+    draw_report(folder / "report.png", parts)
+    write_report_html(folder / "report.html", parts)
+    seconds["reports"] = time.perf_counter() - begin
+    timings = run_timings(result, seconds)
+    write_json(folder / "timings.json", timings.to_json())
+    return WrittenResults(analysis, timings, parts)
+
+
+def report_parts(result: Result, analysis: Analysis) -> ReportParts:
+    """What the reports show of a result."""
+    return ReportParts(
         title=" ".join(result.request.names()),
         trajectory=result.trajectory,
         localised=result.localised,
@@ -120,15 +132,13 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
         diagnostics=result.diagnostics,
         metrics=analysis.metrics,
         comparison=analysis.comparison,
+        states=None if result.states is None else tuple(str(state) for state in result.states.state),
+        covariances=result.pose_covariances(),
+        overlay=analysis.overlay,
+        mapping=result.mapping,
         provenance=provenance(result),
         convergence=analysis.convergence,
     )
-    draw_report(folder / "report.png", parts)
-    write_report_html(folder / "report.html", parts)
-    seconds["reports"] = time.perf_counter() - begin
-    timings = run_timings(result, seconds)
-    write_json(folder / "timings.json", timings.to_json())
-    return WrittenResults(analysis, timings)
 
 
 def write_states(path: Path, stamps_ns: NDArray[np.int64], rows: StateRows) -> None:

@@ -18,9 +18,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.analysis import ScanOverlay
     from hsloc.evaluation import Comparison
     from hsloc.model import OccupancyGrid, ScanDiagnostics, Trajectory
     from hsloc.run_metrics import RunMetrics
+    from hsloc.slam.result import MappingResult
 
     Floats = NDArray[np.float64]
 
@@ -66,6 +68,14 @@ class ReportParts:
     """Pairs of trajectory and reference, which give the error curves; without it there are no errors."""
     localised: NDArray[np.bool_] | None = None
     """Which poses (n,) are known; without it this is derived from the diagnostics."""
+    states: tuple[str, ...] | None = None
+    """State of each pose, of a localiser that judges them (n)."""
+    covariances: Floats | None = None
+    """Covariance (n, 3, 3) of each pose over x, y, theta (m^2, m rad, rad^2); NaN where unknown."""
+    overlay: ScanOverlay | None = None
+    """The scans, to be drawn on the map."""
+    mapping: MappingResult | None = None
+    """Loops and keyscans of a map that the run built."""
     points: Floats | None = None
     """Points (n, 2) that are drawn as a map [m]."""
     provenance: Provenance = field(default_factory=Provenance)
@@ -120,9 +130,7 @@ class Scans:
     fitness: Floats
     sigma_m: Floats
     sigma_deg: Floats
-    evaluations: NDArray[np.int64]
     xy: Floats
-    lost: tuple[tuple[float, float], ...]
 
     def where(self, *statuses: str) -> NDArray[np.bool_]:
         """Which scans have one of these statuses."""
@@ -146,6 +154,42 @@ class ReportData:
     reference: Floats | None
     errors: Errors | None
     scans: Scans | None
+    lost: tuple[tuple[float, float], ...] = ()
+    """Spans (begin, end) in which the pose was not known [s]."""
+    jumps: NDArray[np.bool_] | None = None
+    """Poses (n,) to which no line leads from the one before: the estimate jumped, or nothing was recorded between."""
+    reference_jumps: NDArray[np.bool_] | None = None
+    """The same of the reference."""
+    far: Curve | None = None
+    """Distance to the map that nine of ten points of each scan stay below [m]."""
+    is_built: bool = False
+    """Whether the map was built by the run."""
+
+
+_JUMP_M, _JUMP_SPEED = 0.5, 10.0
+"""A step that is longer than this [m] and would have needed this speed [m/s] is no motion of a ground robot."""
+_PAUSE_S, _PAUSE_STEPS = 2.0, 10.0
+"""A time without poses that is longer than this [s] and than this number of usual steps is a gap in the recording."""
+
+
+def jumps_of(stamps_ns: NDArray[np.int64], poses: Floats) -> NDArray[np.bool_]:
+    """Which of n poses (n, 3) the robot cannot have driven to, or is not known to have, from the one before."""
+    found = np.zeros(len(poses), dtype=bool)
+    if len(poses) < 2:
+        return found
+    seconds = np.diff(stamps_ns) / NS_PER_S
+    length = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    usual = float(np.median(np.abs(seconds)))
+    too_fast = length > _JUMP_SPEED * np.abs(seconds)
+    paused = np.abs(seconds) > max(_PAUSE_S, _PAUSE_STEPS * usual)
+    found[1:] = (length > _JUMP_M) & (too_fast | paused)
+    return found
+
+
+def with_gaps(xy: Floats, jumps: NDArray[np.bool_] | None) -> Floats:
+    """A path (n, 2) with a row of NaN before each jump."""
+    rows = np.zeros(0, dtype=np.intp) if jumps is None else np.flatnonzero(jumps)
+    return np.insert(xy, rows, np.nan, axis=0)
 
 
 def prepare(parts: ReportParts) -> ReportData:
@@ -157,7 +201,7 @@ def prepare(parts: ReportParts) -> ReportData:
     scans = None if diagnostics is None or not len(diagnostics) else _scans(diagnostics, trajectory, start_ns)
     if localised is None:
         localised = np.ones(len(trajectory), dtype=bool)
-        for begin, end in () if scans is None else scans.lost:
+        for begin, end in () if scans is None else _searched(scans):
             localised &= (seconds < begin) | (seconds >= end)
     T_map_reference = IDENTITY if comparison is None else comparison.T_reference_estimate.inverse()
     return ReportData(
@@ -170,7 +214,17 @@ def prepare(parts: ReportParts) -> ReportData:
         reference=None if reference is None else T_map_reference @ reference.poses[:, :2],
         errors=None if comparison is None else _errors(comparison, start_ns),
         scans=scans,
+        lost=_lost_spans(seconds, localised),
+        jumps=jumps_of(trajectory.stamps_ns, trajectory.poses),
+        reference_jumps=None if reference is None else jumps_of(reference.stamps_ns, reference.poses),
+        far=None if parts.overlay is None else _far(parts.overlay, start_ns),
+        is_built=parts.metrics is not None and parts.metrics.run.mode == "slam",
     )
+
+
+def _far(overlay: ScanOverlay, start_ns: int) -> Curve:
+    order = np.argsort(overlay.stamps_ns, kind="stable")
+    return Curve(_since(overlay.stamps_ns, start_ns)[order], overlay.far[order])
 
 
 def status_counts(scans: Scans) -> dict[str, int]:
@@ -233,17 +287,15 @@ def _scans(diagnostics: ScanDiagnostics, trajectory: Trajectory, start_ns: int) 
         fitness=diagnostics.fitness[order],
         sigma_m=np.hypot(sigma[:, 0], sigma[:, 1]),
         sigma_deg=np.degrees(sigma[:, 2]),
-        evaluations=diagnostics.evaluations[order],
         xy=xy,
-        lost=_lost_spans(seconds, status),
     )
 
 
-def _lost_spans(seconds: Floats, status: tuple[str, ...]) -> tuple[tuple[float, float], ...]:
+def _searched(scans: Scans) -> list[tuple[float, float]]:
     """From each first scan that did not know its pose to the next that did."""
     spans = []
     begin = None
-    for second, name in zip(seconds.tolist(), status, strict=True):
+    for second, name in zip(scans.seconds.tolist(), scans.status, strict=True):
         if name == Status.SEARCHING and begin is None:
             begin = second
         elif name != Status.SEARCHING and begin is not None:
@@ -251,4 +303,14 @@ def _lost_spans(seconds: Floats, status: tuple[str, ...]) -> tuple[tuple[float, 
             begin = None
     if begin is not None:
         spans.append((begin, float("inf")))
-    return tuple(spans)
+    return spans
+
+
+def _lost_spans(seconds: Floats, localised: NDArray[np.bool_]) -> tuple[tuple[float, float], ...]:
+    """From each first pose that is not known to the next that is, else to the last."""
+    order = np.argsort(seconds, kind="stable")
+    times, known = seconds[order], localised[order]
+    edges = np.flatnonzero(np.diff(np.concatenate(([True], known, [True])).astype(np.int8)))
+    return tuple(
+        (float(times[first]), float(times[min(end, len(times) - 1)])) for first, end in edges.reshape(-1, 2).tolist()
+    )

@@ -10,37 +10,23 @@ from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from hsloc.atomic_write import write_text_atomically
 from hsloc.evaluation.metrics import format_json
-from hsloc.model import Status
-from hsloc.report.data import Curve, prepare, reason_counts, status_counts
+from hsloc.report.data import prepare, reason_counts
 from hsloc.report.summary import ResultSummary
-from hsloc.report.svg import Chart, chart_svg, map_svg, timeline_html
 from hsloc.report.table import DASH, STATUS_WORDS, error_statistics
+from hsloc.report.view import data_url, view_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from numpy.typing import NDArray
-
     from hsloc.evaluation.error_metrics import ErrorMetrics
-    from hsloc.model import OccupancyGrid
     from hsloc.report.data import Provenance, ReportData, ReportParts
     from hsloc.run_metrics import LaserMetrics, RunMetrics
 
-    Floats = NDArray[np.float64]
-
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "sse", "count")
-STATUS_COLOURS: dict[str, str] = {
-    Status.MATCHED: "green",
-    Status.PREDICTED: "sky",
-    Status.REJECTED: "vermillion",
-    Status.NO_RETURNS: "orange",
-    Status.SEARCHING: "purple",
-    Status.RELOCALISED: "blue",
-}
+VIEWER_SCRIPTS = ("input.js", "charts.js", "view.js")
+"""Files of hsloc/report/viewer, in the order in which they are needed."""
 
 
 def write_report_html(path: str | Path, parts: ReportParts) -> None:
@@ -50,121 +36,23 @@ def write_report_html(path: str | Path, parts: ReportParts) -> None:
     """
     data, metrics = prepare(parts), parts.metrics
     summary = None if metrics is None else ResultSummary.of(metrics)
-    drawing, extent = map_svg(data, parts.grid, parts.points)
-    charts, end = time_charts(data, is_built=metrics is not None and metrics.run.mode == "slam"), _end(data)
+    view, png = view_of(parts, data)
+    if png is not None:
+        view["map"]["image"] = data_url(png)
     fragments = {
         "title": escape(parts.title),
         "head": "" if summary is None else _head(summary),
-        "map": drawing,
-        "aspect": f"{min(max(extent.aspect, 0.7), 3.0):.4g}",
-        "legend": _legend(data, parts.grid, parts.points),
         "figures": "" if summary is None else _figures(summary),
-        "charts": "".join(_figure(chart, end) for chart in charts) + _convergence(parts.convergence),
         "read": "" if metrics is None else _what_was_read(metrics),
-        "scans": _scans(data, end),
+        "scans": _scans(data),
         "statistics": "" if metrics is None else _statistics(metrics),
         "provenance": _provenance(parts.provenance),
         "metrics": "" if metrics is None else escape(format_json(metrics.to_json())),
-        "data": _script_json(_page_data(data, charts)),
-        "style": _template("report.css"),
-        "script": _template("report.js"),
+        "data": script_json(view),
+        "style": resource("viewer/view.css") + resource("templates/report.css"),
+        "script": viewer_script() + resource("templates/report.js"),
     }
-    write_text_atomically(Path(path), _fill(_template("report.html"), fragments))
-
-
-def time_charts(data: ReportData, is_built: bool = False) -> list[Chart]:
-    """All that is known over time: errors where there is truth, fitness, standard deviations, effort.
-
-    The standard deviations of a map that was built (`is_built`) are relative to its first pose.
-    """
-    of = ", relative to the first pose" if is_built else ""
-    charts = []
-    lost = () if data.scans is None else data.scans.lost
-    if data.errors is not None:
-        metres, angle = data.errors.translation_m, data.errors.rotation_deg
-        centimetres = Curve(metres.seconds, metres.values * 100.0)
-        charts.append(Chart("error_cm", "Translation error", "cm", centimetres, spans=lost))
-        charts.append(Chart("error_deg", "Rotation error", "deg", angle, spans=lost))
-    scans = data.scans
-    if scans is not None:
-        refused = scans.where(Status.REJECTED) & np.isfinite(scans.fitness)
-        fitness = Curve(scans.seconds, np.where(refused, np.nan, scans.fitness))
-        marks = Curve(scans.seconds[refused], scans.fitness[refused])
-        charts.append(Chart("fitness", "Fitness of the match", "", fitness, "green", 1.0, False, marks, lost))
-        sigma = Curve(scans.seconds, scans.sigma_m * 100.0)
-        charts.append(Chart("sigma_cm", f"Position, standard deviation{of}", "cm", sigma, "blue", spans=lost))
-        sigma = Curve(scans.seconds, scans.sigma_deg)
-        charts.append(Chart("sigma_deg", f"Heading, standard deviation{of}", "deg", sigma, "blue", spans=lost))
-        spent = Curve(scans.seconds, np.where(scans.evaluations > 0, scans.evaluations, np.nan))
-        charts.append(Chart("evaluations", "Fitness evaluations of the search", "", spent, "purple", spans=lost))
-    return [_without_gaps(chart) for chart in charts if np.isfinite(chart.curve.values).any()]
-
-
-def _without_gaps(chart: Chart) -> Chart:
-    """Without the NaN of scans that were not matched; where the pose was lost the line still breaks."""
-    curve = chart.curve
-    inside = np.zeros(len(curve.seconds), dtype=bool)
-    for begin, until in chart.spans:
-        inside |= (curve.seconds >= begin) & (curve.seconds < until)
-    keep = np.isfinite(curve.values) | inside
-    kept = Curve(curve.seconds[keep], curve.values[keep])
-    return Chart(
-        chart.name, chart.title, chart.unit, kept, chart.colour, chart.top, chart.from_zero, chart.marks, chart.spans
-    )
-
-
-def _end(data: ReportData) -> float:
-    scans = 0.0 if data.scans is None else float(data.scans.seconds.max(initial=0.0))
-    return max(data.duration_s, scans)
-
-
-def _figure(chart: Chart, end: float) -> str:
-    unit = f' <span class="muted">{escape(chart.unit)}</span>' if chart.unit else ""
-    return (
-        f"<figure><figcaption>{escape(chart.title)}{unit}"
-        f'<output data-for="{escape(chart.name)}"></output></figcaption>{chart_svg(chart, end)}</figure>'
-    )
-
-
-def _convergence(convergence: Mapping[str, tuple[Floats, Floats]]) -> str:
-    parts = []
-    for index, (name, (evaluations, fitness)) in enumerate(convergence.items()):
-        curve = Curve(np.asarray(evaluations, dtype=np.float64), np.asarray(fitness, dtype=np.float64))
-        if len(curve.seconds):
-            title, unit = f"Convergence: {name}", "median best fitness over evaluations"
-            chart = Chart(f"convergence{index}", title, unit, curve, "green", 1.0, False, over_time=False)
-            parts.append(_figure(chart, float(curve.seconds.max())))
-    return "".join(parts)
-
-
-def _legend(data: ReportData, grid: OccupancyGrid | None, points: Floats | None) -> str:
-    entries = [
-        ("map", "map", grid is not None),
-        ("points", "map points", points is not None and len(points) > 0),
-        ("trajectory", "trajectory", len(data.path) > 0),
-        ("reference", "reference", data.reference is not None and len(data.reference) > 0),
-        ("odometry", "odometry alone", data.odometry is not None and len(data.odometry) > 0),
-    ]
-    if data.scans is not None:
-        for status, label in (
-            (Status.REJECTED, "scan rejected"),
-            (Status.NO_RETURNS, "scan without returns"),
-            (Status.RELOCALISED, "pose found"),
-        ):
-            entries.append((str(status), label, bool(data.scans.where(status).any())))
-    return (
-        "".join(
-            f'<label><input type="checkbox" checked data-toggle="{name}"><i class="key {name}"></i>{label}</label>'
-            for name, label, there in entries
-            if there
-        )
-        + (
-            '<span><i class="key start"></i>start</span><span><i class="key end"></i>end</span>'
-            if len(data.path)
-            else ""
-        )
-        + ('<span><i class="key guessed"></i>pose unknown</span>' if not data.localised.all() else "")
-    )
+    write_text_atomically(Path(path), fill(resource("templates/report.html"), fragments))
 
 
 def _head(summary: ResultSummary) -> str:
@@ -202,16 +90,11 @@ def _figures(summary: ResultSummary) -> str:
     )
 
 
-def _scans(data: ReportData, end: float) -> str:
+def _scans(data: ReportData) -> str:
+    """Why scans were not used."""
     scans = data.scans
     if scans is None:
         return ""
-    counts = status_counts(scans)
-    spacing = float(np.median(np.diff(scans.seconds))) if len(scans.seconds) > 1 else 1.0
-    rows = [
-        (STATUS_WORDS.get(name, name), count, STATUS_COLOURS.get(name, "blue"), scans.seconds[scans.where(name)])
-        for name, count in counts.items()
-    ]
     table = "".join(
         f'<tr><th scope="row">{escape(STATUS_WORDS.get(status, status))}</th>'
         f'<td class="words">{escape(reason) or "no reason given"}</td><td>{count}</td></tr>'
@@ -223,7 +106,7 @@ def _scans(data: ReportData, end: float) -> str:
         if table
         else "<p>Every scan was used.</p>"
     )
-    return f"<section><h2>Scans</h2>{timeline_html(rows, spacing, end)}{why}</section>"
+    return f"<section><h2>Scans that were not used</h2>{why}</section>"
 
 
 def _statistics(metrics: RunMetrics) -> str:
@@ -293,37 +176,22 @@ def _provenance(provenance: Provenance) -> str:
     return f"<section><h2>To repeat this run</h2>{''.join(parts)}</section>" if parts else ""
 
 
-def _page_data(data: ReportData, charts: list[Chart]) -> dict[str, object]:
-    """What the script reads under the pointer: the curves, and where the robot was."""
-    order = np.argsort(data.seconds, kind="stable")
-    order = order[:: max(1, len(order) // 3000)]
-    thin = {chart.name: chart.curve.thinned(1500) for chart in charts}
-    return {
-        "charts": {
-            chart.name: {
-                "t": _short(thin[chart.name].seconds), "v": _short(thin[chart.name].values), "unit": chart.unit
-            }
-            for chart in charts
-        },
-        "path": {"t": _short(data.seconds[order]), "x": _short(data.path[order, 0]), "y": _short(data.path[order, 1])},
-    }  # fmt: skip
-
-
-def _short(values: Floats) -> list[float | None]:
-    """Seven figures are enough to read."""
-    return [float(f"{value:.7g}") if value == value else None for value in values.tolist()]
-
-
-def _script_json(values: dict[str, object]) -> str:
+def script_json(values: Mapping[str, object]) -> str:
     """JSON that cannot end the <script> element around it."""
     text = json.dumps(values, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _template(name: str) -> str:
-    return (files("hsloc.report") / "templates" / name).read_text(encoding="utf-8")
+def viewer_script() -> str:
+    """The code that draws a view, which the service's page loads as files."""
+    return "".join(resource(f"viewer/{name}") for name in VIEWER_SCRIPTS)
 
 
-def _fill(template: str, fragments: Mapping[str, str]) -> str:
+def resource(name: str) -> str:
+    """The text of a file beside this module."""
+    return files("hsloc.report").joinpath(*name.split("/")).read_text(encoding="utf-8")
+
+
+def fill(template: str, fragments: Mapping[str, str]) -> str:
     """Put each fragment in the place of its {{name}}, in one pass: what a fragment holds is never a place."""
     return re.sub(r"\{\{(\w+)\}\}", lambda found: fragments[found[1]], template)

@@ -12,9 +12,10 @@ from matplotlib.figure import Figure
 
 from hsloc.atomic_write import write_atomically
 from hsloc.report import style
+from hsloc.report.charts import Chart, run_charts
 from hsloc.report.data import prepare
 from hsloc.report.map_image import Extent, shown_extent
-from hsloc.report.png_panels import Panel, draw_map, draw_panel, draw_table, time_panels
+from hsloc.report.png_panels import draw_map, draw_panel, draw_table
 from hsloc.report.summary import ResultSummary
 
 if TYPE_CHECKING:
@@ -32,6 +33,9 @@ LEFT, LEFT_OF_AXES, RIGHT, BOTTOM, TOP = 0.015, 0.05, 0.985, 0.06, 0.88
 
 LINE = 0.031
 """Height of a line of the table, as a part of the picture's."""
+
+MOST_PANELS = 3
+"""Curves that are shown, the most important first."""
 
 WIDE = 2.1
 """From this ratio of width to height on, the map takes the whole width, and the rest is below it."""
@@ -67,7 +71,7 @@ def report_figure(parts: ReportParts) -> Figure:
     FigureCanvasAgg(figure)
     data, summary = prepare(parts), None if parts.metrics is None else ResultSummary.of(parts.metrics)
     rows = [] if summary is None else list(summary.figures)
-    extent, panels = shown_extent(data, parts.grid, parts.points), time_panels(data)
+    extent, panels = shown_extent(data, parts.grid, parts.points), run_charts(data)[:MOST_PANELS]
     left, bottom, width, height = _place(figure, extent, panels, rows, data)
     axes = figure.add_axes((left, bottom, width, height))
     shown = extent.widened(width * WIDTH / (height * HEIGHT))
@@ -128,7 +132,7 @@ def _fit(line: Text, texts: list[str], width: float) -> None:
 Box = tuple[float, float, float, float]
 
 
-def _place(figure: Figure, extent: Extent, panels: list[Panel], rows: list[Row], data: ReportData) -> Box:
+def _place(figure: Figure, extent: Extent, panels: list[Chart], rows: list[Row], data: ReportData) -> Box:
     """Draw panels and table beside the map or below it; returns the box that is left for the map."""
     if not panels and not rows:
         return LEFT_OF_AXES, BOTTOM, RIGHT - LEFT_OF_AXES, TOP - BOTTOM
@@ -148,7 +152,7 @@ def _place(figure: Figure, extent: Extent, panels: list[Panel], rows: list[Row],
     return LEFT_OF_AXES, BOTTOM, width, TOP - BOTTOM
 
 
-def _draw_panels(figure: Figure, panels: list[Panel], data: ReportData, box: Box) -> None:
+def _draw_panels(figure: Figure, panels: list[Chart], data: ReportData, box: Box) -> None:
     """The panels one below the other; their headings are within the box, the time of the last below it."""
     left, bottom, width, height = box
     heading = 0.036

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import floor, log10
 from typing import TYPE_CHECKING
 
@@ -13,15 +12,17 @@ from matplotlib.transforms import Affine2D
 
 from hsloc.model import Status
 from hsloc.report import style
-from hsloc.report.data import LOG_ABOVE, Curve
+from hsloc.report.data import Curve, with_gaps
 from hsloc.report.map_image import line_width, picture_of
-from hsloc.report.polyline import joined, pieces_of
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
     from hsloc.model import OccupancyGrid
+    from hsloc.report.charts import Chart
     from hsloc.report.data import ReportData
     from hsloc.report.map_image import Extent
 
@@ -80,11 +81,16 @@ def _draw_paths(axes: Axes, data: ReportData, width: float, pixel: float) -> Non
         return joined(pieces_of(xy, 0.5 * pixel))
 
     if len(data.path):
-        known = seen(np.where(data.localised[:, None], data.path, np.nan))
+        known = seen(with_gaps(np.where(data.localised[:, None], data.path, np.nan), data.jumps))
         axes.plot(*known.T, color=style.BLUE, linewidth=width, label="trajectory", zorder=5, solid_capstyle="round")
     if data.reference is not None and len(data.reference):
         axes.plot(
-            *seen(data.reference).T, color="black", linewidth=1.0, linestyle=(0, (5, 3)), label="reference", zorder=6
+            *seen(with_gaps(data.reference, data.reference_jumps)).T,
+            color="black",
+            linewidth=1.0,
+            linestyle=(0, (5, 3)),
+            label="reference",
+            zorder=6,
         )
     if data.odometry is not None and len(data.odometry):
         axes.plot(
@@ -92,7 +98,7 @@ def _draw_paths(axes: Axes, data: ReportData, width: float, pixel: float) -> Non
             label="odometry alone", zorder=3,
         )  # fmt: skip
     if not data.localised.all():
-        guessed = seen(np.where(data.localised[:, None], np.nan, data.path))
+        guessed = seen(with_gaps(np.where(data.localised[:, None], np.nan, data.path), data.jumps))
         axes.plot(
             *guessed.T, color=style.PURPLE, linewidth=2.0, linestyle=(0, (0.8, 1.2)), label="pose unknown", zorder=4
         )
@@ -171,49 +177,17 @@ _GAP_PIXELS = 10.0
 """Between a label of the table and its value."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Panel:
-    """One quantity over time: its heading, curve, and the colour of its line."""
-
-    title: str
-    curve: Curve
-    colour: str = style.BLUE
-    is_fitness: bool = False
-
-
-def time_panels(data: ReportData) -> list[Panel]:
-    """With truth: both errors and fitness. Without: fitness and what the estimator itself believes (sigma)."""
-    panels = []
-    if data.errors is not None:
-        metres, degrees = data.errors.translation_m, data.errors.rotation_deg
-        panels.append(Panel("translation error [cm]", Curve(metres.seconds, metres.values * 100.0)))
-        panels.append(Panel("rotation error [deg]", degrees))
-    scans = data.scans
-    if scans is not None:
-        if data.errors is None:
-            panels.append(Panel("position, standard deviation [cm]", Curve(scans.seconds, scans.sigma_m * 100.0)))
-            panels.append(Panel("heading, standard deviation [deg]", Curve(scans.seconds, scans.sigma_deg)))
-        accepted = np.where(scans.where(Status.REJECTED), np.nan, scans.fitness)
-        panels.append(Panel("fitness of the match", Curve(scans.seconds, accepted), style.GREEN, True))
-    return [panel for panel in panels if np.isfinite(panel.curve.values).any()]
-
-
-def draw_panel(axes: Axes, panel: Panel, data: ReportData, *, with_time: bool) -> None:
-    """One panel; `with_time` writes the time under it."""
+def draw_panel(axes: Axes, chart: Chart, data: ReportData, *, with_time: bool) -> None:
+    """One curve over time; `with_time` writes the time under it."""
     unit, factor = ("min", 60.0) if data.duration_s > 300.0 else ("s", 1.0)
-    lost = () if data.scans is None else data.scans.lost
-    curve = _known(panel.curve, lost).thinned(MOST_POINTS)
+    curve = chart.curve.thinned(MOST_POINTS)
     curve = Curve(curve.seconds / factor, curve.values)
-    end = max(data.duration_s, float(panel.curve.seconds.max(initial=0.0))) / factor
-    if panel.is_fitness:
-        _draw_fitness(axes, curve, data, factor)
-    else:
-        _draw_line(axes, curve, panel.colour)
-    for begin, until in lost:
-        axes.axvspan(
-            begin / factor, min(until / factor, end), facecolor=style.PURPLE, alpha=0.22, linewidth=0, zorder=0
-        )
-    axes.set_title(panel.title, loc="left", fontsize=style.TEXT, color=style.INK, pad=4)
+    end = max(data.duration_s, float(chart.curve.seconds.max(initial=0.0))) / factor
+    _draw_line(axes, curve, chart)
+    for begin, until in data.lost:
+        axes.axvspan(begin / factor, until / factor, facecolor=style.PURPLE, alpha=0.22, linewidth=0, zorder=0)
+    title = f"{chart.title} [{chart.unit}]" if chart.unit else chart.title
+    axes.set_title(title, loc="left", fontsize=style.TEXT, color=style.INK, pad=4)
     axes.set_xlim(0.0, end if end > 0.0 else 1.0)
     axes.grid(axis="y", color=style.RULE, linewidth=0.7)
     axes.set_axisbelow(True)
@@ -228,45 +202,22 @@ def draw_panel(axes: Axes, panel: Panel, data: ReportData, *, with_time: bool) -
         axes.tick_params(labelbottom=False)
 
 
-def _known(curve: Curve, lost: tuple[tuple[float, float], ...]) -> Curve:
-    """The curve without its NaN, but with one where the pose was lost and nothing known: the line breaks there."""
-    known = np.isfinite(curve.values)
-    seconds, values = curve.seconds[known], curve.values[known]
-    for begin, until in lost:
-        if not ((seconds >= begin) & (seconds < until)).any():
-            row = int(np.searchsorted(seconds, begin))
-            seconds, values = np.insert(seconds, row, begin), np.insert(values, row, np.nan)
-    return Curve(seconds, values)
-
-
-def _draw_line(axes: Axes, curve: Curve, colour: str) -> None:
+def _draw_line(axes: Axes, curve: Curve, chart: Chart) -> None:
+    if not np.isfinite(curve.values).any():
+        return
     middle, top = float(np.nanmedian(curve.values)), float(np.nanmax(curve.values))
-    if middle > 0.0 and top > LOG_ABOVE * middle:
+    if chart.is_logarithmic:
         axes.set_yscale("log")
         floor = max(float(np.nanpercentile(curve.values, 1.0)), middle / 30.0)
         axes.set_ylim(floor, top * 1.4)
         axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())
         axes.tick_params(which="minor", length=0)
-        axes.plot(curve.seconds, np.maximum(curve.values, floor), color=colour, linewidth=1.1)
+        axes.plot(curve.seconds, np.maximum(curve.values, floor), color=style.BLUE, linewidth=1.1)
         return
-    axes.fill_between(curve.seconds, 0.0, curve.values, color=colour, alpha=0.13, linewidth=0)
-    axes.plot(curve.seconds, curve.values, color=colour, linewidth=1.1)
+    axes.fill_between(curve.seconds, 0.0, curve.values, color=style.BLUE, alpha=0.13, linewidth=0)
+    axes.plot(curve.seconds, curve.values, color=style.BLUE, linewidth=1.1)
     axes.set_ylim(0.0, top * 1.08 if top > 0.0 else 1.0)
-    axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
-
-
-def _draw_fitness(axes: Axes, curve: Curve, data: ReportData, factor: float) -> None:
-    axes.plot(curve.seconds, curve.values, color=style.GREEN, linewidth=1.0)
-    low = float(np.nanmin(curve.values))
-    if data.scans is not None:
-        refused = data.scans.where(Status.REJECTED) & np.isfinite(data.scans.fitness)
-        low = min(low, float(data.scans.fitness[refused].min(initial=1.0)))
-        axes.plot(
-            data.scans.seconds[refused] / factor, data.scans.fitness[refused], "x", color=style.VERMILLION,
-            markersize=5.0, markeredgewidth=1.4,
-        )  # fmt: skip
-    axes.set_ylim(max(0.0, low - 0.08), 1.0)
     axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
 
 
@@ -292,3 +243,48 @@ def draw_table(axes: Axes, rows: list[Row], *, line_height: float) -> None:
                 text.set_y(y)
                 text.set_fontsize(style.TEXT * min(0.95 * axes.bbox.width / text.get_window_extent().width, 1.0))
         y -= line_height
+
+
+_BLOCK = 4096
+"""Points of a path that are Python's numbers at a time."""
+_BREAK = (float("nan"), float("nan"))
+
+
+def pieces_of(xy: Floats, finest: float) -> list[Floats]:
+    """A path (n, 2) in pieces (m, 2) where NaN breaks it, without points closer than `finest` to the last one kept.
+
+    Distances are taken along the axes; the first and the last point of a piece are always kept.
+    """
+    pieces: list[list[tuple[float, float]]] = [[]]
+    last = _BREAK
+    for x, y in _points(xy):
+        piece = pieces[-1]
+        if x != x or y != y:
+            if piece:
+                _end(piece, last)
+                pieces.append([])
+            continue
+        last = (x, y)
+        if not piece or abs(x - piece[-1][0]) + abs(y - piece[-1][1]) >= finest:
+            piece.append(last)
+    if pieces[-1]:
+        _end(pieces[-1], last)
+    return [np.array(piece) for piece in pieces if piece]
+
+
+def joined(pieces: list[Floats]) -> Floats:
+    """The pieces as one path again, NaN between them."""
+    gap = np.array([_BREAK])
+    parts = [part for piece in pieces for part in (piece, gap)]
+    return np.concatenate(parts[:-1]) if parts else gap[:0]
+
+
+def _end(piece: list[tuple[float, float]], last: tuple[float, float]) -> None:
+    if piece[-1] != last:
+        piece.append(last)
+
+
+def _points(xy: Floats) -> Iterator[tuple[float, float]]:
+    """Block by block: all points of a long run as Python's numbers would take ten times their memory."""
+    for at in range(0, len(xy), _BLOCK):
+        yield from xy[at : at + _BLOCK].tolist()

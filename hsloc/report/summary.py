@@ -34,6 +34,8 @@ class ResultSummary:
 
     verdict: Verdict
     """good, check or failed."""
+    mode: str
+    """localise or slam."""
     headline: str
     """What was found, in one sentence."""
     key_figures: tuple[Row, ...]
@@ -58,6 +60,7 @@ class ResultSummary:
         key_figures = [by_label[name] for name in names if name in by_label]
         return ResultSummary(
             verdict=metrics.verdict,
+            mode=metrics.run.mode,
             headline=_headline(metrics),
             key_figures=tuple(key_figures[:_MOST_KEY_FIGURES]),
             figures=tuple(rows),
@@ -72,14 +75,21 @@ class ResultSummary:
         return f"{self.verdict}: {VERDICT_WORDS[self.verdict]}"
 
     def to_json(self) -> dict[str, Any]:
-        """For the web page: figures as {name, values, explanation}, the names of the key figures, texts."""
+        """For the web page: figures as {name, values, numbers, explanation}, the names of the key figures, texts."""
         return {
             "verdict": str(self.verdict),
+            "mode": self.mode,
             "verdict_text": self.verdict_text,
             "headline": self.headline,
             "key_figures": [row.label for row in self.key_figures],
             "figures": [
-                {"name": row.label, "values": list(row.values), "explanation": row.explanation} for row in self.figures
+                {
+                    "name": row.label,
+                    "values": list(row.values),
+                    "numbers": list(row.numbers),
+                    "explanation": row.explanation,
+                }
+                for row in self.figures
             ],
             "reasons": list(self.reasons),
             "warnings": list(self.warnings),

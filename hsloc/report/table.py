@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import degrees, isfinite
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hsloc.model import Status
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from hsloc.evaluation import PoseStatistics, Statistics
     from hsloc.model.verdict import VerdictReason
     from hsloc.run_metrics import MapMetrics, RunMetrics, ScanCounts
@@ -39,11 +41,24 @@ class Row:
     """What the figure is and what is usual, in a sentence or two."""
     sources: tuple[str, ...] = ()
     """Where metrics.json holds the numbers, as JSON pointers without the first slash: `ape/trans_part/rmse`."""
+    numbers: tuple[float | None, ...] = ()
+    """These numbers, in the units of metrics.json."""
 
 
 def table_rows(metrics: RunMetrics) -> list[Row]:
     """The most important figures: those with two columns first, then those with one."""
-    return [*_error_rows(metrics), *_single_rows(metrics)]
+    values = metrics.to_json()
+    return [_with_numbers(row, values) for row in (*_error_rows(metrics), *_single_rows(metrics))]
+
+
+def _with_numbers(row: Row, values: Mapping[str, Any]) -> Row:
+    numbers = []
+    for source in row.sources:
+        found: Any = values
+        for key in source.split("/"):
+            found = found[key]
+        numbers.append(found)
+    return replace(row, numbers=tuple(numbers))
 
 
 def format_length(metres: float | None) -> str:
@@ -216,7 +231,12 @@ def scan_rows(scans: ScanCounts) -> list[Row]:
             "so the scan was not needed; this is no fault."
         )
         rows.append(
-            Row("scans not matched", (words,), explanation, tuple(f"scans/by_status/{name}" for name in unused))
+            Row(
+                "scans not matched",
+                (words,),
+                explanation,
+                tuple(f"scans/by_status/{name}" for name in unused if name in known),
+            )
         )
     return rows
 

@@ -83,7 +83,9 @@ class MappingResult:
     grid: OccupancyGrid
     graph: PoseGraph
     loops: tuple[Loop, ...]
-    """All that were searched for, accepted or not."""
+    """All that were searched for, accepted or not: pairs of submaps."""
+    submap_references: NDArray[np.int64]
+    """Row of `keyscan_poses` that is the frame of each submap, shape (m,)."""
     quality: MappingQuality
     calibration: OdometryCalibration
     """What the map says of the odometry."""

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hsloc.report.polyline import joined, pieces_of
+from hsloc.report.png_panels import joined, pieces_of
 
 NAN = float("nan")
 

@@ -17,10 +17,11 @@ from hsloc.evaluation.map_quality import MapComparison
 from hsloc.evaluation.metrics import compare
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
 from hsloc.model.pose2 import compose_poses
-from hsloc.report.data import Curve, ReportParts, prepare, reason_counts, status_counts
+from hsloc.report.charts import run_charts
+from hsloc.report.data import Curve, ReportParts, jumps_of, prepare, reason_counts, status_counts, with_gaps
 from hsloc.report.map_image import darkest_of_blocks, grey_levels, line_width, shown_extent
 from hsloc.report.png import draw_report
-from hsloc.report.png_panels import format_round_length, round_length, time_panels
+from hsloc.report.png_panels import format_round_length, round_length
 from hsloc.report.table import format_angle, format_duration, format_length, table_rows
 from hsloc.run_metrics import MapMetrics, ResidualMetrics
 
@@ -159,13 +160,25 @@ def test_an_aligned_reference_is_drawn_over_the_trajectory(run: Any) -> None:
 
 
 def test_lost_spans_and_counts(run: Any) -> None:
-    scans = parts(run["trajectory"], diagnostics=run["diagnostics"]).scans
-    ((begin, until),) = scans.lost
+    data = parts(run["trajectory"], diagnostics=run["diagnostics"])
+    scans = data.scans
+    ((begin, until),) = data.lost
     assert (begin, until) == pytest.approx((10.0, 15.0), abs=0.3)
     counts = status_counts(scans)
     assert sum(counts.values()) == len(run["diagnostics"])
     assert counts["searching"] == scans.where("searching").sum() > 0
     assert ("rejected", "fitness 0.41 below 0.55", counts["rejected"]) in reason_counts(scans)
+
+
+def test_no_line_leads_to_where_the_robot_cannot_have_driven() -> None:
+    stamps = np.array([0, 100, 200, 300, 9000, 9100], dtype=np.int64) * 1_000_000
+    x = np.array([0.0, 0.1, 4.0, 4.1, 4.2, 4.3])
+    poses = np.column_stack((x, np.zeros(6), np.zeros(6)))
+    # Four metres in a tenth of a second are a jump; a robot that stood still while nothing was recorded made none.
+    assert jumps_of(stamps, poses).tolist() == [False, False, True, False, False, False]
+    poses[4:, 0] += 2.0
+    assert np.flatnonzero(jumps_of(stamps, poses)).tolist() == [2, 4]
+    assert np.isnan(with_gaps(poses[:, :2], jumps_of(stamps, poses))[2]).all()
 
 
 def test_reasons_that_differ_in_figures_are_one(run: Any) -> None:
@@ -182,7 +195,7 @@ def test_the_curves_are_the_errors(run: Any) -> None:
     data = parts(run["trajectory"], reference=run["reference"], comparison=run["comparison"])
     rmse = float(np.sqrt(np.mean(data.errors.translation_m.values**2)))
     assert rmse == pytest.approx(run["metrics"].errors.ape.trans_part.rmse)
-    assert [panel.title for panel in time_panels(data)] == ["translation error [cm]", "rotation error [deg]"]
+    assert [chart.title for chart in run_charts(data)] == ["Translation error", "Rotation error"]
 
 
 def test_thinning_keeps_every_peak() -> None:

@@ -17,6 +17,7 @@ from paths import RECORDINGS
 
 from hsloc.errors import MapError
 from hsloc.maps.metadata import read_metadata
+from hsloc.report.view import MOST_POSES
 from hsloc_service.execution.worker import linked_map
 from hsloc_service.settings import Settings
 
@@ -57,9 +58,9 @@ def test_the_result_is_that_of_hsloc_replay_byte_for_byte(
         ours = client.get(f"/v1/jobs/{job}/results/{name}").content
         assert without_command(name, ours) == without_command(name, (tmp_path / "out" / name).read_bytes()), name
     viewer = client.get(f"/v1/jobs/{job}/results/viewer.json").json()
-    assert len(viewer["trajectory"]["x"]) == len(viewer["trajectory"]["t"]) <= 3000
+    assert len(viewer["trajectory"]["x"]) == len(viewer["trajectory"]["t"]) <= MOST_POSES + 1
     ape = ended["summary"]["metrics"]["ape"]["trans_part"]
-    assert max(viewer["errors"]["position"]) <= ape["max"] + 2e-3
+    assert max(viewer["charts"][0]["v"]) == pytest.approx(100.0 * ape["max"], rel=1e-4)
 
 
 def chunk(compression: bytes, claimed: int, data: bytes) -> bytes:

@@ -17,6 +17,7 @@ from test_leases import Parts
 from hsloc_service.auth import ANYBODY
 from hsloc_service.db.tables import JobRow
 from hsloc_service.errors import ServiceError
+from hsloc_service.jobs.repository import JobFilter
 from hsloc_service.results.store import Asset
 
 if TYPE_CHECKING:
@@ -195,7 +196,7 @@ class Histories(RuleBasedStateMachine):
 
     @invariant()
     def the_database_says_the_same(self) -> None:
-        rows = {row.id: row for row in self.parts.jobs.list(ANYBODY, limit=1000)}
+        rows = {row.id: row for row in self.parts.jobs.list(ANYBODY, JobFilter(), limit=1000)}
         assert set(rows) == {job for job, model in self.models.items() if not model.deleted}
         for job, row in rows.items():
             model = self.models[job]

@@ -76,6 +76,9 @@ def picture(page: Any, name: str) -> None:
         page.screenshot(path=f"{folder}/{name}.png", full_page=True)
 
 
+MAP, CHART = "#view .rv-base", "#charts .rv-chart canvas"
+
+
 def inked(page: Any, selector: str) -> int:
     """How many different colours a canvas shows."""
     script = """(s) => { const c = document.querySelector(s); const d = c.getContext('2d').getImageData(
@@ -96,14 +99,18 @@ def test_upload_watch_look_download(
     page.click("#go")
     page.wait_for_selector("#job-state .running")
     picture(page, "2-running")
-    page.wait_for_selector("#job-state .succeeded")
+    page.wait_for_selector("#job-state .succeeded", timeout=120_000)
     page.wait_for_selector("#result:not([hidden])")
-    page.wait_for_function("() => document.querySelector('#time-text').textContent !== ''")
+    page.wait_for_function("() => document.querySelector('.rv-now')?.textContent")
     assert page.text_content("#job-title") == NASTY
     assert page.locator("#jobs img, #job img").count() == 0
-    assert inked(page, "#view") > 5
-    assert inked(page, "#plot") > 3
+    assert inked(page, MAP) > 5
+    assert inked(page, CHART) > 3
     assert re.search(r"APE rmse\d+\.\d+ cm, \d+\.\d+°", page.text_content("#metrics") or "")
+    assert (page.text_content("#headline") or "").startswith(
+        "good Localised on the map of the log: every pose is known"
+    )
+    assert page.locator("#key-figures div").count() == 3
     picture(page, "3-result")
     with page.expect_download() as download:
         page.click("text=trajectory.tum")
@@ -117,15 +124,35 @@ def test_upload_watch_look_download(
     look_around_by_mouse(page)
     picture(page, "4-zoomed")
     look_on_a_phone_in_the_dark(page)
+    first = page.url
     press(page, "#job-buttons button >> text=Run again")
-    page.wait_for_function("() => document.querySelectorAll('#jobs li').length === 2")
+    page.wait_for_function("(first) => location.href !== first", arg=first)
+    page.wait_for_selector("#job-state .succeeded", timeout=120_000)
     page.wait_for_selector("#result:not([hidden])")
-    assert page.text_content("#job-state") == "succeeded"
+    page.go_back()  # to the first result
+    page.wait_for_selector("#result:not([hidden])")
+    assert page.url == first
+    page.click("text=← all jobs")
+    page.wait_for_function("() => document.querySelectorAll('#jobs tbody tr').length === 2")
+    compare_two(page)
 
 
-def drawn(page: Any, selector: str = "#view") -> str:
-    """What a canvas shows."""
-    return str(page.evaluate("(s) => document.querySelector(s).toDataURL()", selector))
+def compare_two(page: Any) -> None:
+    for box in page.locator("#jobs tbody input").all():
+        box.check()
+    page.click("#compare-ticked")
+    page.wait_for_selector("#comparison .rv-base")
+    picture(page, "8-compare")
+    assert inked(page, "#comparison .rv-base") > 5
+    rows = page.locator("#comparison table tr").all_text_contents()
+    assert any(re.fullmatch(r"APE rmse(\d+\.\d+ cm / \d+\.\d+°){2}", row) for row in rows)  # the same run: no change
+
+
+def drawn(page: Any, selector: str = MAP) -> str:
+    """What a canvas shows, when the frame that was asked for is drawn."""
+    script = """(s) => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(
+      () => done(document.querySelector(s).toDataURL()))))"""
+    return str(page.evaluate(script, selector))
 
 
 def press(page: Any, selector: str) -> None:
@@ -140,7 +167,7 @@ def press(page: Any, selector: str) -> None:
 
 
 def look_around_by_keyboard(page: Any) -> None:
-    page.focus("#view")
+    page.focus("#view .rv-over")
     page.keyboard.press("0")
     whole = seen = drawn(page)
     for key in ("+", "ArrowLeft", "ArrowDown", "-"):
@@ -149,39 +176,51 @@ def look_around_by_keyboard(page: Any) -> None:
         seen = drawn(page)
     page.keyboard.press("0")
     assert drawn(page) == whole
-    time, plot = page.text_content("#time-text"), drawn(page, "#plot")
+    now, over = page.text_content(".rv-now"), drawn(page, "#view .rv-over")
+    page.keyboard.press(".")
+    assert page.text_content(".rv-now") != now
+    assert drawn(page, "#view .rv-over") != over  # robot and scan have moved
+    assert drawn(page) == whole  # and nothing else has
     page.keyboard.press(",")
-    assert page.text_content("#time-text") != time
-    assert drawn(page) != whole
-    assert drawn(page, "#plot") != plot  # the moment is marked among the errors
-    page.focus("#time")
-    page.keyboard.press("Home")
-    assert (page.text_content("#time-text") or "").startswith("0.0 s")
+    assert page.text_content(".rv-now") == now
+    page.focus("#view input[type=range]")
     page.keyboard.press("End")
-    assert page.text_content("#time-text") == time
+    assert (page.text_content(".rv-now") or "").startswith("112")
+    page.keyboard.press("Home")
+    assert (page.text_content(".rv-now") or "").startswith("0.0 s")
+    page.keyboard.press("Space")
     with page.expect_download() as download:
         press(page, "#assets button >> text=metrics.json")
     assert download.value.suggested_filename == "metrics.json"
 
 
 def look_around_by_mouse(page: Any) -> None:
-    page.click("#zoom-all")
+    page.click("#view [data-do=all]")
     whole = drawn(page)
-    box = page.locator("#view").bounding_box()
+    page.locator("#view .rv-over").scroll_into_view_if_needed()
+    page.focus("#view .rv-over")
+    box = page.locator("#view .rv-over").bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(x, y)
     page.mouse.wheel(0, -400)
-    page.wait_for_function("(seen) => document.querySelector('#view').toDataURL() !== seen", arg=whole)
+    page.wait_for_function("([s, seen]) => document.querySelector(s).toDataURL() !== seen", arg=[MAP, whole])
     zoomed = drawn(page)
     page.mouse.down()
     page.mouse.move(x + 80, y + 40)
     page.mouse.up()
     moved = drawn(page)
     assert moved != zoomed
-    page.uncheck("#legend input >> nth=1")
+    page.uncheck("#view [data-layer=odometry]")
     assert drawn(page) != moved
-    page.locator("#time").fill("300")
-    assert not (page.text_content("#time-text") or "").startswith("112")
+    by_time = drawn(page)
+    page.select_option("#view [data-do=colour]", "error")
+    assert drawn(page) != by_time
+    now = page.text_content(".rv-now")
+    page.locator("#charts .rv-plot").first.click()  # a click on a curve seeks
+    assert page.text_content(".rv-now") != now
+    with page.expect_download() as download:
+        page.click("#view [data-do=picture]")
+    assert download.value.suggested_filename.endswith(".png")
 
 
 def look_on_a_phone_in_the_dark(page: Any) -> None:
@@ -189,10 +228,10 @@ def look_on_a_phone_in_the_dark(page: Any) -> None:
     light, map_in_light = page.evaluate(ground), drawn(page)
     page.emulate_media(color_scheme="dark")
     assert page.evaluate(ground) != light
-    page.wait_for_function("(seen) => document.querySelector('#view').toDataURL() !== seen", arg=map_in_light)
+    page.wait_for_function("([s, seen]) => document.querySelector(s).toDataURL() !== seen", arg=[MAP, map_in_light])
     page.set_viewport_size({"width": 390, "height": 844})
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    assert page.locator("#view").bounding_box()["width"] > 300
+    assert page.locator(MAP).bounding_box()["width"] > 300
     picture(page, "7-phone-result")
     page.emulate_media(color_scheme="light")
     page.set_viewport_size({"width": 1280, "height": 900})
@@ -207,7 +246,7 @@ def test_on_a_phone_in_the_dark_by_keyboard_and_cancel(
         client.post("/v1/jobs", json={"log": file})
     options = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "color_scheme": "dark"}
     page = open_page(live.url, **options)
-    page.wait_for_selector("#jobs button")
+    page.wait_for_selector("#jobs [data-job]")
     for _ in range(30):
         if page.evaluate("document.activeElement.dataset.job !== undefined"):
             break
@@ -313,12 +352,50 @@ def test_the_form_offers_what_the_server_does(make_live: Callable[..., Live], op
     page.fill("[data-option=config]", '{"icp": {"iterations": 9}}')
     page.set_input_files("#log", str(RECORDINGS / "slip.mcap"))
     page.click("#go")
-    page.wait_for_selector("#jobs [data-job]")
+    page.wait_for_selector("#job-state .state")
     with live.client() as client:
         (job,) = client.get("/v1/jobs").json()["jobs"]
     request = job["request"]
     assert (request["initial_pose"], request["read"]["start_s"], request["seed"]) == ([-1.0, 2.0, 0.5], 1.5, 7)
     assert (request["matcher"], request["config"]) == ("icp", {"icp": {"iterations": 9}})
+
+
+def test_several_logs_are_several_jobs_or_one_and_the_table_finds_them(
+    make_live: Callable[..., Live], open_page: Callable[..., Any], tmp_path: Path
+) -> None:
+    live = make_live()
+    logs = [tmp_path / f"{name}.log" for name in ("alpha", "beta", "gamma")]
+    for log in logs:
+        log.write_bytes(b"ok")
+    page = open_page(live.url)
+    page.set_input_files("#log", [str(log) for log in logs])
+    page.click("#go")
+    page.wait_for_function("() => document.querySelectorAll('#jobs [data-state=succeeded]').length === 3")
+    page.check("input[value=parts]")
+    page.click("#go")
+    page.wait_for_selector("#job-state .state")
+    with live.client() as client:
+        jobs = client.get("/v1/jobs").json()["jobs"]
+    assert [len(job["request"].get("logs") or ()) for job in jobs] == [3, 0, 0, 0]
+    page.go_back()
+    page.fill("#search", "BET")
+    page.wait_for_function("() => document.querySelectorAll('#jobs tbody tr').length === 1")
+    assert page.text_content("#jobs tbody .name") == "beta.log"
+    page.fill("#search", "")
+    page.select_option("#order", "name")
+    page.wait_for_function("() => document.querySelector('#jobs tbody .name').textContent.startsWith('alpha')")
+    page.select_option("#filter", "state=failed")
+    page.wait_for_function("() => document.querySelector('#page-text').textContent === 'no such job'")
+    page.click("nav >> text=Uploads")
+    page.wait_for_function("() => document.querySelectorAll('#file-table tbody tr').length === 3")
+    page.click("#file-table button >> nth=0")  # used again, without an upload
+    page.wait_for_function("() => document.querySelector('#stored').value !== ''")
+    page.set_input_files("#log", [])
+    page.click("#go")
+    page.wait_for_selector("#job-state .state")
+    with live.client() as client:
+        assert len(client.get("/v1/jobs").json()["jobs"]) == 5
+        assert len(client.get("/v1/files").json()["files"]) == 3
 
 
 def test_a_page_goes_on_when_the_server_was_restarted(make_live: Callable[..., Live], browser: Any) -> None:
@@ -344,7 +421,7 @@ def test_an_idle_page_pulls_almost_nothing(make_live: Callable[..., Live], open_
         for job in client.get("/v1/jobs").json()["jobs"]:
             wait(client, job["id"])
     page = open_page(live.url)
-    page.wait_for_function("() => document.querySelectorAll('#jobs .succeeded').length === 30")
+    page.wait_for_function("() => document.querySelectorAll('#jobs [data-state=succeeded]').length === 30")
     page.wait_for_timeout(3500)
     answers: list[Any] = []
     page.on("response", lambda answer: answers.append(answer))
@@ -353,12 +430,13 @@ def test_an_idle_page_pulls_almost_nothing(make_live: Callable[..., Live], open_
     assert {answer.status for answer in answers} == {304}
 
 
-SPARSE = """async () => {
-  const { plot } = await import("/web/plot.js"); const canvas = document.createElement("canvas");
-  canvas.style.width = "600px"; canvas.style.height = "200px"; document.body.append(canvas);
+SPARSE = """() => {
+  const root = document.createElement("div"); root.className = "rv rv-charts"; document.body.append(root);
   const t = [...Array(50).keys()], fill = (v) => t.map((k) => k % 10 ? null : v);
-  const seen = (position) => { plot(canvas, { errors: { t, position, heading: t.map(() => null) } }, NaN);
-    return canvas.toDataURL(); };
+  const seen = (v) => { root.replaceChildren(); const chart = { title: "a", unit: "m",
+      explanation: "", t, v, time: true, log: false, top: null };
+    ResultCharts(root, { end: 50, charts: [chart], status: [], lost: [] }, () => {}).draw();
+    return root.querySelector("canvas").toDataURL(); };
   return seen(fill(0.5)) !== seen(fill(0.5).map((v, k) => k === 20 ? null : v)); }"""
 
 

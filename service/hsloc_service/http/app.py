@@ -10,6 +10,7 @@ from fastapi import Depends, FastAPI
 from fastapi.responses import FileResponse
 from fastapi.staticfiles import StaticFiles
 
+import hsloc.report
 from hsloc.version import __version__
 from hsloc_service.auth import Tokens
 from hsloc_service.call_timeout import BoundedExecutor
@@ -66,6 +67,8 @@ ROUTERS = tuple(
     )
 )
 WEB = Path(__file__).parent.parent / "web"
+VIEWER = Path(hsloc.report.__file__).parent / "viewer"
+"""The map view, which report.html embeds."""
 
 
 def create_app(settings: Settings) -> FastAPI:
@@ -172,6 +175,7 @@ def operation_id(route: APIRoute) -> str:
 
 
 def _add_page(app: FastAPI) -> None:
+    app.mount("/web/viewer", StaticFiles(directory=VIEWER), name="viewer")
     app.mount("/web", StaticFiles(directory=WEB), name="web")
 
     @app.get("/", include_in_schema=False)

@@ -17,9 +17,11 @@ from hsloc_service.http.schemas import (
     JobView,
     RerunRequest,
     State,
+    Verdict,
     checked,
 )
-from hsloc_service.http.views import delivery_view, job_view
+from hsloc_service.http.views import brief_view, delivery_view, job_view
+from hsloc_service.jobs.repository import JobFilter, JobOrder
 from hsloc_service.stored_request import plain
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -56,10 +58,23 @@ def list_jobs(
     state: Annotated[State | None, Query()] = None,
     before: Annotated[int | None, Query(ge=1, le=2**62, description="`next` of the page before")] = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
+    offset: Annotated[int, Query(ge=0, le=2**31, description="how many to leave out; instead of `before`")] = 0,
+    order: JobOrder = "newest",
+    verdict: Annotated[Verdict | None, Query(description="verdict of the result")] = None,
+    search: Annotated[
+        str | None, Query(max_length=200, description="part of the log's name, or the beginning of the job's id")
+    ] = None,
+    brief: Annotated[
+        bool, Query(description="of each summary the key figures alone, and how many jobs there are")
+    ] = False,
 ) -> JobList:
-    """Your jobs, newest first."""
-    rows = ctx.jobs.list(who, state=state, before=before, limit=limit)
-    return JobList(jobs=[job_view(row) for row in rows], next=rows[-1].seq if len(rows) == limit else None)
+    """Your jobs, newest first. Page with `next` and `before`; in another order with `offset`."""
+    wanted = JobFilter(state=state, verdict=verdict, search=search, order=order)
+    rows = ctx.jobs.list(who, wanted, before=before, offset=offset, limit=limit)
+    views = [brief_view(row) if brief else job_view(row) for row in rows]
+    more = len(rows) == limit and order == "newest"
+    total = ctx.jobs.count(who, wanted) if brief else None
+    return JobList(jobs=views, next=rows[-1].seq if more else None, total=total)
 
 
 @router.get("/{job_id}", responses=problems(404))

@@ -199,6 +199,7 @@ class RerunRequest(_Rerun):  # type: ignore[misc, valid-type]
     """What to change in a job that is run again; the rest, and the seed, stay."""
 
 
+Verdict = Literal["good", "check", "failed"]
 State = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
 
 
@@ -248,6 +249,7 @@ class JobList(BaseModel):
 
     jobs: list[JobView]
     next: int | None
+    total: int | None = Field(default=None, description="how many jobs the filter leaves, where `brief` was asked for")
 
 
 class AssetView(BaseModel):

@@ -62,6 +62,23 @@ def job_view(row: JobRow) -> JobView:
     )
 
 
+def brief_view(row: JobRow) -> JobView:
+    """A job for a list: what was chosen of the request, and the key figures of the summary."""
+    view = job_view(row)
+    request = {key: value for key, value in view.request.items() if value is not None}
+    summary = view.summary
+    if summary is not None:
+        metrics, names = summary.get("metrics", {}), summary.get("key_figures", [])
+        summary = {
+            "verdict": metrics.get("verdict"),
+            "mode": metrics.get("run", {}).get("mode"),
+            "duration_s": metrics.get("log", {}).get("duration_s"),
+            "headline": summary.get("headline"),
+            "key_figures": [each for name in names for each in summary.get("figures", []) if each["name"] == name],
+        }
+    return view.model_copy(update={"request": request, "summary": summary})
+
+
 def delivery_view(row: DeliveryRow) -> DeliveryView:
     """A webhook."""
     return DeliveryView(

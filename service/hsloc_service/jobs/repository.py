@@ -7,9 +7,9 @@ import json
 import time
 import uuid
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from sqlalchemy import delete, func, select
+from sqlalchemy import ColumnElement, delete, func, or_, select
 
 from hsloc_service.db.tables import ACTIVE, AssetRow, CounterRow, DeliveryRow, EventRow, FileRow, IdempotencyRow, JobRow
 from hsloc_service.errors import ServiceError, busy, conflict, not_found
@@ -35,6 +35,40 @@ class Submitted(NamedTuple):
 
     job: JobRow
     created: bool
+
+
+JobOrder = Literal["newest", "oldest", "name", "longest"]
+ORDERS: dict[JobOrder, tuple[ColumnElement[Any], ...]] = {
+    "newest": (JobRow.seq.desc(),),
+    "oldest": (JobRow.seq.asc(),),
+    "name": (func.lower(JobRow.log_name), JobRow.seq.desc()),
+    "longest": (func.coalesce(JobRow.ended - JobRow.started, 0.0).desc(), JobRow.seq.desc()),
+}
+"""By name, what jobs are ordered by; longest is the time from start to end."""
+
+
+@dataclass(frozen=True, slots=True)
+class JobFilter:
+    """Which jobs are listed, and in what order; what is None does not matter."""
+
+    state: str | None = None
+    verdict: str | None = None
+    """Verdict of the result: good, check or failed."""
+    search: str | None = None
+    """Part of the name of the log in any case, or the beginning of the job's id."""
+    order: JobOrder = "newest"
+
+    def conditions(self, who: Principal) -> list[ColumnElement[bool]]:
+        """For a query; never without the tenant."""
+        found: list[ColumnElement[bool]] = [JobRow.tenant == who.tenant]
+        if self.state is not None:
+            found.append(JobRow.state == self.state)
+        if self.verdict is not None:
+            found.append(JobRow.summary["metrics"]["verdict"].as_string() == self.verdict)
+        if self.search:
+            by_name = JobRow.log_name.icontains(self.search, autoescape=True)
+            found.append(or_(by_name, JobRow.id.startswith(self.search, autoescape=True)))
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,16 +115,21 @@ class Jobs:
             return _job(session, who, job_id)
 
     def list(
-        self, who: Principal, *, state: str | None = None, before: int | None = None, limit: int = 50
+        self, who: Principal, wanted: JobFilter, *, before: int | None = None, offset: int = 0, limit: int = 50
     ) -> Sequence[JobRow]:
-        """Jobs, newest first; `before` is the `seq` of the last one seen."""
-        query = select(JobRow).where(JobRow.tenant == who.tenant).order_by(JobRow.seq.desc()).limit(limit)
-        if state is not None:
-            query = query.where(JobRow.state == state)
+        """Jobs in the order that is asked for; `before` is the `seq` of the last one seen, `offset` how many were."""
+        query = (
+            select(JobRow).where(*wanted.conditions(who)).order_by(*ORDERS[wanted.order]).offset(offset).limit(limit)
+        )
         if before is not None:
             query = query.where(JobRow.seq < before)
         with self.database.read() as session:
             return session.scalars(query).all()
+
+    def count(self, who: Principal, wanted: JobFilter) -> int:
+        """How many jobs there are to list."""
+        with self.database.read() as session:
+            return session.scalar(select(func.count()).select_from(JobRow).where(*wanted.conditions(who))) or 0
 
     def assets(self, who: Principal, job_id: str) -> tuple[JobRow, Sequence[AssetRow]]:
         """A job and the manifest of its results."""

@@ -1,0 +1,289 @@
+"""What report.html and the web page draw of a run: map, paths, scans, loops, events and curves, as one JSON value.
+
+hsloc/report/templates/view.js draws it. Lengths are in metres and times in seconds since the first pose; columns have a
+bounded length, however long the run was.
+"""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from hsloc.model import Status
+from hsloc.report.charts import convergence_charts, run_charts
+from hsloc.report.data import peak_rows, prepare, status_counts
+from hsloc.report.map_image import picture_of, shown_extent
+from hsloc.report.summary import ResultSummary
+from hsloc.report.table import STATUS_WORDS
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hsloc.model import OccupancyGrid
+    from hsloc.report.charts import Chart
+    from hsloc.report.data import Errors, ReportData, ReportParts, Scans
+    from hsloc.slam.result import MappingResult
+
+    Floats = NDArray[np.float64]
+    Rows = NDArray[np.intp]
+
+MOST_POSES = 6000
+"""Poses of the trajectory that are drawn, about; of other paths half as many."""
+MOST_POINTS = 1500
+"""Points of a curve, about; no peak is left out."""
+MOST_MARKS = 1000
+"""Scans of one status that are marked."""
+MOST_ELLIPSES = 300
+MOST_PIXELS = 4000
+"""Longest side of the map's picture."""
+_CM = 100.0
+_MOST_CM = 32767
+"""Largest coordinate of a scan's point: 327 m."""
+
+
+def view_of(parts: ReportParts, data: ReportData | None = None) -> tuple[dict[str, Any], bytes | None]:
+    """The value for view.js, in which `map` lacks its picture, and this picture as PNG; None where nothing is known."""
+    data = prepare(parts) if data is None else data
+    start_ns = int(parts.trajectory.stamps_ns.min()) if len(parts.trajectory) else 0
+    frame, png = _map(parts.grid)
+    extent = shown_extent(data, parts.grid, parts.points)
+    summary = None if parts.metrics is None else ResultSummary.of(parts.metrics)
+    scans = data.scans
+    values = {
+        "title": parts.title,
+        "summary": None if summary is None else summary.to_json(),
+        "map": frame,
+        "extent": [_round(value) for value in (extent.x0, extent.y0, extent.x1, extent.y1)],
+        "end": _round(_end(data)),
+        "trajectory": _trajectory(parts, data),
+        "odometry": _path(data.odometry, None),
+        "reference": _path(data.reference, data.reference_jumps),
+        "points": None if parts.points is None else _columns(x=parts.points[:, 0], y=parts.points[:, 1]),
+        "lost": [[_round(begin), _round(end)] for begin, end in data.lost],
+        "scans": _scans(parts, start_ns),
+        "marks": [] if scans is None else _marks(scans),
+        "loops": None if parts.mapping is None else _loops(parts.mapping, start_ns),
+        "ellipses": _ellipses(parts, start_ns),
+        "events": _events(parts, data, start_ns),
+        "status": [] if scans is None else _status_rows(scans),
+        "charts": [_chart(chart) for chart in (*run_charts(data), *convergence_charts(parts.convergence))],
+    }
+    return values, png
+
+
+def _end(data: ReportData) -> float:
+    return max(data.duration_s, 0.0 if data.scans is None else float(data.scans.seconds.max(initial=0.0)))
+
+
+def data_url(png: bytes) -> str:
+    """A picture as text, for a page that loads nothing."""
+    return f"data:image/png;base64,{b64encode(png).decode('ascii')}"
+
+
+def _map(grid: OccupancyGrid | None) -> tuple[dict[str, Any] | None, bytes | None]:
+    """Side of a pixel [m], size in pixels, and pose of the lower left corner in the map frame; and the picture."""
+    picture = None if grid is None else picture_of(grid, MOST_PIXELS)
+    if picture is None:
+        return None, None
+    # Grey and clear, the top row first.
+    levels = np.ascontiguousarray(picture.levels[::-1, :, (0, 3)])
+    stream = BytesIO()
+    Image.fromarray(levels).save(stream, format="PNG", optimize=True)
+    corner, (height, width) = picture.T_map_corner, levels.shape[:2]
+    frame = {"side": picture.side, "width": width, "height": height, "corner": [corner.x, corner.y, corner.theta]}
+    return frame, stream.getvalue()
+
+
+def _thinned(jumps: NDArray[np.bool_] | None, n: int, most: int) -> Rows:
+    """At most about `most` of n rows: every k-th, the ends, and both sides of each jump."""
+    rows = np.arange(0, n, max(-(-n // most), 1))
+    extra = np.zeros(0, dtype=np.intp) if jumps is None else np.flatnonzero(jumps)[:most]
+    return np.union1d(rows, np.concatenate((extra, extra - 1, [n - 1]))) if n else rows
+
+
+def _trajectory(parts: ReportParts, data: ReportData) -> dict[str, Any]:
+    poses, n = parts.trajectory.poses, len(parts.trajectory)
+    order = np.argsort(data.seconds, kind="stable")
+    jumps = np.zeros(n, dtype=bool) if data.jumps is None else data.jumps
+    # The path is in the order of the log; its jumps are at rows of that order.
+    rows = _thinned(jumps, n, MOST_POSES) if (order == np.arange(n)).all() else order[_thinned(None, n, MOST_POSES)]
+    states = parts.states or tuple("localised" if known else "lost" for known in data.localised)
+    names = list(dict.fromkeys(states))
+    codes = {name: code for code, name in enumerate(names)}
+    result: dict[str, Any] = _columns(
+        t=data.seconds[rows], x=poses[rows, 0], y=poses[rows, 1], theta=poses[rows, 2], decimals=3
+    )
+    result |= {"states": [str(name) for name in names], "state": [codes[states[row]] for row in rows]}
+    result["breaks"] = np.flatnonzero(jumps[rows]).tolist()
+    if parts.covariances is not None and np.isfinite(parts.covariances).any():
+        result["sigma"] = _numbers(np.sqrt(parts.covariances[rows, 0, 0] + parts.covariances[rows, 1, 1]), 4)
+    if data.errors is not None:
+        result["error"] = _numbers(_at(data.errors, data.seconds[rows]), 4)
+    return result
+
+
+def _at(errors: Errors, seconds: Floats) -> Floats:
+    """The error of the pair nearest in time (n,); NaN where there is none within twice the usual distance of pairs."""
+    times, values = errors.translation_m.seconds, errors.translation_m.values
+    after = np.clip(np.searchsorted(times, seconds), 1, max(len(times) - 1, 1))
+    if len(times) < 2:
+        return np.full(len(seconds), np.nan)
+    nearest = np.where(seconds - times[after - 1] < times[after] - seconds, after - 1, after)
+    near = np.abs(times[nearest] - seconds) <= 2.0 * float(np.median(np.diff(times))) + 1e-9
+    return np.where(near, values[nearest], np.nan)
+
+
+def _path(xy: Floats | None, jumps: NDArray[np.bool_] | None) -> dict[str, Any] | None:
+    if xy is None or len(xy) < 2:
+        return None
+    rows = _thinned(jumps, len(xy), MOST_POSES // 2)
+    breaks = [] if jumps is None else np.flatnonzero(jumps[rows]).tolist()
+    return {**_columns(x=xy[rows, 0], y=xy[rows, 1], decimals=3), "breaks": breaks}
+
+
+def _scans(parts: ReportParts, start_ns: int) -> dict[str, Any] | None:
+    """Scans with points: poses, status, and all points as centimetres in the base frame (int16), distances as bytes."""
+    overlay = parts.overlay
+    if overlay is None or not len(overlay.rows):
+        return None
+    rows = overlay.rows[np.argsort(overlay.stamps_ns[overlay.rows], kind="stable")]
+    place = {int(row): k for k, row in enumerate(overlay.rows)}
+    clouds = [overlay.points[place[int(row)]] for row in rows]
+    near = np.concatenate([overlay.distances[place[int(row)]] for row in rows])
+    points = np.clip(np.round(np.concatenate(clouds) * _CM), -_MOST_CM, _MOST_CM).astype("<i2")
+    bytes_of_distances = np.clip(np.round(near * _CM), 0, 255).astype(np.uint8)
+    status: dict[int, tuple[str, str]] = {}
+    if parts.diagnostics is not None:
+        diagnostics = parts.diagnostics
+        triples = zip(diagnostics.stamps_ns.tolist(), diagnostics.status, diagnostics.reason, strict=True)
+        status = {stamp: (STATUS_WORDS.get(name, str(name)), reason) for stamp, name, reason in triples}
+    words = [status.get(stamp, ("", "")) for stamp in overlay.stamps_ns[rows].tolist()]
+    poses = overlay.poses[rows]
+    return {
+        **_columns(t=(overlay.stamps_ns[rows] - start_ns) / 1e9, x=poses[:, 0], y=poses[:, 1], decimals=3),
+        **_columns(theta=poses[:, 2], far=overlay.far[rows], decimals=4),
+        "count": [len(cloud) for cloud in clouds],
+        "status": [f"{name}: {reason}" if reason else name for name, reason in words],
+        "points": b64encode(points.tobytes()).decode("ascii"),
+        "distances": b64encode(bytes_of_distances.tobytes()).decode("ascii"),
+    }
+
+
+def _marks(scans: Scans) -> list[dict[str, Any]]:
+    """Scans that were refused or without returns, and those at which the pose was found, on the map."""
+    found = []
+    for status in (Status.NO_RETURNS, Status.REJECTED, Status.RELOCALISED):
+        rows = np.flatnonzero(scans.where(status) & np.isfinite(scans.xy).all(axis=1))
+        rows = rows[:: max(1, -(-len(rows) // MOST_MARKS))]
+        marks = _columns(t=scans.seconds[rows], x=scans.xy[rows, 0], y=scans.xy[rows, 1], decimals=3)
+        if len(rows):
+            reasons = [scans.reason[row] for row in rows]
+            found.append({"status": str(status), "label": STATUS_WORDS[status], **marks, "reason": reasons})
+    return found
+
+
+def _loops(mapping: MappingResult, start_ns: int) -> dict[str, Any]:
+    """Both ends of all loops that were searched for, when the second was seen, and why the others were refused."""
+    references, loops = mapping.submap_references, mapping.loops
+    pairs = [(references[loop.first], references[loop.second]) for loop in loops]
+    ends = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    first, second = (mapping.keyscan_poses[ends[:, k]] for k in (0, 1))
+    seconds = (mapping.keyscan_stamps_ns[ends[:, 1]] - start_ns) / 1e9
+    return {
+        **_columns(t=seconds, x0=first[:, 0], y0=first[:, 1], x1=second[:, 0], y1=second[:, 1], decimals=3),
+        "accepted": [bool(loop.accepted) for loop in loops],
+        "reason": [loop.reason for loop in loops],
+    }
+
+
+def _ellipses(parts: ReportParts, start_ns: int) -> dict[str, Any] | None:
+    """Position and covariance of some poses spread over the run."""
+    covariances, trajectory = parts.covariances, parts.trajectory
+    if covariances is None:
+        return None
+    rows = np.flatnonzero(np.isfinite(covariances[:, :2, :2]).all(axis=(1, 2)))
+    rows = rows[:: max(1, -(-len(rows) // MOST_ELLIPSES))]
+    if not len(rows):
+        return None
+    seconds, poses, c = (trajectory.stamps_ns[rows] - start_ns) / 1e9, trajectory.poses[rows], covariances[rows]
+    columns = _columns(t=seconds, x=poses[:, 0], y=poses[:, 1], decimals=3)
+    return columns | _columns(xx=c[:, 0, 0], xy=c[:, 0, 1], yy=c[:, 1, 1], decimals=7)
+
+
+def _events(parts: ReportParts, data: ReportData, start_ns: int) -> list[dict[str, Any]]:
+    """What to jump to, in order of time: reasons of the verdict, losses and what ended them, loops, refused scans."""
+    found: list[tuple[float, str, str]] = []
+    if parts.metrics is not None:
+        found += [
+            (begin, "warning", f"{reason.text} (from {begin:.1f} to {end:.1f} s)")
+            for reason in parts.metrics.verdict_reasons
+            for begin, end in reason.times
+        ]
+    for begin, end in data.lost:
+        found += [(begin, "loss", f"the pose is not known until {end:.1f} s"), (end, "loss", "the pose is known again")]
+    if parts.mapping is not None:
+        loops = _loops(parts.mapping, start_ns)
+        found += [(t, "loop", "a loop is closed") for t, ok in zip(loops["t"], loops["accepted"], strict=True) if ok]
+    if data.scans is not None:
+        rows = np.flatnonzero(data.scans.where(Status.REJECTED))
+        rows = rows[:: max(1, -(-len(rows) // MOST_MARKS))]
+        found += [(float(data.scans.seconds[row]), "rejected", data.scans.reason[row]) for row in rows]
+    return [{"t": _round(t), "kind": kind, "text": text} for t, kind, text in sorted(found)]
+
+
+def _status_rows(scans: Scans) -> list[dict[str, Any]]:
+    """For each status its name, how many scans had it, and when: runs [begin, end]."""
+    spacing = float(np.median(np.diff(scans.seconds))) if len(scans.seconds) > 1 else 1.0
+    rows = []
+    for name, count in status_counts(scans).items():
+        spans = runs(scans.seconds[scans.where(name)], 2.0 * spacing)
+        spans = spans[:: max(1, -(-len(spans) // MOST_MARKS))]
+        times = [[_round(begin), _round(end + spacing)] for begin, end in spans]
+        rows.append({"status": name, "label": STATUS_WORDS.get(name, name), "count": count, "runs": times})
+    return rows
+
+
+def runs(seconds: Floats, gap: float) -> list[tuple[float, float]]:
+    """First and last of each group of sorted seconds that are at most `gap` apart."""
+    if len(seconds) == 0:
+        return []
+    breaks = np.flatnonzero(np.diff(seconds) > gap)
+    firsts = seconds[np.concatenate(((0,), breaks + 1))]
+    lasts = seconds[np.concatenate((breaks, (len(seconds) - 1,)))]
+    return list(zip(firsts.tolist(), lasts.tolist(), strict=True))
+
+
+def _chart(chart: Chart) -> dict[str, Any]:
+    rows = peak_rows(chart.curve.values, MOST_POINTS)
+    values: dict[str, Any] = {
+        "name": chart.name, "title": chart.title, "unit": chart.unit, "explanation": chart.explanation,
+        "log": chart.is_logarithmic, "top": chart.top, "time": chart.over_time,
+        "t": _numbers(chart.curve.seconds[rows], 3), "v": _significant(chart.curve.values[rows]),
+    }  # fmt: skip
+    if chart.marks is not None and len(chart.marks.seconds):
+        kept = slice(None, None, max(1, -(-len(chart.marks.seconds) // MOST_MARKS)))
+        values["marks"] = {"t": _numbers(chart.marks.seconds[kept], 3), "v": _significant(chart.marks.values[kept])}
+    return values
+
+
+def _columns(*, decimals: int = 3, **columns: Floats) -> dict[str, Any]:
+    return {name: _numbers(column, decimals) for name, column in columns.items()}
+
+
+def _numbers(values: Floats, decimals: int) -> list[float | None]:
+    """Rounded; what is not a number is null."""
+    rounded = np.round(np.asarray(values, dtype=np.float64), decimals)
+    return [value if known else None for value, known in zip(rounded.tolist(), np.isfinite(rounded), strict=True)]
+
+
+def _significant(values: Floats) -> list[float | None]:
+    """Five figures, which are enough to read."""
+    return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values.tolist()]
+
+
+def _round(value: float) -> float:
+    return round(float(value), 3)

@@ -1,0 +1,69 @@
+"use strict";
+// Several results side by side: paths on the map of the first, curves over each other, figures with their differences.
+(() => {
+  const INKS = ["blue", "vermillion", "green", "purple", "orange", "sky", "robot", "muted"];
+  const make = (tag, text = "", className = "") => { const made = document.createElement(tag); made.textContent = text; made.className = className; return made; };
+
+  function change(first, value) {
+    if (first === null || value === null || first === undefined || value === undefined || first === value) return "";
+    if (first === 0) return "";
+    const percent = 100 * (value - first) / Math.abs(first);
+    return `${percent > 0 ? "+" : "−"}${Math.abs(percent) < 10 ? Math.abs(percent).toFixed(1) : Math.abs(percent).toFixed(0)} %`;
+  }
+
+  class ResultComparison {
+    // `runs` are {name, href, data, image}: the value of hsloc/report/view.py, and the picture of its map.
+    constructor(root, runs) {
+      this.root = root;
+      const view = make("div"), charts = make("div"), first = runs[0];
+      const built = runs.some((run) => run.data.summary?.mode === "slam");
+      view.setAttribute("role", "region"); view.setAttribute("aria-label", "map with all paths");
+      charts.setAttribute("role", "region"); charts.setAttribute("aria-label", "curves over time");
+      root.replaceChildren(this.table(runs), make("h3", `Paths on the map of ${first.name}`));
+      if (built) root.append(make("p", "A map that a run built has a frame of its own, which begins at the first pose of the log.", "rv-help"));
+      root.append(view, charts);
+      const data = { ...first.data, end: Math.max(...runs.map((run) => run.data.end)), others: [], charts: [], status: [] };
+      data.extent = [0, 1, 2, 3].map((k) => Math[k < 2 ? "min" : "max"](...runs.map((run) => run.data.extent[k])));
+      runs.forEach((run, k) => { if (k) data.others.push({ ...run.data.trajectory, name: run.name, ink: INKS[k % INKS.length] }); });
+      data.trajectoryName = first.name;
+      for (const chart of first.data.charts) {
+        if (!chart.time) continue;
+        const others = runs.map((run, k) => ({ ...run.data.charts.find((each) => each.name === chart.name), ink: INKS[k % INKS.length] })).slice(1).filter((each) => each.t);
+        data.charts.push({ ...chart, others });
+      }
+      this.view = new globalThis.ResultView(view, data, first.image, charts);
+    }
+
+    table(runs) {
+      const box = make("div", "", "scroll"), table = make("table", "", "rv-table"), head = table.createTHead().insertRow(), body = table.createTBody();
+      box.tabIndex = 0; box.setAttribute("role", "region"); box.setAttribute("aria-label", "figures of all runs");
+      head.append(make("td"));
+      runs.forEach((run, k) => {
+        const cell = make("th"), key = make("i", "", "rv-key"), name = make(run.href ? "a" : "span", run.name);
+        if (run.href) name.href = run.href;
+        key.style.borderColor = `var(--rv-${INKS[k % INKS.length]})`;
+        cell.scope = "col";
+        cell.append(key, " ", name);
+        head.append(cell);
+      });
+      const line = (name, texts, explanation = "", changes = []) => {
+        const row = body.insertRow(), label = make("th", name);
+        label.scope = "row"; label.title = explanation;
+        row.append(label);
+        texts.forEach((text, k) => { const cell = make("td", text); if (changes[k]) cell.append(" ", make("small", changes[k], "rv-change")); row.append(cell); });
+      };
+      line("verdict", runs.map((run) => run.data.summary?.verdict ?? ""));
+      const figures = runs.map((run) => new Map((run.data.summary?.figures ?? []).map((figure) => [figure.name, figure])));
+      for (const name of new Set(figures.flatMap((each) => [...each.keys()]))) {
+        const first = figures[0].get(name), any = figures.find((each) => each.has(name)).get(name);
+        line(name, figures.map((each) => each.get(name)?.values.join(" / ") ?? "–"), any.explanation,
+          figures.map((each, k) => k && first ? change(first.numbers?.[0], each.get(name)?.numbers?.[0]) : ""));
+      }
+      box.append(table);
+      return box;
+    }
+
+    end() { this.view.end(); this.root.replaceChildren(); }
+  }
+  globalThis.ResultComparison = ResultComparison;
+})();

@@ -1,0 +1,94 @@
+"use strict";
+// Mouse, fingers and keys of the map: see view.js, whose `ResultView` is the `view` here.
+globalThis.lengthText = (m) => m < 1 ? `${(100 * m).toFixed(m < 0.1 ? 1 : 0)} cm` : `${m.toFixed(2)} m`;
+globalThis.listenToView = (view) => {
+  function nearest(px, py) {
+    const path = view.data.trajectory, [mx, my] = view.metres(px, py);
+    let best = null, least = (14 * view.ratio / view.scale) ** 2;
+    for (let k = 0; k < path.x.length; k += 1) {
+      const [x, y] = view.local(path.x[k], path.y[k]), far = (x - mx) ** 2 + (y - my) ** 2;
+      if (far < least) { least = far; best = k; }
+    }
+    return best;
+  }
+  function hover(px, py) {
+    const [x, y] = view.metres(px, py), k = nearest(px, py), path = view.data.trajectory;
+    const words = [`${(x + view.ox).toFixed(2)}, ${(y + view.oy).toFixed(2)} m`];
+    if (k !== null) words.push(`${path.t[k].toFixed(1)} s, ${path.states[path.state[k]].replaceAll("_", " ")}`);
+    if (view.measure?.length) { const [a, b = [x, y]] = view.measure; words.push(`distance ${globalThis.lengthText(Math.hypot(b[0] - a[0], b[1] - a[1]))}`); }
+    view.$place.textContent = words.join(" · ");
+    view.charts.cursor(k === null ? view.time : path.t[k]);
+  }
+  function click(px, py) {
+    if (view.measure) {
+      if (view.measure.length > 1) view.measure = [];
+      view.measure.push(view.metres(px, py));
+      hover(px, py);
+      view.drawOver();
+      return;
+    }
+    const k = nearest(px, py);
+    if (k !== null) view.seek(view.data.trajectory.t[k]);
+  }
+  function save() {
+    const canvas = document.createElement("canvas"), c = canvas.getContext("2d");
+    canvas.width = view.$base.width; canvas.height = view.$base.height;
+    c.fillStyle = view.ink("ground"); c.fillRect(0, 0, canvas.width, canvas.height);
+    c.drawImage(view.$base, 0, 0); c.drawImage(view.$over, 0, 0);
+    canvas.toBlob((blob) => {
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(blob);
+      link.download = `${view.data.title || "map"}.png`;
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+    });
+  }
+  const over = view.$over, place = (event) => [event.offsetX * view.ratio, event.offsetY * view.ratio];
+  over.addEventListener("wheel", (event) => {
+    // An untouched map lets the page scroll by.
+    if (!event.ctrlKey && document.activeElement !== over) return;
+    event.preventDefault();
+    view.zoom(Math.exp(-Math.max(-200, Math.min(200, event.deltaY)) * 0.002), ...place(event));
+  }, { passive: false });
+  over.addEventListener("pointerdown", (event) => {
+    over.focus({ preventScroll: true });
+    over.setPointerCapture(event.pointerId);
+    view.fingers.set(event.pointerId, place(event));
+    view.pressed = place(event);
+  });
+  over.addEventListener("pointermove", (event) => {
+    const was = view.fingers.get(event.pointerId), now = place(event);
+    if (!was) { hover(...now); return; }
+    const others = [...view.fingers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
+    if (others.length === 1) {
+      const apart = ([x, y]) => Math.hypot(x - others[0][0], y - others[0][1]) || 1;
+      view.zoom(apart(now) / apart(was), (now[0] + others[0][0]) / 2, (now[1] + others[0][1]) / 2);
+    } else if (!others.length) view.move(now[0] - was[0], now[1] - was[1]);
+    view.fingers.set(event.pointerId, now);
+  });
+  over.addEventListener("pointerup", (event) => {
+    const now = place(event);
+    if (view.fingers.size === 1 && view.pressed && Math.hypot(now[0] - view.pressed[0], now[1] - view.pressed[1]) < 4 * view.ratio) click(...now);
+    view.fingers.delete(event.pointerId);
+  });
+  over.addEventListener("pointercancel", (event) => view.fingers.delete(event.pointerId));
+  over.addEventListener("pointerleave", () => { view.$place.textContent = ""; view.charts.cursor(view.time); });
+  over.addEventListener("dblclick", (event) => view.zoom(2, ...place(event)));
+  const measure = () => { view.measure = view.measure ? null : []; over.classList.toggle("rv-measuring", Boolean(view.measure)); view.drawOver(); };
+  const actions = { in: () => view.zoom(1.5), out: () => view.zoom(1 / 1.5), all: () => view.all(), measure, picture: () => save(),
+    play: () => view.play(), less: () => view.step(-1), more: () => view.step(1), back: () => view.jump(false), next: () => view.jump(true) };
+  view.root.addEventListener("click", (event) => actions[event.target.closest?.("button[data-do]")?.dataset.do]?.());
+  view.root.addEventListener("change", (event) => {
+    if (event.target.dataset.do === "speed") view.speed = Number(event.target.value);
+    if (event.target.dataset.do === "colour") { view.colourBy = event.target.value; view.paths = null; view.draw(); }
+  });
+  view.$time.addEventListener("input", () => view.seek(Number(view.$time.value)));
+  const step = 60, keys = { ArrowLeft: () => view.move(step, 0), ArrowRight: () => view.move(-step, 0), ArrowUp: () => view.move(0, step),
+    ArrowDown: () => view.move(0, -step), "+": () => view.zoom(1.25), "=": () => view.zoom(1.25), "-": () => view.zoom(0.8), 0: () => view.all(),
+    ",": () => view.step(-1), ".": () => view.step(1), " ": () => view.play(), n: () => view.jump(true), p: () => view.jump(false) };
+  over.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
+    event.preventDefault();
+    keys[event.key]();
+  });
+};

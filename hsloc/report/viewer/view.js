@@ -1,0 +1,383 @@
+"use strict";
+// A result on its map: one file for report.html and the service's page. The value that it draws is made by
+// hsloc/report/view.py. Text from the run goes in as text, never as markup. Needs charts.js and input.js, and view.css.
+(() => {
+  const STATES = { localised: "blue", predicted: "sky", ambiguous: "orange", off_map: "vermillion", lost: "purple" };
+  // Viridis at eight places (S. van der Walt and N. Smith, 2015): even in lightness, readable for the colour-blind.
+  const SCALE = ["#440154", "#46327e", "#365c8d", "#277f8e", "#1fa187", "#4ac16d", "#a0da39", "#fde725"];
+  const NEAR_CM = 5, FAR_CM = 15;
+  const MARKS = { rejected: "✕", no_returns: "▼", relocalised: "★" };
+  const KINDS = [["", "any event"], ["warning", "warning"], ["loss", "loss"], ["loop", "loop"], ["rejected", "refused scan"]];
+
+  const make = (tag, attributes = {}, ...children) => {
+    const made = document.createElement(tag);
+    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+    made.append(...children);
+    return made;
+  };
+  const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  const length = globalThis.lengthText;
+  // The last row whose time is not after t.
+  const before = (times, t) => {
+    let low = 0, high = times.length - 1;
+    while (low < high) { const middle = (low + high + 1) >> 1; if (times[middle] <= t) low = middle; else high = middle - 1; }
+    return low;
+  };
+
+  class ResultView {
+    // `image` is the map's picture, or null; `root` an element that is filled, as is `charts` with the curves.
+    constructor(root, data, image, charts) {
+      this.$charts = charts;
+      this.root = root; this.data = data; this.image = image;
+      this.time = 0; this.fingers = new Map(); this.measure = null; this.playing = null; this.speed = 10;
+      this.ox = (data.extent[0] + data.extent[2]) / 2;
+      this.oy = (data.extent[1] + data.extent[3]) / 2;
+      this.local = (x, y) => [x - this.ox, y - this.oy];
+      this.unpack();
+      this.build();
+      this.charts = globalThis.ResultCharts(this.$charts, data, (t) => this.seek(t));
+      this.dark = matchMedia("(prefers-color-scheme: dark)");
+      this.onScheme = () => { this.colours = null; this.charts.draw(); this.draw(); };
+      this.dark.addEventListener("change", this.onScheme);
+      this.observer = new ResizeObserver(() => this.resize());
+      this.observer.observe(this.$frame);
+      addEventListener("beforeprint", this.onPrint = () => this.all());
+      globalThis.listenToView(this);
+      this.resize();
+      this.all();
+      this.seek(0);
+    }
+
+    // Frees what the page holds beyond the element.
+    end() {
+      this.stop();
+      this.observer.disconnect();
+      this.dark.removeEventListener("change", this.onScheme);
+      removeEventListener("beforeprint", this.onPrint);
+      this.charts.end();
+      this.root.replaceChildren();
+    }
+
+    unpack() {
+      const scans = this.data.scans;
+      if (!scans) return;
+      const raw = bytes(scans.points), view = new DataView(raw.buffer);
+      this.xy = Float32Array.from({ length: raw.length / 2 }, (_, k) => view.getInt16(2 * k, true) / 100);
+      this.near = bytes(scans.distances);
+      this.first = [];
+      scans.count.reduce((sum, n) => { this.first.push(sum); return sum + n; }, 0);
+    }
+
+    build() {
+      const button = (name, text, title) => make("button", { type: "button", "data-do": name, title, "aria-label": title }, text);
+      this.$base = make("canvas", { class: "rv-base", "aria-hidden": "true" });
+      this.$over = make("canvas", { class: "rv-over", tabindex: "0", role: "img", "aria-label":
+        "Map with the trajectory. Arrow keys move, plus and minus zoom, 0 shows all, comma and full stop step by scan, n and p go to the next and previous event." });
+      this.$place = make("div", { class: "rv-place" });
+      this.$scale = make("div", { class: "rv-scale" }, make("i"), make("span"));
+      const tools = make("div", { class: "rv-tools" }, button("in", "+", "zoom in"), button("out", "−", "zoom out"),
+        button("all", "⤢", "show all"), button("measure", "↔", "measure a distance"), button("picture", "PNG", "save the map as a picture"));
+      this.$frame = make("div", { class: "rv-frame" }, this.$base, this.$over, this.$place, this.$scale, tools);
+      this.$time = make("input", { type: "range", min: "0", max: String(this.data.end || 1), step: "any", value: "0", "aria-label": "time" });
+      this.$now = make("output", { class: "rv-now" });
+      this.$event = make("p", { class: "rv-event", role: "status", "aria-live": "polite" });
+      this.$kind = make("select", { "aria-label": "kind of event" });
+      for (const [kind, text] of KINDS) {
+        const n = this.data.events.filter((event) => !kind || event.kind === kind).length;
+        if (n || !kind) this.$kind.append(make("option", { value: kind }, `${text} (${n})`));
+      }
+      const speeds = make("select", { "aria-label": "speed of playing", "data-do": "speed" });
+      for (const times of [1, 2, 5, 10, 30, 100]) speeds.append(make("option", { value: String(times), ...(times === 10 ? { selected: "" } : {}) }, `${times}×`));
+      this.$play = button("play", "Play", "play");
+      const steps = make("div", { class: "rv-steps" }, button("back", "|◂", "previous event"), button("less", "◂", "previous scan"),
+        this.$play, button("more", "▸", "next scan"), button("next", "▸|", "next event"), this.$kind, speeds);
+      this.$layers = make("div", { class: "rv-layers" });
+      this.root.classList.add("rv");
+      this.$charts.classList.add("rv", "rv-charts");
+      this.root.replaceChildren(this.$frame, make("div", { class: "rv-time" }, steps, this.$time, this.$now), this.$event, this.$layers);
+      this.buildLayers();
+    }
+
+    buildLayers() {
+      const d = this.data, refused = d.loops ? d.loops.accepted.filter((ok) => !ok).length : 0;
+      const layers = [
+        ["map", "map", d.map, true], ["points", "map points", d.points, true], ["trajectory", d.trajectoryName ?? "trajectory", d.trajectory.t.length, true],
+        ...(d.others ?? []).map((other, k) => [`other${k}`, other.name, true, true, other.ink]),
+        ["reference", "reference", d.reference, true], ["odometry", "odometry alone", d.odometry, true],
+        ["scan", "scan at the cursor", d.scans, true], ["scans", "all scans", d.scans, false],
+        ["loops", `loops (${d.loops ? d.loops.accepted.length - refused : 0})`, d.loops && d.loops.accepted.length > refused, true],
+        ["refused", `refused loops (${refused})`, refused, false], ["ellipses", "2σ ellipses", d.ellipses, false],
+        ...d.marks.map((mark) => [mark.status, `scan ${mark.label} (${mark.t.length})`, true, true]),
+      ];
+      this.shown = new Set();
+      for (const [name, text, there, on, ink] of layers) {
+        if (!there) continue;
+        const box = make("input", { type: "checkbox", "data-layer": name, ...(on ? { checked: "" } : {}) });
+        if (on) this.shown.add(name);
+        box.addEventListener("change", () => { if (box.checked) this.shown.add(name); else this.shown.delete(name); this.draw(); });
+        const key = make("i", { class: `rv-key rv-${name}` }, MARKS[name] || "");
+        if (ink) key.style.borderColor = `var(--rv-${ink})`;
+        this.$layers.append(make("label", {}, box, key, text));
+      }
+      const choices = [["plain", "one colour"], ["state", "state", d.trajectory.states.some((state) => state !== "localised")],
+        ["error", "error", d.trajectory.error], ["sigma", "standard deviation", d.trajectory.sigma], ["time", "time"]];
+      const select = make("select", { "data-do": "colour", "aria-label": "colour of the trajectory" });
+      for (const [name, text, there = true] of choices) if (there) select.append(make("option", { value: name }, text));
+      this.colourBy = d.trajectory.states.some((state) => state !== "localised") ? "state" : "plain";
+      select.value = this.colourBy;
+      this.$legend = make("span", { class: "rv-legend" });
+      this.$layers.append(make("label", {}, "colour by ", select), this.$legend);
+    }
+
+    // --- view: metres (x, y) from the middle at the centre of the canvas, and pixels a metre ---------------------------
+    resize() {
+      const ratio = devicePixelRatio || 1, { clientWidth: w, clientHeight: h } = this.$frame;
+      if (!w || !h) return;
+      for (const canvas of [this.$base, this.$over]) { canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio); }
+      this.ratio = ratio;
+      if (this.whole || !this.scale) this.all(); else this.draw();
+      this.charts?.draw();
+    }
+    all() {
+      const [x0, y0, x1, y1] = this.data.extent;
+      this.x = this.y = 0;
+      this.scale = Math.min(this.$base.width / (x1 - x0), this.$base.height / (y1 - y0));
+      this.whole = true;
+      this.draw();
+    }
+    zoom(factor, px = this.$base.width / 2, py = this.$base.height / 2) {
+      const [mx, my] = this.metres(px, py), size = Math.max(this.data.extent[2] - this.data.extent[0], 1);
+      this.scale = Math.min(Math.max(this.scale * factor, 0.1 * this.$base.width / size), 20000);
+      const [nx, ny] = this.metres(px, py);
+      this.move(this.scale * (nx - mx), -this.scale * (ny - my));
+    }
+    move(dx, dy) { this.x -= dx / this.scale; this.y += dy / this.scale; this.whole = false; this.draw(); }
+    metres(px, py) { return [this.x + (px - this.$base.width / 2) / this.scale, this.y - (py - this.$base.height / 2) / this.scale]; }
+    pixels(x, y) { return [this.$base.width / 2 + (x - this.x) * this.scale, this.$base.height / 2 - (y - this.y) * this.scale]; }
+    world(c) { c.setTransform(this.scale, 0, 0, -this.scale, this.$base.width / 2 - this.x * this.scale, this.$base.height / 2 + this.y * this.scale); }
+
+    // --- drawing -------------------------------------------------------------------------------------------------------
+    ink(name) {
+      if (!this.colours) {
+        const style = getComputedStyle(this.root);
+        this.colours = new Proxy({}, { get: (known, key) => (known[key] ??= style.getPropertyValue(`--rv-${key}`).trim()) });
+        this.paths = null;
+      }
+      return this.colours[name];
+    }
+    draw() {
+      if (!this.scale || this.drawn) return;
+      // Once for each frame of the screen, however many events there were.
+      this.drawn = requestAnimationFrame(() => { this.drawn = null; this.drawBase(); this.drawOver(); });
+    }
+    drawBase() {
+      const c = this.$base.getContext("2d"), d = this.data;
+      c.setTransform(1, 0, 0, 1, 0, 0);
+      c.clearRect(0, 0, c.canvas.width, c.canvas.height);
+      this.world(c);
+      if (this.shown.has("map")) this.drawMap(c);
+      this.ink("ink");
+      this.paths ??= this.makePaths();
+      const px = this.ratio / this.scale, stroke = (path, colour, width, dash = []) => {
+        c.strokeStyle = colour; c.lineWidth = width * px; c.setLineDash(dash.map((n) => n * px)); c.stroke(path); c.setLineDash([]);
+      };
+      c.lineJoin = c.lineCap = "round";
+      if (this.shown.has("scans")) for (const k of d.scans.t.keys()) this.drawScan(c, k, 1.2 * px);
+      if (this.shown.has("points")) this.dots(c, d.points, this.ink("ink"), 3 * px);
+      if (this.shown.has("odometry")) stroke(this.paths.odometry, this.ink("vermillion"), 1.3, [2, 4]);
+      if (this.shown.has("refused")) stroke(this.paths.refused, this.ink("vermillion"), 1, [3, 4]);
+      if (this.shown.has("loops")) stroke(this.paths.loops, this.ink("green"), 1.6);
+      if (this.shown.has("trajectory")) for (const [colour, path] of this.paths.trajectory) stroke(path, colour, 2.6);
+      this.paths.others.forEach((path, k) => { if (this.shown.has(`other${k}`)) stroke(path, this.ink(d.others[k].ink), 2); });
+      if (this.shown.has("reference")) stroke(this.paths.reference, this.ink("ink"), 1.1, [6, 4]);
+      if (this.shown.has("ellipses")) stroke(this.paths.ellipses, this.ink("purple"), 1.2);
+      this.drawMarks(c);
+      this.drawScale();
+    }
+    drawMap(c) {
+      if (!this.image || !this.data.map) return;
+      const { side, width, height, corner: [x, y, theta] } = this.data.map;
+      c.save();
+      c.translate(...this.local(x, y));
+      c.rotate(theta);
+      c.scale(side, -side);
+      c.imageSmoothingEnabled = this.scale * side < 1.5;
+      c.drawImage(this.dark.matches ? (this.inverted ??= this.invert()) : this.image, 0, -height, width, height);
+      c.restore();
+    }
+    invert() {
+      const canvas = make("canvas"), c = canvas.getContext("2d");
+      canvas.width = this.data.map.width; canvas.height = this.data.map.height;
+      c.drawImage(this.image, 0, 0);
+      const pixels = c.getImageData(0, 0, canvas.width, canvas.height);
+      for (let k = 0; k < pixels.data.length; k += 4) for (let i = 0; i < 3; i += 1) pixels.data[k + i] = 242 - 0.88 * pixels.data[k + i];
+      c.putImageData(pixels, 0, 0);
+      return canvas;
+    }
+    dots(c, columns, colour, size) {
+      c.fillStyle = colour;
+      for (const k of columns.x.keys()) { const [x, y] = this.local(columns.x[k], columns.y[k]); c.fillRect(x - size / 2, y - size / 2, size, size); }
+    }
+    polyline(columns) {
+      const path = new Path2D(), breaks = new Set(columns?.breaks);
+      for (const k of columns ? columns.x.keys() : []) {
+        const at = this.local(columns.x[k], columns.y[k]);
+        if (k && !breaks.has(k)) path.lineTo(...at); else path.moveTo(...at);
+      }
+      return path;
+    }
+    makePaths() {
+      const d = this.data, paths = { odometry: this.polyline(d.odometry), reference: this.polyline(d.reference), trajectory: this.coloured(),
+        others: (d.others ?? []).map((other) => this.polyline(other)), loops: new Path2D(), refused: new Path2D(), ellipses: new Path2D() };
+      if (d.loops) for (const k of d.loops.t.keys()) {
+        const path = d.loops.accepted[k] ? paths.loops : paths.refused;
+        path.moveTo(...this.local(d.loops.x0[k], d.loops.y0[k]));
+        path.lineTo(...this.local(d.loops.x1[k], d.loops.y1[k]));
+      }
+      if (d.ellipses) for (const k of d.ellipses.t.keys()) {
+        const { xx, xy, yy } = Object.fromEntries(["xx", "xy", "yy"].map((name) => [name, d.ellipses[name][k]]));
+        const mean = (xx + yy) / 2, root = Math.hypot((xx - yy) / 2, xy), angle = 0.5 * Math.atan2(2 * xy, xx - yy);
+        const [x, y] = this.local(d.ellipses.x[k], d.ellipses.y[k]), a = 2 * Math.sqrt(mean + root), b = 2 * Math.sqrt(Math.max(mean - root, 0));
+        paths.ellipses.moveTo(x + a * Math.cos(angle), y + a * Math.sin(angle));
+        paths.ellipses.ellipse(x, y, a, b, angle, 0, 2 * Math.PI);
+      }
+      return paths;
+    }
+    // One path for each colour; the legend says what the colours mean.
+    coloured() {
+      const path = this.data.trajectory, breaks = new Set(path.breaks), found = new Map(), by = this.colourBy;
+      let colour = () => this.ink("blue");
+      this.$legend.replaceChildren();
+      const entry = (ink, text) => { const key = make("i", { class: "rv-key" }); key.style.borderColor = ink; this.$legend.append(key, `${text} `); };
+      if (by === "state") {
+        const inks = path.states.map((state) => this.ink(STATES[state] || "ink"));
+        colour = (k) => inks[path.state[k]];
+        path.states.forEach((state, k) => entry(inks[k], state.replaceAll("_", " ")));
+      } else if (by !== "plain") {
+        const values = by === "time" ? path.t : path[by], known = values.filter((v) => v !== null).sort((a, b) => a - b);
+        const low = by === "time" ? 0 : Math.min(known[0] ?? 0, 0), high = (by === "time" ? known.at(-1) : known[Math.floor(0.98 * (known.length - 1))]) || 1;
+        colour = (k) => values[k] === null ? this.ink("muted") : SCALE[Math.min(Math.max(Math.floor(SCALE.length * (values[k] - low) / (high - low)), 0), SCALE.length - 1)];
+        const text = (v) => by === "time" ? `${v.toFixed(0)} s` : length(v);
+        entry(SCALE[0], text(low)); entry(SCALE[4], text((low + high) / 2)); entry(SCALE[7], by === "time" ? text(high) : `${text(high)} and more`);
+      }
+      let last = null;
+      for (const k of path.x.keys()) {
+        const ink = colour(k), at = this.local(path.x[k], path.y[k]);
+        if (!found.has(ink)) found.set(ink, new Path2D());
+        const target = found.get(ink);
+        if (k === 0 || breaks.has(k)) target.moveTo(...at);
+        else { if (last !== ink) target.moveTo(...this.local(path.x[k - 1], path.y[k - 1])); target.lineTo(...at); }
+        last = ink;
+      }
+      return found;
+    }
+    drawMarks(c) {
+      c.setTransform(1, 0, 0, 1, 0, 0);
+      c.textAlign = "center"; c.textBaseline = "middle";
+      for (const mark of this.data.marks) {
+        if (!this.shown.has(mark.status)) continue;
+        c.font = `${(mark.status === "relocalised" ? 20 : 12) * this.ratio}px system-ui, sans-serif`;
+        c.fillStyle = this.ink(mark.status === "rejected" ? "vermillion" : "orange");
+        for (const k of mark.t.keys()) c.fillText(MARKS[mark.status], ...this.pixels(...this.local(mark.x[k], mark.y[k])));
+      }
+      const path = this.data.trajectory, n = path.x.length, end = (k, name, colour) => {
+        const [px, py] = this.pixels(...this.local(path.x[k], path.y[k])), r = 6 * this.ratio;
+        c.beginPath(); c.arc(px, py, r, 0, 2 * Math.PI); c.fillStyle = this.ink(colour); c.fill();
+        c.strokeStyle = this.ink("halo"); c.lineWidth = 2 * this.ratio; c.stroke();
+        c.font = `600 ${13 * this.ratio}px system-ui, sans-serif`; c.textAlign = "left"; c.lineWidth = 3 * this.ratio;
+        c.strokeText(name, px + 1.5 * r, py - 1.5 * r); c.fillStyle = this.ink("ink"); c.fillText(name, px + 1.5 * r, py - 1.5 * r);
+      };
+      if (n && this.shown.has("trajectory")) { end(n - 1, "end", "vermillion"); end(0, "start", "green"); }
+    }
+    drawScan(c, k, size) {
+      const { x, y, theta, count } = this.data.scans, cos = Math.cos(theta[k]), sin = Math.sin(theta[k]), [px, py] = this.local(x[k], y[k]);
+      for (let i = this.first[k]; i < this.first[k] + count[k]; i += 1) {
+        const bx = this.xy[2 * i], by = this.xy[2 * i + 1], near = this.near[i];
+        c.fillStyle = this.ink(near <= NEAR_CM ? "green" : near <= FAR_CM ? "orange" : "vermillion");
+        c.fillRect(px + cos * bx - sin * by - size / 2, py + sin * bx + cos * by - size / 2, size, size);
+      }
+    }
+    drawScale() {
+      const rough = 110 * this.ratio / this.scale, power = 10 ** Math.floor(Math.log10(rough));
+      const metres = [5, 2, 1].map((step) => step * power).find((step) => step <= rough * 1.000001) || power;
+      this.$scale.firstChild.style.width = `${metres * this.scale / this.ratio}px`;
+      this.$scale.lastChild.textContent = metres >= 1000 ? `${metres / 1000} km` : metres >= 1 ? `${metres} m` : `${Number((100 * metres).toPrecision(3))} cm`;
+    }
+    drawOver() {
+      const c = this.$over.getContext("2d"), path = this.data.trajectory, scans = this.data.scans, px = this.ratio / this.scale;
+      c.setTransform(1, 0, 0, 1, 0, 0);
+      c.clearRect(0, 0, c.canvas.width, c.canvas.height);
+      this.world(c);
+      if (scans && this.shown.has("scan")) this.drawScan(c, this.scanAt(this.time), Math.max(3.2 * px, 0.02));
+      if (path.t.length) {
+        const k = before(path.t, this.time), [x, y] = this.local(path.x[k], path.y[k]), size = Math.max(11 * px, 0.2);
+        c.save();
+        c.translate(x, y); c.rotate(path.theta[k]);
+        c.beginPath(); c.moveTo(size, 0); c.lineTo(-0.7 * size, 0.6 * size); c.lineTo(-0.4 * size, 0); c.lineTo(-0.7 * size, -0.6 * size); c.closePath();
+        c.fillStyle = this.ink("robot"); c.fill();
+        c.strokeStyle = this.ink("halo"); c.lineWidth = 1.2 * px; c.stroke();
+        c.restore();
+      }
+      if (this.measure?.length) {
+        const [a, b = a] = this.measure;
+        c.strokeStyle = c.fillStyle = this.ink("robot"); c.lineWidth = 2 * px;
+        c.beginPath(); c.moveTo(...a); c.lineTo(...b); c.stroke();
+        for (const end of [a, b]) { c.beginPath(); c.arc(...end, 4 * px, 0, 2 * Math.PI); c.fill(); }
+      }
+    }
+
+    // --- time ----------------------------------------------------------------------------------------------------------
+    scanAt(t) {
+      const times = this.data.scans.t, k = before(times, t);
+      return k + 1 < times.length && times[k + 1] - t < t - times[k] ? k + 1 : k;
+    }
+    seek(t) {
+      const path = this.data.trajectory, scans = this.data.scans;
+      this.time = Math.min(Math.max(t, 0), this.data.end);
+      this.$time.value = String(this.time);
+      const words = [`${this.time.toFixed(1)} s`];
+      if (path.t.length) {
+        const k = before(path.t, this.time);
+        words.push(`x ${path.x[k].toFixed(2)}, y ${path.y[k].toFixed(2)} m, ${(180 * path.theta[k] / Math.PI).toFixed(1)}°`, path.states[path.state[k]].replaceAll("_", " "));
+        if (path.sigma?.[k] != null) words.push(`σ ${length(path.sigma[k])}`);
+        if (path.error?.[k] != null) words.push(`error ${length(path.error[k])}`);
+      }
+      if (scans) { const k = this.scanAt(this.time); words.push(`scan at ${scans.t[k].toFixed(1)} s ${scans.status[k]}`); }
+      this.$now.textContent = words.join(" · ");
+      this.charts.now = this.time;
+      this.charts.cursor(this.time);
+      if (this.scale) this.drawOver();
+      this.root.dispatchEvent(new CustomEvent("seek", { detail: this.time }));
+    }
+    step(steps) {
+      const times = this.data.scans ? this.data.scans.t : this.data.trajectory.t;
+      if (!times.length) return;
+      const k = this.data.scans ? this.scanAt(this.time) : before(times, this.time);
+      this.seek(times[Math.min(Math.max(k + steps, 0), times.length - 1)]);
+    }
+    jump(forward) {
+      const events = this.data.events.filter((event) => !this.$kind.value || event.kind === this.$kind.value);
+      const found = forward ? events.find((event) => event.t > this.time + 1e-6) : events.findLast((event) => event.t < this.time - 1e-6);
+      this.$event.textContent = found ? `${found.kind} at ${found.t.toFixed(1)} s${found.text ? `: ${found.text}` : ""}` : "no further event";
+      if (!found) return;
+      this.seek(found.t);
+      const path = this.data.trajectory, k = before(path.t, found.t);
+      const [px, py] = this.pixels(...this.local(path.x[k], path.y[k])), { width, height } = this.$base;
+      if (px < 0 || py < 0 || px > width || py > height) this.move(width / 2 - px, height / 2 - py);
+    }
+    stop() { cancelAnimationFrame(this.playing); this.playing = null; this.$play.textContent = "Play"; }
+    play() {
+      if (this.playing !== null) { this.stop(); return; }
+      if (this.time >= this.data.end) this.seek(0);
+      let last = performance.now();
+      this.$play.textContent = "Stop";
+      const step = (now) => {
+        this.seek(this.time + this.speed * (now - last) / 1000);
+        last = now;
+        if (this.time < this.data.end) this.playing = requestAnimationFrame(step); else this.stop();
+      };
+      this.playing = requestAnimationFrame(step);
+    }
+  }
+  globalThis.ResultView = ResultView;
+})();

@@ -1,0 +1,44 @@
+// What every part of the page needs. Whatever comes from a log or a person goes in as text, never as markup.
+
+import { Refused } from "./api.js";
+
+export const $ = (id) => document.getElementById(id);
+export const ACTIVE = ["queued", "running", "cancelling"];
+
+export function element(tag, text = "", className = "") {
+  const made = document.createElement(tag);
+  made.textContent = text;
+  if (className) made.className = className;
+  return made;
+}
+
+export function button(text, work, className = "") {
+  const made = element("button", text, className);
+  made.type = "button";
+  made.addEventListener("click", () => guarded(work));
+  return made;
+}
+
+export function notice(text) {
+  $("notice").textContent = text;
+  $("notice").hidden = !text;
+}
+
+export async function guarded(work) {
+  try { return await work(); } catch (error) {
+    if (error.name !== "AbortError") notice(error instanceof Refused || error instanceof SyntaxError ? error.message : `the server cannot be reached (${error.message})`);
+    return undefined;
+  }
+}
+
+export const bytes = (n) => n < 1e6 ? `${(n / 1e3).toFixed(0)} kB` : n < 1e9 ? `${(n / 1e6).toFixed(1)} MB` : `${(n / 1e9).toFixed(2)} GB`;
+export const when = (text) => new Date(text).toLocaleString();
+export const duration = (s) => s < 60 ? `${s.toFixed(1)} s` : s < 3600 ? `${Math.floor(s / 60)} min ${String(Math.round(s % 60)).padStart(2, "0")} s` : `${Math.floor(s / 3600)} h ${String(Math.round(s % 3600 / 60)).padStart(2, "0")} min`;
+
+// The verdict of a result, or the state of a job that has none.
+export function badge(job) {
+  const verdict = job.state === "succeeded" && (job.summary?.verdict ?? job.summary?.metrics?.verdict);
+  const made = verdict ? element("span", verdict, `badge verdict-${verdict}`) : element("span", job.state, `badge state ${job.state}`);
+  made.dataset.state = job.state;
+  return made;
+}

@@ -1,0 +1,38 @@
+// The uploads: what is there, use it again, delete it.
+
+import { get, request } from "./api.js";
+import { $, button, bytes, element, guarded, when } from "./dom.js";
+
+let shown = [];
+let next = null;
+
+function row(file, useAgain) {
+  const line = element("tr"), cell = (...content) => { const made = element("td"); made.append(...content); line.append(made); };
+  cell(element("span", file.name, "name"));
+  cell(file.state === "complete" ? bytes(file.size) : `${bytes(file.received)} of ${file.size === null ? "?" : bytes(file.size)}`);
+  cell(when(file.created));
+  cell(element("code", file.sha256?.slice(0, 12) ?? ""));
+  const buttons = element("div", "", "row");
+  if (file.state === "complete") buttons.append(button("New job", () => useAgain(file.id)));
+  buttons.append(button("Delete", async () => {
+    if (!confirm(`Delete the upload ${file.name}?`)) return;
+    await request(`/v1/files/${file.id}`, { method: "DELETE" });
+    await show(useAgain);
+  }));
+  cell(buttons);
+  return line;
+}
+
+export async function show(useAgain, more = false) {
+  const found = await get(`/v1/files?limit=50${more && next ? `&before=${next}` : ""}`);
+  shown = more ? [...shown, ...found.files] : found.files;
+  next = found.next;
+  $("file-table").tBodies[0].replaceChildren(...shown.map((file) => row(file, useAgain)));
+  $("file-table").hidden = shown.length === 0;
+  $("no-files").hidden = shown.length > 0;
+  $("more-files").hidden = !next;
+}
+
+export function listen(useAgain) {
+  $("more-files").addEventListener("click", () => guarded(() => show(useAgain, true)));
+}

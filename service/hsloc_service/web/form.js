@@ -1,0 +1,123 @@
+// The form of a new job: files that are dropped, chosen or uploaded already, and the options that the server offers.
+
+import { get, post } from "./api.js";
+import { $, bytes, element, guarded, notice, when } from "./dom.js";
+import { chosen as chosenOptions } from "./options.js";
+import { upload } from "./upload.js";
+
+let uploading = null;
+const sent = new WeakMap(); // files that were uploaded for a job that is not queued yet, with their ids
+
+function chosenLog() {
+  const files = [...$("log").files];
+  $("drop-text").textContent = files.length ? `${files.map((f) => f.name).join(", ")} (${bytes(files.reduce((n, f) => n + f.size, 0))})` : "Choose logs, or drop them here";
+  $("many").hidden = files.length < 2;
+}
+
+export function listen(submitted) {
+  $("log").addEventListener("change", chosenLog);
+  for (const kind of ["dragover", "dragleave", "drop"]) {
+    $("drop").addEventListener(kind, (event) => {
+      event.preventDefault();
+      $("drop").classList.toggle("over", kind === "dragover");
+      if (kind === "drop" && event.dataTransfer.files.length) {
+        $("log").files = event.dataTransfer.files;
+        chosenLog();
+      }
+    });
+  }
+  $("more-options").addEventListener("toggle", () => { if ($("more-options").open) guarded(reusable); });
+  $("upload-form").addEventListener("submit", async (event) => {
+    event.preventDefault();
+    notice("");
+    uploading = new AbortController();
+    $("go").disabled = true;
+    $("stop").hidden = $("upload-progress").hidden = false;
+    const jobs = await guarded(submit);
+    if (uploading.signal.aborted) $("upload-text").textContent += ": paused; the same file goes on from here";
+    $("go").disabled = false;
+    $("go").textContent = uploading.signal.aborted ? "Go on" : "Upload and run";
+    $("stop").hidden = true;
+    if (jobs) submitted(jobs);
+  });
+  $("stop").addEventListener("click", () => uploading.abort());
+}
+
+function options() {
+  const found = chosenOptions($("options"));
+  if ($("resume").value) found.resume = $("resume").value;
+  return found;
+}
+
+async function submit() {
+  const wanted = options(), files = [...$("log").files], stored = $("stored").value;
+  if (!files.length && !stored) throw new SyntaxError("choose a log, or drop one on the field");
+  const report = (name) => (done, total, note) => {
+    $("upload-bar").value = total ? done / total : 1;
+    $("upload-text").textContent = `${name}: ${bytes(done)} of ${bytes(total)}${note ? `: ${note}` : ""}`;
+  };
+  // What is there already is not sent again when a later file was paused or refused.
+  const send = async (file) => {
+    if (!sent.has(file)) sent.set(file, await upload(file, report(file.name), uploading.signal));
+    return sent.get(file);
+  };
+  const map = [...$("map").files];
+  if (map.length) {
+    const yaml = map.find((file) => /\.ya?ml$/i.test(file.name)), image = map.find((file) => file !== yaml);
+    if (!yaml || !image || map.length !== 2) throw new SyntaxError("a map is two files: its YAML and its image");
+    wanted.map = { yaml: await send(yaml), image: await send(image) };
+  } else if ($("stored-map").value) {
+    const [yaml, image] = $("stored-map").value.split(" ");
+    wanted.map = { yaml, image };
+  }
+  const others = ["relations", "reference", "calibration"].filter((name) => $(name).files.length);
+  for (const name of others) wanted[name] = await send($(name).files[0]);
+  const parts = document.querySelector("input[name=many]:checked").value === "parts" && files.length > 1;
+  const requests = [];
+  if (parts) {
+    const logs = [];
+    for (const file of files) logs.push(await send(file));
+    requests.push([{ ...wanted, logs }, files]);
+  } else {
+    if (stored) requests.push([{ ...wanted, log: stored }, []]);
+    for (const file of files) requests.push([{ ...wanted, log: await send(file) }, [file]]);
+  }
+  const jobs = [];
+  for (const [request, used] of requests) {
+    jobs.push(await post("/v1/jobs", request, { "Idempotency-Key": crypto.randomUUID ? crypto.randomUUID() : String(Math.random()) }));
+    for (const file of used) sent.delete(file);
+  }
+  for (const file of [...map, ...others.map((name) => $(name).files[0])]) sent.delete(file);
+  return jobs;
+}
+
+// Uploads and maps that another job can use; rebuilt only if they changed, so that an open list stays open.
+async function reusable() {
+  const { files } = await get("/v1/files?limit=200"), complete = files.filter((file) => file.state === "complete");
+  const isMap = (file) => /\.(ya?ml|pgm|png|bmp)$/i.test(file.name), stem = (name) => name.replace(/\.[^.]+$/, "");
+  const logs = complete.filter((file) => !isMap(file)).map((file) => [file.id, `${file.name}, ${bytes(file.size)}, ${when(file.created)}`]);
+  const images = complete.filter((file) => /\.(pgm|png|bmp)$/i.test(file.name));
+  const maps = complete.filter((file) => /\.ya?ml$/i.test(file.name)).flatMap((yaml) => {
+    const image = images.find((each) => stem(each.name) === stem(yaml.name)) ?? images[0];
+    return image ? [[`${yaml.id} ${image.id}`, `${yaml.name} and ${image.name}, ${when(yaml.created)}`]] : [];
+  });
+  const { jobs } = await get("/v1/jobs?limit=200&state=succeeded&brief=true");
+  const built = jobs.filter((job) => job.summary?.mode === "slam" && job.request.mapper !== "point" && job.request.config?.mapper !== "point");
+  fill($("stored"), "none", logs);
+  fill($("stored-map"), "none", maps);
+  fill($("resume"), "none: begin a new one", built.map((job) => [job.id, `${job.log}, ${when(job.created)}`]));
+}
+
+function fill(box, none, entries) {
+  const values = ["", ...entries.map(([value]) => value)], before = box.value;
+  if (values.join() === [...box.options].map((option) => option.value).join()) return;
+  box.replaceChildren(...[["", none], ...entries].map(([value, text]) => { const made = element("option", text); made.value = value; return made; }));
+  box.value = values.includes(before) ? before : "";
+}
+
+// For an upload that is to be used in a new job.
+export async function use(file) {
+  $("more-options").open = true;
+  await guarded(reusable);
+  $("stored").value = file;
+}

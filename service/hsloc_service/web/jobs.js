@@ -1,0 +1,92 @@
+// The table of jobs: search, filter, order, pages, and what can be done with those that are ticked.
+
+import { get, post, request } from "./api.js";
+import { $, badge, duration, element, guarded, when } from "./dom.js";
+
+const PAGE = 50;
+const ticked = new Set();
+let offset = 0;
+
+// Of a table that is polled every row stays while it says the same, so that focus and ticks stay.
+const rows = new Map();
+
+function row(job) {
+  const key = JSON.stringify(job, (name, value) => name === "age_s" || name === "heartbeat_age_s" ? undefined : value);
+  const known = rows.get(job.id);
+  if (known?.key === key) return known.line;
+  const line = element("tr"), cell = (...content) => { const made = element("td"); made.append(...content); line.append(made); return made; };
+  const box = element("input");
+  box.type = "checkbox";
+  box.checked = ticked.has(job.id);
+  box.setAttribute("aria-label", `tick ${job.log}`);
+  box.addEventListener("change", () => { if (box.checked) ticked.add(job.id); else ticked.delete(job.id); tick(); });
+  cell(box);
+  const link = element("a", job.log, "name");
+  link.href = `#job=${job.id}`;
+  link.dataset.job = job.id;
+  cell(link);
+  const result = cell(badge(job)), summary = job.summary ?? {};
+  if (job.progress) {
+    const bar = element("progress");
+    bar.value = job.progress.fraction;
+    bar.setAttribute("aria-label", `${job.progress.phase} of ${job.log}`);
+    result.append(bar);
+  }
+  cell(summary.key_figures?.map((figure) => `${figure.name} ${figure.values.join(" / ")}`).join(" · ") || job.message || "");
+  cell(summary.mode ?? "");
+  cell(summary.duration_s ? duration(summary.duration_s) : "");
+  cell(job.started && job.ended ? duration((new Date(job.ended) - new Date(job.started)) / 1000) : "");
+  cell(when(job.created) + (job.rerun_of ? ", run again" : ""));
+  if (known && known.line.contains(document.activeElement)) queueMicrotask(() => link.focus());
+  rows.set(job.id, { key, line });
+  return line;
+}
+
+export async function refresh() {
+  const query = new URLSearchParams({ brief: "true", limit: PAGE, offset, order: $("order").value });
+  if ($("search").value.trim()) query.set("search", $("search").value.trim());
+  const [name, value] = $("filter").value.split("=");
+  if (value) query.set(name, value);
+  const { jobs, total } = await get(`/v1/jobs?${query}`);
+  if (!jobs.length && offset) { offset = Math.max(offset - PAGE, 0); return refresh(); }
+  const lines = jobs.map(row), body = $("jobs").tBodies[0];
+  if (lines.length !== body.rows.length || lines.some((line, k) => body.rows[k] !== line)) body.replaceChildren(...lines);
+  for (const id of rows.keys()) if (!jobs.some((job) => job.id === id)) rows.delete(id);
+  const filtered = Boolean(value || $("search").value.trim());
+  $("no-jobs").hidden = total > 0 || filtered;
+  $("jobs").hidden = total === 0 && !filtered;
+  $("page-text").textContent = total ? `${offset + 1} to ${offset + jobs.length} of ${total}` : filtered ? "no such job" : "";
+  $("newer").disabled = offset === 0;
+  $("older").disabled = offset + jobs.length >= total;
+  tick();
+  return jobs;
+}
+
+function tick() {
+  $("ticked").hidden = ticked.size === 0;
+  $("ticked-text").textContent = `${ticked.size} ticked`;
+  $("compare-ticked").disabled = ticked.size < 2;
+}
+
+async function each(work) {
+  try { for (const id of [...ticked]) { await work(id); ticked.delete(id); } } finally {
+    rows.clear();
+    await refresh();
+  }
+}
+
+export function listen() {
+  const again = () => { offset = 0; guarded(refresh); };
+  let timer = null;
+  $("search").addEventListener("input", () => { clearTimeout(timer); timer = setTimeout(again, 250); });
+  $("filter").addEventListener("change", again);
+  $("order").addEventListener("change", again);
+  $("older").addEventListener("click", () => { offset += PAGE; guarded(refresh); });
+  $("newer").addEventListener("click", () => { offset = Math.max(offset - PAGE, 0); guarded(refresh); });
+  $("compare-ticked").addEventListener("click", () => { location.hash = `compare=${[...ticked].join(",")}`; });
+  $("rerun-ticked").addEventListener("click", () => guarded(() => each((id) => post(`/v1/jobs/${id}/rerun`))));
+  $("delete-ticked").addEventListener("click", () => {
+    if (!confirm(`Delete ${ticked.size} jobs and their results?`)) return;
+    guarded(() => each((id) => request(`/v1/jobs/${id}`, { method: "DELETE" })));
+  });
+}

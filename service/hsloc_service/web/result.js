@@ -1,0 +1,156 @@
+// One job: its state while it runs, then its result as report.html shows it.
+
+import { events, get, hasToken, post, request } from "./api.js";
+import { $, ACTIVE, badge, button, bytes, element, guarded } from "./dom.js";
+
+let watching = null; // AbortController of the job that is shown
+let view = null;
+
+export function leave() {
+  watching?.abort();
+  watching = null;
+  view?.end();
+  view = null;
+}
+
+export async function show(id, focus) {
+  leave();
+  watching = new AbortController();
+  const mine = watching.signal;
+  $("result").hidden = true;
+  const job = await guarded(() => get(`/v1/jobs/${id}`));
+  if (!job || mine.aborted) return;
+  render(job);
+  if (focus) $("job-title").focus();
+  if (ACTIVE.includes(job.state)) {
+    for await (const _ of events(`/v1/jobs/${id}/events`, mine)) {
+      const now = await guarded(() => get(`/v1/jobs/${id}`));
+      if (now && !mine.aborted) render(now);
+    }
+  }
+  if (mine.aborted) return;
+  const ended = await guarded(() => get(`/v1/jobs/${id}`));
+  if (!ended || mine.aborted) return;
+  render(ended);
+  if (ended.state === "succeeded") await guarded(() => showResult(ended, mine));
+}
+
+function render(job) {
+  document.title = `${job.log}: hsloc`;
+  $("job-title").textContent = job.log;
+  const state = $("job-state");
+  state.replaceChildren(element("span", job.state, `state ${job.state}`));
+  if (job.reason) state.append(` (${job.reason})`);
+  if (job.message) state.append(`: ${job.message}`);
+  if (job.state === "queued") state.append(": waits for a slot");
+  const progress = job.progress;
+  $("job-bar").hidden = !ACTIVE.includes(job.state);
+  if (progress) {
+    $("job-bar").value = progress.fraction;
+    const speed = progress.phase === "replay" && progress.speed ? `, ${progress.speed.toFixed(0)} times real time` : "";
+    const amount = progress.phase === "replay" ? `${progress.done.toFixed(0)} of ${progress.total.toFixed(0)} s` : `${Math.round(100 * progress.fraction)} %`;
+    state.append(`: ${progress.phase}, ${amount}${speed}, ${progress.age_s.toFixed(0)} s ago`);
+  } else {
+    $("job-bar").removeAttribute("value");
+  }
+  const settings = Object.fromEntries(Object.entries(job.request).filter(([, value]) => value !== null));
+  $("job-request").lastElementChild.textContent = JSON.stringify(settings, null, 2);
+  const buttons = [];
+  if (ACTIVE.includes(job.state)) {
+    buttons.push(button("Cancel", async () => { await post(`/v1/jobs/${job.id}/cancel`); render(await get(`/v1/jobs/${job.id}`)); }));
+  } else {
+    buttons.push(button("Run again", async () => { location.hash = `job=${(await post(`/v1/jobs/${job.id}/rerun`)).id}`; }));
+    buttons.push(button("Delete", async () => {
+      if (!confirm(`Delete the job on ${job.log} and its results?`)) return;
+      await request(`/v1/jobs/${job.id}`, { method: "DELETE" });
+      location.hash = "";
+    }));
+  }
+  $("job-buttons").replaceChildren(...buttons);
+}
+
+// The view of a job, and the picture of its map.
+export async function load(job) {
+  const base = `/v1/jobs/${job.id}/results`, data = await get(`${base}/viewer.json`);
+  // Jobs of earlier versions have a view that this page cannot draw.
+  if (!data.extent) return null;
+  const image = data.map ? await createImageBitmap(await (await request(`${base}/${data.map.image}`)).blob()) : null;
+  return { data, image };
+}
+
+async function showResult(job, mine) {
+  const base = `/v1/jobs/${job.id}/results`, manifest = await get(base);
+  const names = new Set(manifest.assets.map((asset) => asset.name));
+  const files = manifest.assets.filter((a) => !a.name.startsWith("viewer")).map(assetLine), zip = element("li");
+  zip.append(button("all files (.zip)", () => download(`${base}.zip`, "results.zip")));
+  if (names.has("report.html") && !hasToken()) {
+    const item = element("li"), link = element("a", "open the report");
+    link.href = `${base}/report.html?download=false`;
+    link.target = "_blank";
+    item.append(link);
+    files.unshift(item);
+  }
+  $("assets").replaceChildren(...files, zip);
+  summary(job, null);
+  $("result").hidden = false;
+  const loaded = names.has("viewer.json") ? await load(job) : null;
+  if (!loaded || mine.aborted) return;
+  summary(job, loaded.data.summary);
+  view = new globalThis.ResultView($("view"), loaded.data, loaded.image, $("charts"));
+}
+
+function assetLine(asset) {
+  const item = element("li");
+  item.append(button(asset.name, () => download(asset.href, asset.name)), element("span", bytes(asset.size), "quiet"), element("code", asset.sha256));
+  return item;
+}
+
+// Through fetch, because a link cannot carry the token.
+async function download(path, name) {
+  const blob = await (await request(path)).blob();
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+}
+
+// The summary as the reports show it: made once, by hsloc.report.summary. The job's row holds it without explanations.
+function summary(job, whole) {
+  const short = job.summary ?? {}, found = short.metrics ?? {}, figures = whole?.figures ?? short.figures ?? [];
+  const headline = element("span", short.headline ?? "");
+  $("headline").replaceChildren(badge(job), " ", headline);
+  if (short.verdict_text) badgeText($("headline").firstChild, short.verdict_text);
+  $("key-figures").replaceChildren(...(short.key_figures ?? []).map((name) => {
+    const figure = figures.find((each) => each.name === name), box = element("div");
+    box.append(element("dt", name), element("dd", figure?.values.join(" / ") ?? ""), element("dd", figure?.explanation ?? "", "quiet"));
+    return box;
+  }));
+  const reasons = short.verdict_reasons ?? [], known = new Set(reasons.map((reason) => reason.text));
+  const warnings = whole?.warnings ?? [...(short.warnings ?? []).filter((warning) => !known.has(warning.text)).map(warningText), ...(short.notes ?? [])];
+  const list = (title, lines) => {
+    if (!lines.length) return [];
+    const all = element("ul");
+    all.append(...lines.map((text) => element("li", text)));
+    return [element("h3", title), all];
+  };
+  $("notes").replaceChildren(...list("Look at this", whole?.reasons ?? reasons.map((reason) => reason.line)), ...list("Warnings", warnings));
+  const rows = [];
+  const row = (name, values, explanation = "") => {
+    const line = element("tr"), head = element("th", name);
+    head.scope = "row";
+    line.append(head, element("td", values.join(", ")), element("td", explanation, "quiet"));
+    rows.push(line);
+  };
+  if (found.verdict) row("verdict", [short.verdict_text ?? found.verdict]);
+  for (const figure of figures) row(figure.name, figure.values, figure.explanation);
+  if (found.log) row("log", [`${found.log.duration_s.toFixed(1)} s, ${found.log.path_length_m.toFixed(1)} m, ${found.log.odometry_messages} odometry messages`]);
+  if (short.timings?.times_real_time) row("speed", [`${short.timings.times_real_time.toFixed(0)} times real time`]);
+  if (found.run) row("run", [`hsloc ${found.run.hsloc}, ${found.run.matcher ?? "graph mapper"}, preset ${found.run.preset}, seed ${found.run.seed}`]);
+  if (found.run) row("SHA-256 of the log", [found.run.input_sha256]);
+  $("metrics").tBodies[0].replaceChildren(...rows);
+}
+
+const badgeText = (mark, text) => { mark.title = text; };
+// Jobs of earlier versions hold warnings as text.
+const warningText = (warning) => typeof warning === "string" ? warning : [warning.text, warning.remedy].filter(Boolean).join("; ");

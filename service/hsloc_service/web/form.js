@@ -6,7 +6,7 @@ import { chosen as chosenOptions } from "./options.js";
 import { upload } from "./upload.js";
 
 let uploading = null;
-const sent = new WeakMap(); // files that were uploaded for a job that is not queued yet, with their ids
+const sent = new WeakMap(); // files that were uploaded, with their ids: the same choice is not sent twice
 
 function chosenLog() {
   const files = [...$("log").files];
@@ -77,17 +77,21 @@ async function submit() {
   if (parts) {
     const logs = [];
     for (const file of files) logs.push(await send(file));
-    requests.push([{ ...wanted, logs }, files]);
+    requests.push({ ...wanted, logs });
   } else {
-    if (stored) requests.push([{ ...wanted, log: stored }, []]);
-    for (const file of files) requests.push([{ ...wanted, log: await send(file) }, [file]]);
+    if (stored) requests.push({ ...wanted, log: stored });
+    for (const file of files) requests.push({ ...wanted, log: await send(file) });
   }
   const jobs = [];
-  for (const [request, used] of requests) {
-    jobs.push(await post("/v1/jobs", request, { "Idempotency-Key": crypto.randomUUID ? crypto.randomUUID() : String(Math.random()) }));
-    for (const file of used) sent.delete(file);
+  try {
+    for (const request of requests) {
+      jobs.push(await post("/v1/jobs", request, { "Idempotency-Key": crypto.randomUUID ? crypto.randomUUID() : String(Math.random()) }));
+    }
+  } catch (error) {
+    // An upload may have been deleted: the next attempt sends all of them again.
+    for (const file of [...files, ...map, ...others.map((name) => $(name).files[0])]) sent.delete(file);
+    throw error;
   }
-  for (const file of [...map, ...others.map((name) => $(name).files[0])]) sent.delete(file);
   return jobs;
 }
 

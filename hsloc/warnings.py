@@ -39,6 +39,8 @@ class WarningCode(StrEnum):
     """angle_min, angle_max, angle_increment and the number of beams contradict each other."""
     SCAN_RANGE_MAX = "scan_range_max"
     """Many readings are larger than range_max and are discarded."""
+    SCAN_NO_RETURN_CODE = "scan_no_return_code"
+    """A finite reading at the end of the scale that follows no wall is read as no return."""
     SCAN_TIME_INCREMENT = "scan_time_increment"
     """time_increment does not fit the time between scans."""
     MAP_IS_COSTMAP = "map_is_costmap"

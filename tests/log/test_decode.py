@@ -20,6 +20,7 @@ from hsloc.log.messages import decode, definitions, encode
 from hsloc.log.messages import definition_compatibility as schema
 from hsloc.log.messages.decoders import Undecodable, decoder_for, is_decodable
 from hsloc.log.messages.from_objects import FROM_OBJECT
+from hsloc.log.session.scan_geometry import ScanFixes
 from hsloc.log.transforms import Transform3
 from hsloc.model import OccupancyGrid, Pose2
 
@@ -46,14 +47,15 @@ def payloads(frame: str, child: str) -> dict[str, bytes]:
     }
 
 
-def multi_echo(frame: str) -> bytes:
+def multi_echo(frame: str, intensities: tuple[list[float], ...] = ()) -> bytes:
     """A scan of which some beams have no echo, and some several."""
     kinds = ROS2.types
     header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](START // 10**9, 5), frame)
     echoes = [np.array(values, dtype=np.float32) for values in ([1.5], [], [2.5, 3.5], [4.0])]
     beams = [kinds["sensor_msgs/msg/LaserEcho"](values) for values in echoes]
+    strengths = [kinds["sensor_msgs/msg/LaserEcho"](np.array(values, dtype=np.float32)) for values in intensities]
     name = definitions.MULTI_ECHO_LASER_SCAN
-    message = kinds[name](header, -1.0, 1.0, 0.5, 0.0, 0.1, 0.05, 12.0, beams, [])
+    message = kinds[name](header, -1.0, 1.0, 0.5, 0.0, 0.1, 0.05, 12.0, beams, strengths)
     return bytes(ROS2.serialize_cdr(message, name))
 
 
@@ -279,3 +281,21 @@ def test_hostile_definitions_are_refused_at_once(text: str, encoding: str) -> No
     with pytest.raises(LogFormatError, match="/topic: "):
         decoder_for(channel(definitions.LASER_SCAN, text, encoding))
     assert time.perf_counter() - begin < 1.0
+
+
+def test_the_strongest_echo_of_each_beam() -> None:
+    data = multi_echo("laser", ([7.0], [], [3.0, 9.0], [5.0]))
+    message = decode.BY_HAND[definitions.MULTI_ECHO_LASER_SCAN](memoryview(data))
+    np.testing.assert_array_equal(message.ranges, np.array((1.5, np.nan, 2.5, 4.0), dtype=np.float32))
+    fixed = ScanFixes.parse("echo=strongest").apply(message, None)
+    np.testing.assert_array_equal(fixed.ranges, np.array((1.5, np.nan, 3.5, 4.0), dtype=np.float32))
+    np.testing.assert_array_equal(fixed.intensities, np.array((7.0, np.nan, 9.0, 5.0), dtype=np.float32))
+    assert plain(fixed) == plain(ScanFixes.parse("echo=strongest").apply(by_rosbags(data), None))
+
+
+def by_rosbags(data: bytes) -> decode.ScanMessage:
+    """The slow way."""
+    name = definitions.MULTI_ECHO_LASER_SCAN
+    found = FROM_OBJECT[name](ROS2.deserialize_cdr(data, name))
+    assert isinstance(found, decode.ScanMessage)
+    return found

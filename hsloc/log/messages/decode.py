@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from math import nan
-from struct import Struct
+from struct import Struct, unpack_from
 from struct import error as StructError
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,7 +20,7 @@ from hsloc.log.transforms import Transform3
 from hsloc.model import OccupancyGrid, Pose2
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -60,6 +60,8 @@ class ScanMessage(NamedTuple):
     T_frame_laser: Transform3 | None = None
     """The laser's pose in `frame_id`, which Foxglove's message has and ROS's has not."""
     angle_max: float = nan
+    strongest: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
+    """Ranges and intensities of the strongest echo of each beam, of a lidar that tells several."""
 
 
 class OdometryMessage(NamedTuple):
@@ -103,7 +105,6 @@ class PoseMessage(NamedTuple):
 _STAMP_AND_SIZE = Struct("<iII")
 _SIZE = Struct("<I")
 _SCAN = Struct("<7fI")
-_F4_ONE = Struct("<f")
 _POSE = Struct("<7d")
 POSE_BYTES = _POSE.size
 _F4 = np.dtype("<f4")
@@ -200,32 +201,54 @@ def laser_scan(data: Payload) -> ScanMessage:
 
 
 def multi_echo_laser_scan(data: Payload) -> ScanMessage:
-    """sensor_msgs/MultiEchoLaserScan from CDR: of each beam the first echo, NaN where it has none."""
+    """sensor_msgs/MultiEchoLaserScan from CDR: of each beam the first echo and the strongest, NaN where it has none."""
     alignment(data)
     stamp, frame, at = header(data, 4)
     at = aligned(at, 4)
     angle_min, angle_max, increment, time_increment, scan_time, range_min, range_max, count = _SCAN.unpack_from(
         data, at
     )
-    ranges, at = _first_echoes(data, at + _SCAN.size, count)
+    echoes, at = _echoes(data, at + _SCAN.size, count)
     (count,) = _SIZE.unpack_from(data, at)
-    intensities = _first_echoes(data, at + 4, count)[0] if count else None
+    strengths = _echoes(data, at + 4, count)[0] if count else []
+    ranges, intensities, strongest = chosen_echoes(echoes, strengths)
     values = (increment, time_increment, range_min, range_max, ranges, intensities, scan_time)
-    return ScanMessage(stamp, frame, angle_min, *values, angle_max=angle_max)
+    return ScanMessage(stamp, frame, angle_min, *values, angle_max=angle_max, strongest=strongest)
 
 
-def _first_echoes(data: Payload, at: int, count: int) -> tuple[NDArray[np.float32], int]:
+def _echoes(data: Payload, at: int, count: int) -> tuple[list[tuple[float, ...]], int]:
     if at + 4 * count > len(data):
         raise ValueError("more echoes than the message holds")
-    echoes = np.full(count, np.nan, dtype=np.float32)
-    for beam in range(count):
+    echoes = []
+    for _ in range(count):
         (size,) = _SIZE.unpack_from(data, at)
         if at + 4 + 4 * size > len(data):
             raise ValueError("more echoes than the message holds")
-        if size:
-            (echoes[beam],) = _F4_ONE.unpack_from(data, at + 4)
+        echoes.append(unpack_from(f"<{size}f", data, at + 4))
         at += 4 + 4 * size
     return echoes, at
+
+
+def chosen_echoes(
+    ranges: Sequence[Sequence[float]], intensities: Sequence[Sequence[float]]
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, tuple[NDArray[np.float32], NDArray[np.float32]] | None]:
+    """Ranges and intensities of the first echo of each beam, and both of the strongest one if intensities are there."""
+    first = np.array([echoes[0] if len(echoes) else nan for echoes in ranges], dtype=np.float32)
+    if len(intensities) != len(ranges):
+        strengths = np.array([echoes[0] if len(echoes) else nan for echoes in intensities], dtype=np.float32)
+        return first, strengths if len(strengths) else None, None
+    best = np.full((2, len(ranges)), np.nan, dtype=np.float32)
+    strengths = np.full(len(ranges), np.nan, dtype=np.float32)
+    for beam, (echoes, strength) in enumerate(zip(ranges, intensities, strict=True)):
+        if len(strength):
+            strengths[beam] = strength[0]
+        count = min(len(echoes), len(strength))
+        if count:
+            k = max(range(count), key=strength.__getitem__)
+            best[:, beam] = echoes[k], strength[k]
+        elif len(echoes):
+            best[0, beam] = echoes[0]
+    return first, strengths if len(strengths) else None, (best[0], best[1])
 
 
 @lru_cache(maxsize=64)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from hsloc.log.messages.decode import (
     OdometryMessage,
     PoseMessage,
     ScanMessage,
+    chosen_echoes,
     make_grid,
     plane_covariance,
 )
@@ -45,12 +45,12 @@ def object_laser_scan(message: Any) -> ScanMessage:
 
 
 def object_multi_echo_laser_scan(message: Any) -> ScanMessage:
-    """From a message object: of each beam the first echo."""
-    ranges, intensities = (
-        np.array([beam.echoes[0] if len(beam.echoes) else nan for beam in beams], dtype=np.float32)
-        for beams in (message.ranges, message.intensities)
+    """From a message object: of each beam the first echo and the strongest."""
+    ranges, intensities, strongest = chosen_echoes(
+        [beam.echoes for beam in message.ranges], [beam.echoes for beam in message.intensities]
     )
-    return _object_scan(message, ranges, intensities)
+    none = np.zeros(0, dtype=np.float32)
+    return _object_scan(message, ranges, none if intensities is None else intensities)._replace(strongest=strongest)
 
 
 def _object_scan(message: Any, ranges: NDArray[np.float32], intensities: NDArray[np.float32]) -> ScanMessage:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import isfinite, pi
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -72,6 +73,7 @@ class ScanFeed:
         """
         self._fixes = ScanFixes() if fixes is None else fixes
         self._survey = ScanSurvey() if survey is None else survey
+        self._code = replace(self._survey.no_return)
         self._turns = TurnAssembler(self._survey) if self._survey.segments > 1 else None
         self.topic = clock.topic
         self.clocks = (clock,)
@@ -101,6 +103,8 @@ class ScanFeed:
         ):
             self._losses.invalid_messages[self.topic] += 1
             return ()
+        self._code.learn(ranges, increment, (range_min, range_max))
+        ranges = self._code.apply(ranges)
         mounting = self._mountings.of(frame, message.T_frame_laser)
         if mounting.flipped:
             angle_min, increment = -angle_min, -increment

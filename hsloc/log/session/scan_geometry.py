@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from math import inf, isfinite, nan, pi, radians
 from typing import TYPE_CHECKING, NamedTuple
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hsloc.errors import ConfigError
+from hsloc.log.range_codes import NoReturnCode
 from hsloc.warnings import WarningCode
 
 if TYPE_CHECKING:
@@ -40,6 +41,10 @@ _CODE_SHARE = 0.5
 """Readings beyond range_max of which more than this part have one value are a code for no return."""
 
 
+_ONLY = {"angles": ("degrees",), "echo": ("strongest",)}
+"""Fields of `--scan-fix` that take a word alone."""
+
+
 class Problem(NamedTuple):
     """What does not fit in the scans of a topic, and what to do."""
 
@@ -54,35 +59,37 @@ class ScanFixes:
 
     `increment` is an angle in radians, or `angles` (from angle_min, angle_max and the number of beams) or `negate`;
     `degrees` says that all angles are in degrees; `time_increment` is a time in seconds, or `interval` (from the time
-    between scans); `range_max` is in metres.
+    between scans); `range_max` is in metres; `strongest` takes of each beam the strongest echo, not the first.
     """
 
     increment: float | str | None = None
     degrees: bool = False
     time_increment: float | str | None = None
     range_max: float | None = None
+    strongest: bool = False
 
     @staticmethod
     def parse(text: str | None) -> ScanFixes:
         """From `name=value` items with commas between. Raises ConfigError naming the item."""
         items = [item.strip() for item in text.split(",")] if text else []
         values: dict[str, float | str | bool] = {}
-        words = {"increment": ("angles", "negate"), "time_increment": ("interval",), "angles": ("degrees",)}
+        words = {"increment": ("angles", "negate"), "time_increment": ("interval",), **_ONLY}
         for item in items:
             name, _, text = item.partition("=")
-            if name not in ("increment", "time_increment", "range_max", "angles"):
+            if name not in ("increment", "time_increment", "range_max", *_ONLY):
                 raise ConfigError(
-                    f"--scan-fix {item}: {name!r} is unknown; known are increment, time_increment, range_max, angles"
+                    f"--scan-fix {item}: {name!r} is unknown; known are increment, time_increment, range_max, "
+                    f"{', '.join(_ONLY)}"
                 )
             if text in words.get(name, ()):
-                values["degrees" if name == "angles" else name] = True if name == "angles" else text
+                values[text if name in _ONLY else name] = True if name in _ONLY else text
                 continue
             try:
                 number = float(text)
             except ValueError:
                 number = nan
-            allowed = " or ".join([*words.get(name, ()), *(["a number"] if name != "angles" else [])])
-            if not isfinite(number) or name == "angles" or (name == "range_max" and number <= 0.0):
+            allowed = " or ".join([*words.get(name, ()), *(["a number"] if name not in _ONLY else [])])
+            if not isfinite(number) or name in _ONLY or (name == "range_max" and number <= 0.0):
                 raise ConfigError(f"--scan-fix {item}: {text!r} must be {allowed}")
             values[name] = number
         return ScanFixes(**values)  # type: ignore[arg-type]
@@ -103,6 +110,8 @@ class ScanFixes:
             step = abs(increment) / _TURN * interval_s if interval_s is not None else step
         elif isinstance(self.time_increment, float):
             step = self.time_increment
+        if self.strongest and message.strongest is not None:
+            message = message._replace(ranges=message.strongest[0], intensities=message.strongest[1])
         return message._replace(
             angle_min=low,
             angle_increment=increment,
@@ -117,7 +126,8 @@ class ScanSurvey:
     """What the first scans of a topic say: the usual time between them (s), segments of a turn, and what is wrong.
 
     `segments` is how many messages make a turn, 1 where each is a whole scan; `first_angle` that of the segment with
-    which a turn begins (rad). `sweep_is_wrong`: time_increment cannot be that of the lidar.
+    which a turn begins (rad). `sweep_is_wrong`: time_increment cannot be that of the lidar. `no_return` is what is
+    known so far of a code for no return.
     """
 
     interval_s: float | None = None
@@ -125,6 +135,7 @@ class ScanSurvey:
     first_angle: float = 0.0
     sweep_is_wrong: bool = False
     problems: tuple[Problem, ...] = ()
+    no_return: NoReturnCode = field(default_factory=NoReturnCode)
 
 
 def survey(messages: Iterable[ScanMessage]) -> ScanSurvey:
@@ -141,7 +152,12 @@ def survey(messages: Iterable[ScanMessage]) -> ScanSurvey:
     sweep = _sweep(scans[0], turn)
     if sweep is not None:
         problems.append(sweep)
-    return ScanSurvey(turn, segments, first_angle, sweep is not None, tuple(problems))
+    code = NoReturnCode()
+    for scan in scans:
+        code.learn(scan.ranges, scan.angle_increment, (scan.range_min, scan.range_max))
+    if code.is_known:
+        problems.append(Problem(WarningCode.SCAN_NO_RETURN_CODE, str(code), ""))
+    return ScanSurvey(turn, segments, first_angle, sweep is not None, tuple(problems), code)
 
 
 def _angles(scan: ScanMessage) -> Problem | None:

@@ -23,7 +23,7 @@ class LineFormat(Protocol):
     """A format that says one thing a line, its first word telling what.
 
     `states_mounting` are the keywords whose lines say where the laser stands, `laser_odometry` whether the odometry
-    of laser lines counts even in a log that has odometry lines.
+    of laser lines counts in place of that of odometry lines.
     """
 
     name: str

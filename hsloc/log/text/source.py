@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, BinaryIO, cast
 
 from hsloc.errors import LogFormatError, TopicError
 from hsloc.log.messages.decode import OdometryMessage, ScanMessage
+from hsloc.log.range_codes import NO_RETURN_CM, RANGE_MIN, NoReturnCode, RangeRule
 from hsloc.log.source import Observation
 from hsloc.log.summary import LogSummary, Losses, ReadOptions, TopicStatistics, TopicSummary
 from hsloc.log.text.carmen import Carmen
-from hsloc.log.text.max_range_inference import RANGE_MIN, RangeRule
 from hsloc.log.text.wean import Wean
 from hsloc.model import IDENTITY, Odometry, Scan
 from hsloc.warnings import RunWarning, WarningCode
@@ -89,13 +89,14 @@ class TextSource:
         self._format = line_format
         self._options = options
         self._rule = RangeRule()
+        self._code = NoReturnCode()
         # Laser lines, which may have several keywords, are of one clock.
         offsets = options.offsets_s()
         self._scan_offset_ns = round(1e9 * sum(value for name, value in offsets.items() if name != "ODOM"))
         calibration = options.calibration
         known = [] if calibration is None else [lidar for topic, lidar in calibration.lidars if topic != "ODOM"]
         self._given_mounting = options.laser_pose or (known[0].T_base_laser if known else None)
-        self._has_odometry_lines = False
+        self._laser_lines_count = False
         self.losses_at_opening = Losses()
         self.summary = self._survey()
 
@@ -113,16 +114,14 @@ class TextSource:
             yield words[0], line
 
     def _events_of(self, line: Line) -> Iterator[Event]:
-        if line.odometry is not None and (
-            line.scan is None or self._format.laser_odometry or not self._has_odometry_lines
-        ):
+        if line.odometry is not None and (line.scan is not None) == self._laser_lines_count:
             yield line.odometry
         if line.scan is not None:
             mounting = self._given_mounting or line.scan.T_base_laser
             yield replace(
                 line.scan,
                 stamp_ns=line.scan.stamp_ns + self._scan_offset_ns,
-                ranges=self._rule.apply(line.scan.ranges),
+                ranges=self._code.apply(self._rule.apply(line.scan.ranges)),
                 range_min=RANGE_MIN,
                 range_max=line.scan.range_max or self._rule.range_max,
                 T_base_laser=mounting,
@@ -161,12 +160,17 @@ class TextSource:
                     kinds[kind][keyword] = None
             if line.scan is not None:
                 self._rule.learn(line.scan.ranges)
+                largest = line.scan.range_max or (NO_RETURN_CM - 0.5) / 100.0
+                self._code.learn(line.scan.ranges, line.scan.angle_increment, (RANGE_MIN, largest))
                 if first_scan is None:
                     first_scan, scan_keyword = line.scan, keyword
-            elif line.odometry is not None:
-                self._has_odometry_lines = True
             topics.setdefault(keyword, TopicStatistics()).add(latest, latest, 1, 0)
         self._check(bool(kinds["scan"]), bool(kinds["odometry"]))
+        # Of the two kinds of lines one counts: they tell the same way with different delays, and would count it twice.
+        of_lasers = [keyword for keyword in kinds["odometry"] if keyword in kinds["scan"]]
+        others = [keyword for keyword in kinds["odometry"] if keyword not in kinds["scan"]]
+        self._laser_lines_count = bool(of_lasers) and (self._format.laser_odometry or not others)
+        kinds["odometry"] = dict.fromkeys(of_lasers if self._laser_lines_count else others)
         return self._summary(topics, kinds, first_ns or 0, latest, first_scan, scan_keyword)
 
     def _summary(
@@ -192,10 +196,10 @@ class TextSource:
                     "give --laser-pose x,y,yaw",
                 )
             )
+        clip = self._rule.clip
+        if self._code.is_known and not (clip is not None and self._code.low <= clip <= self._code.high):
+            warnings.append(RunWarning(WarningCode.SCAN_NO_RETURN_CODE, f"{scan_keyword}: {self._code}"))
         mounting = self._given_mounting or (scan.T_base_laser if scan else IDENTITY)
-        odometry = kinds["odometry"]
-        if self._has_odometry_lines and not self._format.laser_odometry:
-            odometry = {keyword: None for keyword in odometry if keyword not in kinds["scan"]}
         return LogSummary(
             paths=(self._shown,),
             format=self._format.name,
@@ -207,7 +211,7 @@ class TextSource:
                 for name, s in sorted(topics.items())
             ),
             scan_topic=" + ".join(kinds["scan"]) or None,
-            odom_topic=" + ".join(odometry) or None,
+            odom_topic=" + ".join(kinds["odometry"]) or None,
             truth_topic=" + ".join(kinds["truth"]) or None,
             odom_frame="odom",
             base_frame=self._options.base_frame or "base_link",

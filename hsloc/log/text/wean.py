@@ -6,7 +6,8 @@
     L x y theta laser_x laser_y laser_theta r1 .. r180 t
 
 Centimetres and radians in the odometry's frame, seconds from the log's start; beams one degree apart from -90. Both
-lines carry odometry; the second pose of L is the laser's, which gives its mounting.
+lines carry odometry, those of L that of the scan; O lines run about 0.15 s ahead of it and are not read where there are
+L lines. The second pose of L is the laser's, which gives its mounting.
 """
 
 from __future__ import annotations

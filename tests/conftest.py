@@ -9,9 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from paths import DATA, RECORDINGS
+from paths import DATA, RECORDINGS, ROOT
 
-from hsloc.trajectory_io.tum import write_tum
+# Before anything imports numba or matplotlib. The jobs of a service that has just been installed compile all kernels,
+# and so would those of every test that starts one.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / "build" / "numba"))
+os.environ.setdefault("MPLCONFIGDIR", str(ROOT / "build" / "matplotlib"))
+
+from hsloc.trajectory_io.tum import write_tum  # noqa: E402
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -16,7 +16,7 @@ from paths import DATA, RECORDINGS, ROOT
 os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / "build" / "numba"))
 os.environ.setdefault("MPLCONFIGDIR", str(ROOT / "build" / "matplotlib"))
 
-from hsloc.trajectory_io.tum import write_tum  # noqa: E402
+from hsloc.trajectory_io.tum import write_tum
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,10 +1,12 @@
 """Check a log: stamps, gaps, frames, ranges, odometry, damage; each finding with its remedy.
 
-Exit code 0: nothing that spoils results; 1: errors were found; 3: the file is damaged.
+Exit code 0: nothing that spoils results; 1: errors were found; 3: the file is damaged; 4: the recording does not keep
+the profile.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hsloc.cli.arguments import add_read_arguments, read_options
@@ -12,12 +14,15 @@ from hsloc.cli.progress import ProgressLine
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Mapping
 
     from hsloc.log import CheckReport, Finding, Log
+    from hsloc.slam.time_offset import Offset
 
 HELP = "check a log for what spoils results"
 EXAMPLES = """
   hsloc check run.mcap
+  hsloc check run.mcap --profile fleet.yaml -q
   hsloc check run.mcap --json -q || echo "see the findings"
 """
 
@@ -26,6 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `hsloc check`."""
     parser.add_argument("log", nargs="+", metavar="LOG", help="Log: a file, its parts, or a folder with them.")
     add_read_arguments(parser)
+    parser.add_argument(
+        "--profile", type=Path, metavar="FILE",
+        help="What every recording must have, a YAML file: topics, types, rates, gaps, frames, transforms, offset.",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="Print everything as JSON.")
     parser.add_argument("-q", "--quiet", action="store_true", help="Print errors and damage only.")
 
@@ -34,38 +43,54 @@ def run(arguments: argparse.Namespace) -> int:
     """Check; returns the exit code."""
     from dataclasses import replace
 
-    from hsloc.log import check_log, open_log
+    from hsloc.cli.main import EXIT_BELOW_LIMIT
+    from hsloc.log import check_log, open_log, read_profile, violations
 
+    profile = None if arguments.profile is None else read_profile(arguments.profile)
     log = open_log(arguments.log, replace(read_options(arguments), require_scan=False, require_odometry=False))
     start, span = log.summary.start_ns, max(log.summary.end_ns - log.summary.start_ns, 1)
     with ProgressLine(arguments.quiet or arguments.json or arguments.no_progress) as line:
         report = check_log(log, lambda log_time: line.show("check", (log_time - start) / span))
-    findings = (*report.findings, *_of_clocks(arguments, log))
-    report = replace(report, findings=findings)
+    offsets = _offsets(arguments, log)
+    report = replace(report, findings=(*report.findings, *_of_clocks(offsets)))
+    seconds = {topic: offset.seconds for topic, offset in offsets.items()}
+    unkept = [] if profile is None else violations(profile, log.summary, report, seconds)
     if arguments.json:
         from json import dumps
 
-        print(dumps(_values(report, [str(path) for path in log.summary.paths], start), indent=2))
+        values = _values(report, [str(path) for path in log.summary.paths], start)
+        print(dumps(values if profile is None else {**values, "profile": unkept}, indent=2))
     else:
-        print("\n".join(_lines(report, start, arguments.quiet)))
+        lines = _lines(report, start, arguments.quiet) + [f"profile: {line}" for line in unkept]
+        if profile is not None and not unkept and not arguments.quiet:
+            lines.append("profile: kept")
+        print("\n".join(lines))
     if report.has_errors:
         return 1
-    return 3 if report.losses.data_lost else 0
+    if report.losses.data_lost:
+        return 3
+    return EXIT_BELOW_LIMIT if unkept else 0
 
 
-def _of_clocks(arguments: argparse.Namespace, log: Log) -> list[Finding]:
+def _offsets(arguments: argparse.Namespace, log: Log) -> dict[str, Offset]:
     """The offset between the stamps of scans and odometry, where the motion determines it."""
     from hsloc.errors import HslocError
-    from hsloc.log import Finding, Severity
     from hsloc.slam.front_end import FrontEndParameters
-    from hsloc.slam.time_offset import offset_warning, offsets_of_log
+    from hsloc.slam.time_offset import offsets_of_log
 
     if log.summary.scan_topic is None or log.summary.odom_topic is None:
-        return []
+        return {}
     try:
-        found = offsets_of_log(log.summary.paths, read_options(arguments), FrontEndParameters())
+        return offsets_of_log(log.summary.paths, read_options(arguments), FrontEndParameters())
     except HslocError:  # What stands in the way is among the findings.
-        return []
+        return {}
+
+
+def _of_clocks(found: Mapping[str, Offset]) -> list[Finding]:
+    """Findings of the offsets that are none by chance."""
+    from hsloc.log import Finding, Severity
+    from hsloc.slam.time_offset import offset_warning
+
     warnings = [(topic, offset_warning(topic, offset)) for topic, offset in found.items() if offset.is_significant]
     return [Finding(w.code, Severity.WARNING, topic, w.text, w.remedy, 1) for topic, w in warnings]
 

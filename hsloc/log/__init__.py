@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from hsloc.log.calibration_file import read_calibration
     from hsloc.log.checks.checker import CheckReport, check_log
     from hsloc.log.checks.findings import Finding, Severity
+    from hsloc.log.checks.profile import Profile, read_profile, violations
     from hsloc.log.checks.topics import LEAST_JUMP, LONGEST_JUMP_S, MAX_SPEED
     from hsloc.log.convert import Conversion, convert_log
     from hsloc.log.messages.decode import LinkMessage
@@ -40,6 +41,7 @@ __all__ = [
     "LogSummary",
     "LogWriter",
     "Losses",
+    "Profile",
     "ReadOptions",
     "Severity",
     "Transform3",
@@ -49,12 +51,15 @@ __all__ = [
     "is_static_topic",
     "open_log",
     "read_calibration",
+    "read_profile",
+    "violations",
 ]
 
 _MODULES = {
     "calibration_file": ("read_calibration",),
     "checks.checker": ("CheckReport", "check_log"),
     "checks.findings": ("Finding", "Severity"),
+    "checks.profile": ("Profile", "read_profile", "violations"),
     "checks.topics": ("LEAST_JUMP", "LONGEST_JUMP_S", "MAX_SPEED"),
     "convert": ("Conversion", "convert_log"),
     "messages.decode": ("LinkMessage",),

@@ -16,13 +16,13 @@ from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import ConfigError
+from hsloc.log.yaml_table import load_table
 from hsloc.model import Pose2, wrap_angle
 from hsloc.model.calibration import Calibration, LidarCalibration, OdometryCorrection
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-_MAX_BYTES = 64 << 10
 _ODOMETRY = {"scale": (0.5, 2.0), "rotation_scale": (0.5, 2.0), "turn_per_metre": (-1.0, 1.0)}
 """Keys and limits: what lies beyond is a mistake of units or of the file."""
 _LIDAR = {"x": (-100.0, 100.0), "y": (-100.0, 100.0), "yaw": (-7.0, 7.0), "time_offset": (-1e6, 1e6)}
@@ -31,7 +31,7 @@ _REMEDY = "; write it with `hsloc calibrate`"
 
 def read_calibration(path: Path) -> Calibration:
     """Read a calibration file. Raises ConfigError that names the file and the key."""
-    values = _load(path)
+    values = load_table(path, "calibration", _REMEDY)
     if not {"odometry", "lidars"} & values.keys():
         raise ConfigError(f"{path}: has neither odometry nor lidars, so it is no calibration{_REMEDY}")
     odometry = _numbers(path, "odometry", values.get("odometry") or {}, _ODOMETRY)
@@ -61,25 +61,3 @@ def _numbers(path: Path, where: str, values: Any, limits: dict[str, tuple[float,
         if not is_number or not low <= value <= high:
             raise ConfigError(f"{path}: {where}: {name} is {value!r}; it must be a number from {low:g} to {high:g}")
     return {name: float(value) for name, value in values.items()}
-
-
-def _load(path: Path) -> dict[str, Any]:
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-    from ruamel.yaml.events import AliasEvent
-
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise ConfigError(f"{path}: is too large for a calibration{_REMEDY}")
-        text = path.read_bytes().decode()
-        if any(isinstance(event, AliasEvent) for event in YAML(typ="safe", pure=True).parse(text)):
-            raise ConfigError(f"{path}: has a YAML alias (*name); write the value in its place")
-        values = YAML(typ="safe", pure=True).load(text)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror or error}){_REMEDY}") from error
-    except (YAMLError, ValueError, RecursionError, AttributeError) as error:
-        reason = (str(error).splitlines() or [""])[0]
-        raise ConfigError(f"{path}: is not YAML ({reason}){_REMEDY}") from error
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path}: is not a calibration{_REMEDY}")
-    return values

@@ -6,7 +6,7 @@ of the log, with a memory that does not grow.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from hsloc.log.checks.findings import NANOSECONDS, Finding, Findings, Intervals, Place, Severity
@@ -16,7 +16,7 @@ from hsloc.log.session.transform_topics import MAP_FRAME
 from hsloc.warnings import WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from hsloc.log.messages.decode import LinkMessage
     from hsloc.log.reader import Log
@@ -25,12 +25,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CheckReport:
-    """All findings, the worst first; intervals between messages by topic; how many messages were looked at."""
+    """All findings, the worst first; intervals between messages by topic; how many messages were looked at.
+
+    `frames` are (frame, child frame) of scans and odometry by topic, `parents` the parent of each frame of transforms.
+    """
 
     findings: tuple[Finding, ...]
     intervals: dict[str, Intervals]
     messages: int
     losses: Losses
+    frames: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    parents: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def has_errors(self) -> bool:
@@ -72,7 +77,10 @@ def check_log(log: Log, progress: Callable[[int], None] | None = None) -> CheckR
     _check_summary(log.summary, bool(scans), findings)
     _check_damage(log, losses, findings)
     intervals = {f"{check.topic} {check.what}": check.intervals for check in topics.values()}
-    return CheckReport(tuple(findings.sorted()), intervals, count, losses)
+    frames = {
+        check.topic: (getattr(check, "frame", "") or "", getattr(check, "child", "") or "") for check in topics.values()
+    }
+    return CheckReport(tuple(findings.sorted()), intervals, count, losses, frames, transforms.parents)
 
 
 _SCAN_OR_ODOMETRY: dict[type, type[TopicCheck]] = {ScanMessage: ScanCheck, OdometryMessage: OdometryCheck}
@@ -169,7 +177,7 @@ class TransformCheck:
 
     def __init__(self, findings: Findings) -> None:
         self._findings = findings
-        self._parents: dict[str, str] = {}
+        self.parents: dict[str, str] = {}
         self._stamps: dict[tuple[str, str], int] = {}
         self._number = 0
 
@@ -177,12 +185,12 @@ class TransformCheck:
         """One transform of a message."""
         place = Place(topic, self._number, link.stamp_ns, log_time_ns)
         self._number += 1
-        if link.child not in self._parents and len(self._parents) >= MAX_FRAMES:
+        if link.child not in self.parents and len(self.parents) >= MAX_FRAMES:
             self._findings.add(
                 Severity.WARNING, "frames", place, f"more than {MAX_FRAMES} frames", "look for a broken publisher"
             )
             return
-        parent = self._parents.setdefault(link.child, link.parent)
+        parent = self.parents.setdefault(link.child, link.parent)
         if parent != link.parent:
             self._findings.add(
                 Severity.ERROR, "two_parents", place, f"{link.child} has two parents: {parent} and {link.parent}",
@@ -214,11 +222,11 @@ class TransformCheck:
 
     def compare_odometry(self, topic: str, frame: str, child: str) -> None:
         """Whether an odometry topic and /tf speak of the same frames."""
-        parent = self._parents.get(child)
-        if not child or "odom" not in self._parents.values():
+        parent = self.parents.get(child)
+        if not child or "odom" not in self.parents.values():
             return
         if parent is None or (parent != frame and frame):
-            moved = sorted(name for name, above in self._parents.items() if above == "odom")
+            moved = sorted(name for name, above in self.parents.items() if above == "odom")
             self._findings.add(
                 Severity.WARNING, "odometry_frames", topic,
                 f"the topic speaks of {frame} -> {child}, /tf of odom -> {', '.join(moved[:5])}",

@@ -1,0 +1,38 @@
+"""Small YAML files that people write: a table of keys, nothing else."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from hsloc.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_MAX_BYTES = 64 << 10
+
+
+def load_table(path: Path, what: str, remedy: str = "") -> dict[str, Any]:
+    """The keys of a YAML file. Raises ConfigError that names the file, for what is no table.
+
+    Aliases are refused: nested ones expand half a kilobyte to gigabytes.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+    from ruamel.yaml.events import AliasEvent
+
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ConfigError(f"{path}: is too large for a {what}{remedy}")
+        text = path.read_bytes().decode()
+        if any(isinstance(event, AliasEvent) for event in YAML(typ="safe", pure=True).parse(text)):
+            raise ConfigError(f"{path}: has a YAML alias (*name); write the value in its place")
+        values = YAML(typ="safe", pure=True).load(text)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror or error}){remedy}") from error
+    except (YAMLError, ValueError, RecursionError, AttributeError) as error:
+        reason = (str(error).splitlines() or [""])[0]
+        raise ConfigError(f"{path}: is not YAML ({reason}){remedy}") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: is not a {what}{remedy}")
+    return values

@@ -32,6 +32,7 @@ COMMANDS = (
     "info",
     "check",
     "eval",
+    "compare",
     "sweep",
     "convert",
     "calibrate",

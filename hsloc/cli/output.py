@@ -68,15 +68,15 @@ def print_job(summary: Mapping[str, Any]) -> None:
     lines = [] if verdict is None else [f"verdict: {summary.get('verdict_text', verdict)}"]
     lines += [summary["headline"]] if "headline" in summary else []
     lines += [f"  {reason_text(from_json(VerdictReason, each))}" for each in summary.get("verdict_reasons", ())]
-    _print(lines + _table([Row(each["name"], tuple(each["values"])) for each in summary.get("figures", ())]))
+    print_lines(lines + _table([Row(each["name"], tuple(each["values"])) for each in summary.get("figures", ())]))
 
 
 def print_summary(metrics: RunMetrics, timings: RunTimings, folder: Path) -> None:
     """The verdict, the figures as the reports show them, how fast the run was, and where the results are."""
-    _print(summary_lines(metrics, timings, folder))
+    print_lines(summary_lines(metrics, timings, folder))
 
 
-def _print(lines: Iterable[str]) -> None:
+def print_lines(lines: Iterable[str]) -> None:
     """On stdout; a terminal without the degree sign gets a question mark, not a traceback."""
     encoding = sys.stdout.encoding or "utf-8"
     for line in lines:

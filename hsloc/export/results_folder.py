@@ -93,6 +93,7 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
     begin = time.perf_counter()
     with RunRecording(result, folder / "run.mcap") as recording:
         analysis = analyse(result, observer=recording.add, progress=progress)
+        recording.add_analysis(analysis)
     seconds = {"analyse": time.perf_counter() - begin - recording.seconds, "run_mcap": recording.seconds}
     begin = time.perf_counter()
     write_tum(folder / "trajectory.tum", result.trajectory)
@@ -104,14 +105,14 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
         write_tum(folder / "reference.tum", result.reference)
     if result.mode == "slam":
         save_map(result.grid, folder)
-    if result.mapping is not None:
-        write_covariances(folder / "covariances.csv", result.trajectory.stamps_ns, result.pose_covariances())
+    parts = report_parts(result, analysis)
+    if result.mapping is not None and parts.covariances is not None:
+        write_covariances(folder / "covariances.csv", result.trajectory.stamps_ns, parts.covariances)
         result.mapping.graph.write_g2o(folder / "graph.g2o")
         if result.mapping.state is not None:
             write_state(result.mapping.state, folder / STATE_FILE)
     write_json(folder / "metrics.json", analysis.metrics.to_json())
     (folder / "config.yaml").write_text(config_text(result), encoding="utf-8")
-    parts = report_parts(result, analysis)
     draw_report(folder / "report.png", parts)
     write_report_html(folder / "report.html", parts)
     seconds["reports"] = time.perf_counter() - begin

@@ -5,10 +5,12 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from hsloc.export.provenance import config_text
 from hsloc.log import LogWriter
 from hsloc.model.events import PairedScan
-from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.model.pose2 import IDENTITY, Pose2, compose_poses
 from hsloc.model.trajectory import Trajectory
 from hsloc.version import __version__
 
@@ -16,17 +18,28 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
-    from hsloc.analysis import PosedEvent
+    from numpy.typing import NDArray
+
+    from hsloc.analysis import Analysis, PosedEvent
     from hsloc.replay.run import Result
 
 _PATH_POSES = 2000
 """A path to look at needs no more poses; viewers slow down."""
 
 
+_INFO, _WARN = 20, 30
+"""Levels of rcl_interfaces/Log."""
+
+
+def _thinned(path: Trajectory) -> Trajectory:
+    every = max(len(path) // _PATH_POSES, 1)
+    return Trajectory(path.stamps_ns[::every], path.poses[::every])
+
+
 class RunRecording:
     """Writes map, scans, transforms, poses and the path of a result; the events come from a second pass over the log.
 
-    Of a map that was built also the covariance of the pose of each scan.
+    Also the covariance of the pose of each scan, where it is known.
 
     A context manager: the file is complete when it ends. `seconds` is the time spent in writing.
     """
@@ -57,8 +70,7 @@ class RunRecording:
         begin = time.perf_counter()
         trajectory = self._result.trajectory
         if error is None:
-            every = max(len(trajectory) // _PATH_POSES, 1)
-            self._writer.path(self._start, Trajectory(trajectory.stamps_ns[::every], trajectory.poses[::every]))
+            self._writer.path(self._start, _thinned(trajectory))
         self._writer.__exit__(kind, error, trace)
         self.seconds += time.perf_counter() - begin
 
@@ -74,14 +86,41 @@ class RunRecording:
             if self._result.follows_scans:
                 self._write_pose(scan.stamp_ns, IDENTITY, posed.T_map_base, posed.T_map_base)
             self._writer.scan(scan)
-            if self._result.mapping is not None:
-                covariance = self._result.mapping.scan_covariances[self._scans]
+            if (covariance := self._covariance(self._scans)) is not None:
                 self._writer.pose_with_covariance(scan.stamp_ns, posed.T_map_base, covariance, "/pose_with_covariance")
             self._scans += 1
         else:
             self._write_pose(event.stamp_ns, posed.T_map_odom, event.T_odom_base, posed.T_map_base)
         self.seconds += time.perf_counter() - begin
 
+    def add_analysis(self, analysis: Analysis) -> None:
+        """Write reference and odometry as paths in the frame of the map, and warnings and verdict as log messages."""
+        begin = time.perf_counter()
+        reference, comparison = self._result.reference, analysis.comparison
+        if reference is not None and len(reference):
+            if comparison is not None:
+                T_map_reference = comparison.T_reference_estimate.inverse().to_array()
+                reference = Trajectory(reference.stamps_ns, compose_poses(T_map_reference, reference.poses))
+            self._writer.path(self._start, _thinned(reference), "/reference_path")
+        if analysis.odometry is not None:
+            self._writer.path(self._start, _thinned(analysis.odometry), "/odometry_path")
+        metrics = analysis.metrics
+        for reason in metrics.verdict_reasons:
+            for begin_s, _ in reason.times or ((0.0, 0.0),):
+                self._writer.log(self._start + round(begin_s * 1e9), _WARN, f"{reason.code}: {reason.text}")
+        for warning in metrics.warnings:
+            self._writer.log(self._start, _WARN, f"{warning.code}: {warning}")
+        self._writer.log(self._start, _INFO, f"verdict: {metrics.verdict}")
+        self.seconds += time.perf_counter() - begin
+
     def _write_pose(self, stamp_ns: int, T_map_odom: Pose2, T_odom_base: Pose2, T_map_base: Pose2) -> None:
         self._writer.transforms(stamp_ns, [("map", "odom", T_map_odom), ("odom", "base_link", T_odom_base)])
         self._writer.pose(stamp_ns, T_map_base)
+
+    def _covariance(self, row: int) -> NDArray[np.float64] | None:
+        """Covariance (3, 3) of the pose at a scan, in the order of the log; None where it is not known."""
+        result = self._result
+        if result.mapping is not None:
+            return np.asarray(result.mapping.scan_covariances[row])
+        covariance: NDArray[np.float64] = result.diagnostics.covariance[row]
+        return covariance if np.isfinite(covariance).all() else None

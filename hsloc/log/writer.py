@@ -191,6 +191,10 @@ class LogWriter:
         """nav_msgs/Path."""
         self._add(topic, definitions.PATH, stamp_ns, encode.path(stamp_ns, trajectory, frame_id), log_time_ns)
 
+    def log(self, stamp_ns: int, level: int, text: str, name: str = "hsloc", topic: str = "/rosout") -> None:
+        """rcl_interfaces/Log; `level` is 20 for information, 30 for a warning, 40 for an error."""
+        self._add(topic, definitions.LOG, stamp_ns, encode.log_message(stamp_ns, level, name, text), None)
+
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """A metadata record: seed, scenario, versions."""
         try:

@@ -162,6 +162,8 @@ class ReportData:
     """The same of the reference."""
     far: Curve | None = None
     """Distance to the map that nine of ten points of each scan stay below [m]."""
+    loops: Floats | None = None
+    """Both ends (k, 2, 2) of the loops that were closed [m]."""
     is_built: bool = False
     """Whether the map was built by the run."""
 
@@ -218,8 +220,16 @@ def prepare(parts: ReportParts) -> ReportData:
         jumps=jumps_of(trajectory.stamps_ns, trajectory.poses),
         reference_jumps=None if reference is None else jumps_of(reference.stamps_ns, reference.poses),
         far=None if parts.overlay is None else _far(parts.overlay, start_ns),
+        loops=None if parts.mapping is None else _closed(parts.mapping),
         is_built=parts.metrics is not None and parts.metrics.run.mode == "slam",
     )
+
+
+def _closed(mapping: MappingResult) -> Floats:
+    """Positions (k, 2, 2) of the submaps that accepted loops join."""
+    references = mapping.submap_references
+    pairs = [(references[loop.first], references[loop.second]) for loop in mapping.loops if loop.accepted]
+    return mapping.keyscan_poses[np.array(pairs, dtype=np.int64).reshape(-1, 2), :2]
 
 
 def _far(overlay: ScanOverlay, start_ns: int) -> Curve:

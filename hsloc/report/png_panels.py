@@ -80,6 +80,9 @@ def _draw_paths(axes: Axes, data: ReportData, width: float, pixel: float) -> Non
     def seen(xy: Floats) -> Floats:
         return joined(pieces_of(xy, 0.5 * pixel))
 
+    if data.loops is not None and len(data.loops):
+        lines = with_gaps(data.loops.reshape(-1, 2), np.arange(2 * len(data.loops)) % 2 == 0)
+        axes.plot(*lines.T, color=style.GREEN, linewidth=1.2, label="loop closed", zorder=4)
     if len(data.path):
         known = seen(with_gaps(np.where(data.localised[:, None], data.path, np.nan), data.jumps))
         axes.plot(*known.T, color=style.BLUE, linewidth=width, label="trajectory", zorder=5, solid_capstyle="round")

@@ -57,6 +57,7 @@ def test_bytes_equal_the_reference_for_every_alignment(frame: str, child: str) -
         (encode.laser_scan(make_scan(), frame, 0.1), definitions.LASER_SCAN),
         (encode.laser_scan(make_scan(4, intensities=True), frame, 0.1), definitions.LASER_SCAN),
         (encode.laser_scan(make_scan(0), frame, 0.1), definitions.LASER_SCAN),
+        (encode.log_message(STAMP, 30, child, frame), definitions.LOG),
         (encode.odometry(STAMP, pose, cov, (1, 2, 3), (frame, child)), definitions.ODOMETRY),
         (encode.transforms(STAMP, [(frame, child, pose), (child, frame, tilted)]), definitions.TF_MESSAGE),
         (encode.transforms(STAMP, []), definitions.TF_MESSAGE),

@@ -15,6 +15,7 @@ OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE_STAMPED = "geometry_msgs/msg/PoseWithCovarianceStamped"
 PATH = "nav_msgs/msg/Path"
+LOG = "rcl_interfaces/msg/Log"
 
 KNOWN_TYPES = (
     LASER_SCAN,
@@ -24,6 +25,7 @@ KNOWN_TYPES = (
     POSE_STAMPED,
     POSE_WITH_COVARIANCE_STAMPED,
     PATH,
+    LOG,
 )
 
 FIELDS: dict[str, tuple[str, ...]] = {
@@ -56,6 +58,20 @@ FIELDS: dict[str, tuple[str, ...]] = {
         "geometry_msgs/Pose origin",
     ),
     "nav_msgs/OccupancyGrid": ("std_msgs/Header header", "nav_msgs/MapMetaData info", "int8[] data"),
+    "rcl_interfaces/Log": (
+        "byte DEBUG=10",
+        "byte INFO=20",
+        "byte WARN=30",
+        "byte ERROR=40",
+        "byte FATAL=50",
+        "builtin_interfaces/Time stamp",
+        "uint8 level",
+        "string name",
+        "string msg",
+        "string file",
+        "string function",
+        "uint32 line",
+    ),
     "nav_msgs/Path": ("std_msgs/Header header", "geometry_msgs/PoseStamped[] poses"),
     "nav_msgs/Odometry": (
         "std_msgs/Header header",

@@ -171,3 +171,11 @@ def path(stamp_ns: int, trajectory: Trajectory, frame_id: str) -> bytes:
         parts += (stamp_bytes(int(stamp)), name, _POSE.pack(x, y, 0.0, 0.0, 0.0, sine, cosine))
         offset += 8 + len(name) + _POSE.size
     return b"".join(parts)
+
+
+def log_message(stamp_ns: int, level: int, name: str, text: str) -> bytes:
+    """rcl_interfaces/Log; file, function and line are left empty."""
+    data = stamp_bytes(stamp_ns) + bytes((level, 0, 0, 0))
+    for each in (name, text, "", ""):
+        data += padded_string(each, len(data), 4)
+    return ENCAPSULATION + data + _COUNT.pack(0)

@@ -191,8 +191,20 @@
       this.paths.others.forEach((path, k) => { if (this.shown.has(`other${k}`)) stroke(path, this.ink(d.others[k].ink), 2); });
       if (this.shown.has("reference")) stroke(this.paths.reference, this.ink("ink"), 1.1, [6, 4]);
       if (this.shown.has("ellipses")) stroke(this.paths.ellipses, this.ink("purple"), 1.2);
+      this.drawAxes(c);
       this.drawMarks(c);
       this.drawScale();
+    }
+    // Where the frame of the map has its origin, and its axes.
+    drawAxes(c) {
+      c.setTransform(1, 0, 0, 1, 0, 0);
+      const [px, py] = this.pixels(...this.local(0, 0)), r = this.ratio;
+      c.font = `${11 * r}px system-ui, sans-serif`; c.textAlign = "center"; c.textBaseline = "middle"; c.lineWidth = 1.6 * r;
+      for (const [dx, dy, name, colour] of [[28, 0, "x", "vermillion"], [0, -28, "y", "green"]]) {
+        c.strokeStyle = c.fillStyle = this.ink(colour);
+        c.beginPath(); c.moveTo(px, py); c.lineTo(px + dx * r, py + dy * r); c.stroke();
+        c.fillText(name, px + 1.3 * dx * r, py + 1.3 * dy * r);
+      }
     }
     drawMap(c) {
       if (!this.image || !this.data.map) return;

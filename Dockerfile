@@ -10,7 +10,7 @@ COPY pyproject.toml requirements.lock README.md LICENSE ./
 # What the lock names and the service needs, in a layer of its own: it changes seldom. The secret is for builders behind
 # a proxy with a certificate of its own; without it nothing is mounted.
 RUN --mount=type=secret,id=ca,target=/etc/ssl/certs/ca-certificates.crt \
-    /venv/bin/python -c "import tomllib; p = tomllib.load(open('pyproject.toml', 'rb'))['project']; print('\n'.join(p['dependencies'] + p['optional-dependencies']['serve']))" > /tmp/wanted.txt \
+    /venv/bin/python -c "import tomllib; p = tomllib.load(open('pyproject.toml', 'rb'))['project']; print('\n'.join(p['dependencies'] + p['optional-dependencies']['serve'] + p['optional-dependencies']['postgresql']))" > /tmp/wanted.txt \
     && /venv/bin/pip install -q -c requirements.lock -r /tmp/wanted.txt setuptools
 COPY hsloc hsloc
 COPY service service
@@ -21,7 +21,7 @@ RUN NUMBA_CACHE_DIR=/opt/hsloc/numba MPLCONFIGDIR=/opt/hsloc/matplotlib sh -c '\
     /venv/bin/hsloc replay -q /tmp/kidnapped.mcap --out /tmp/a && /venv/bin/hsloc replay -q /tmp/kidnapped.mcap --mode slam --out /tmp/b'
 
 FROM ${BASE}
-RUN useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin hsloc && install -d -o 10001 -m 700 /data
+RUN useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin hsloc && install -d -o 10001 -m 700 /data /store
 COPY --from=build /venv /venv
 COPY --from=build /opt/hsloc /opt/hsloc
 ENV PATH=/venv/bin:$PATH HSLOC_SERVE_DATA=/data PORT=8000 PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 \

@@ -135,6 +135,11 @@ class Client:
         found: dict[str, Any] = self.request("GET", f"/v1/jobs/{job_id}").json()
         return found
 
+    def workers(self) -> list[dict[str, Any]]:
+        """The servers and workers that share the service's database; the token needs the scope `admin`."""
+        found: list[dict[str, Any]] = self.request("GET", "/v1/workers").json()["workers"]
+        return found
+
     def cancel(self, job_id: str) -> dict[str, Any]:
         """Ask for the end of a job."""
         found: dict[str, Any] = self.request("POST", f"/v1/jobs/{job_id}/cancel").json()

@@ -60,8 +60,33 @@ class Server:
         return 0.0
 
 
+class Worker:
+    """`hsloc work` with the tests' fake worker."""
+
+    def __init__(self, data: Path, **variables: str) -> None:
+        self.data = data
+        self.variables = {
+            "HSLOC_MIN_FREE_BYTES": "1M",
+            "HSLOC_WORKER_COMMAND": f"{sys.executable},-P,{FAKE_WORKER}",
+            **variables,
+        }
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> Worker:
+        command = [sys.executable, "-m", "hsloc.cli.main", "work", "--data", str(self.data)]
+        with (self.data.parent / f"{self.data.name}.log").open("ab") as log:
+            self.process = subprocess.Popen(command, env=os.environ | self.variables, stdout=log, stderr=log)
+        return self
+
+    def end(self, which: int = signal.SIGTERM) -> int:
+        assert self.process is not None
+        self.process.send_signal(which)
+        return self.process.wait(60.0)
+
+
 def jobs_processes(data: Path) -> list[int]:
     """Processes of jobs that are alive."""
     from hsloc_service.execution.processes import marked
 
-    return list(marked((data / "instance").read_text().strip() + ":"))
+    instance = data / "instance"
+    return list(marked(instance.read_text().strip() + ":")) if instance.exists() else []

@@ -42,6 +42,8 @@ COMMANDS = (
     "completion",
     "serve",
     "submit",
+    "work",
+    "workers",
 )
 
 EXIT_OK, EXIT_FAILED, EXIT_USAGE, EXIT_DATA_LOST, EXIT_BELOW_LIMIT = 0, 1, 2, 3, 4

@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Serve until SIGTERM."""
     from hsloc.errors import ConfigError
 
-    service, settings = _service()
+    service, settings = service_module("main"), service_module("settings")
     try:
         retention = None if arguments.retention_days is None else arguments.retention_days * 86400.0
         chosen = settings.from_environment(data=arguments.data, slots=arguments.slots, retention_s=retention)
@@ -81,12 +81,12 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError(str(error)) from error
 
 
-def _service() -> tuple[Any, Any]:
-    """`hsloc_service.main` and `hsloc_service.settings`, found by name: the library does not import the service."""
+def service_module(name: str) -> Any:
+    """A module of `hsloc_service`, found by name: the library does not import the service."""
     from hsloc.errors import ConfigError
 
     try:
-        return importlib.import_module("hsloc_service.main"), importlib.import_module("hsloc_service.settings")
+        return importlib.import_module(f"hsloc_service.{name}")
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"{error.name} is not installed; install the service with: pip install 'hsloc[serve]'"

@@ -28,7 +28,8 @@ EXAMPLES = """
   hsloc sweep logs/*.mcap --out nightly --jobs 4 --min-localised 0.95
   hsloc sweep run.mcap --out budgets --vary hide.budget=100,200,400 --seeds 0-9
   hsloc sweep run.mcap --out compare --matcher hide --matcher icp --csv
-  hsloc sweep logs/*.mcap --out nightly --shard 0/4 && hsloc sweep --merge --out nightly
+  hsloc sweep logs/*.mcap --out nightly --shard 0/4
+  hsloc sweep --merge --out nightly
 """
 
 

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 T = TypeVar("T")
+MIN_BYTES_PER_S = 1 << 18
+"""A store that is slower than this counts as dead [B/s]."""
 
 
 def start_call(work: Callable[[], T]) -> Future[T]:

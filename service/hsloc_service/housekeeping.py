@@ -84,6 +84,8 @@ class Housekeeping:
         if store.url is None or now - self._swept < SWEEP_S:
             return
         try:
+            if self._deletions.parts is not None:
+                self._deletions.parts.sweep()
             unknown = self._deletions.sweep(store)
         except StoreError as error:
             log("store.error", what="sweep", error=str(error))

@@ -31,12 +31,20 @@ class Settings:
     """Folder of the database, the uploads and the results; on a local disk."""
     database_url: str = field(default="", repr=False)
     """Database that several servers share, such as `postgresql://user@host/hsloc`; empty: SQLite in the data folder."""
+    store_url: str = ""
+    """Object store, or folder that all see, for uploads and results of several servers and workers: `s3://bucket/prefix`,
+    `file:///mnt/hsloc`; empty: the data folder."""
+    cache_bytes: int = 16 * GIB
+    """Maximum size of the copies of uploads that a server or worker keeps where `store_url` is set [B]; those that a
+    job reads are kept in any case."""
     results_url: str = ""
     """Where results go instead of the data folder, as fsspec knows it: `s3://bucket/prefix`, `file:///mnt/results`."""
     store_timeout_s: float = 30.0
     """Time limit for one call to a store of results [s]; then it counts as dead (503)."""
     slots: int = 1
-    """Number of jobs that run at the same time."""
+    """Number of jobs that run at the same time; 0 where workers run them all."""
+    tags: tuple[str, ...] = ()
+    """Tags of jobs that run here, such as `big-memory`; jobs without a tag run everywhere."""
 
     require_token: bool = False
     """Refuse requests without a bearer token. `hsloc serve` sets it unless it listens on loopback without tokens."""
@@ -131,13 +139,17 @@ class Settings:
         for name in ("allowed_hosts", "worker_command"):
             if not getattr(self, name):
                 raise SettingsError(f"{name} is empty; give at least one value, or leave it out")
+        if self.store_url and self.results_url:
+            raise SettingsError(
+                "store_url and results_url are both set; results go to store_url, so leave results_url out"
+            )
         if not 0.0 < self.heartbeat_s < self.lease_s:
             raise SettingsError(
                 f"heartbeat_s is {self.heartbeat_s}; it must be above 0 and below lease_s {self.lease_s}"
             )
 
 
-MAY_BE_ZERO = ("min_free_bytes", "grace_s", "webhook_backoff_s")
+MAY_BE_ZERO = ("slots", "cache_bytes", "min_free_bytes", "grace_s", "webhook_backoff_s")
 MAX_SECONDS = 1e9
 """Thirty years: times beyond that are misprints, and overflow."""
 

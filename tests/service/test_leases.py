@@ -17,7 +17,7 @@ from hsloc_service.db.tables import JobRow
 from hsloc_service.errors import ServiceError
 from hsloc_service.execution.job_process import parse_line
 from hsloc_service.jobs.leases import Leases
-from hsloc_service.jobs.repository import Jobs
+from hsloc_service.jobs.repository import ORDERS, JobFilter, Jobs
 from hsloc_service.results.store import Asset
 from hsloc_service.storage import Storage
 from hsloc_service.uploads.repository import Files
@@ -241,6 +241,17 @@ def test_a_success_whose_answer_was_lost_may_be_written_again(parts: Parts) -> N
     assert not leases.succeed(claim, f"{claim.job_id}.2", ASSET, {})
 
 
+def test_a_job_with_a_tag_waits_for_a_worker_that_has_it(parts: Parts) -> None:
+    file = parts.files.create(ANYBODY, "run.mcap", 0)
+    parts.files.complete(file.id, 0, "00")
+    large = parts.jobs.submit(ANYBODY, {"log": file.id, "map": None, "tag": "big-memory"}).job.id
+    small = parts.submit()
+    leases = parts.leases()
+    tagged = replace(leases, tags=("big-memory",))
+    claims = [leases.claim("folder:a"), leases.claim("folder:a"), tagged.claim("folder:b")]
+    assert [claim and claim.job_id for claim in claims] == [small, None, large]
+
+
 def test_one_housekeeper_at_a_time(parts: Parts) -> None:
     with parts.database.elected("housekeeping") as first, parts.database.elected("housekeeping") as second:
         assert first
@@ -253,3 +264,16 @@ def test_a_text_that_postgresql_does_not_take(parts: Parts) -> None:
     file = parts.files.create(ANYBODY, "a\0b.mcap", 0)
     assert parts.files.get(ANYBODY, file.id).name == "ab.mcap"
     assert parse_line(b'{"failed": "a\\u0000b"}') == {"failed": "a\ufffdb"}
+
+
+def test_lists_in_every_order_and_by_every_filter(parts: Parts) -> None:
+    """Summaries are JSON, which each database reads by functions of its own."""
+    jobs = [parts.submit() for _ in range(2)]
+    leases = parts.leases()
+    claim = leases.claim("folder:a")
+    assert claim is not None
+    assert leases.succeed(claim, f"{jobs[0]}.1", ASSET, {"metrics": {"verdict": "good"}})
+    for order in ORDERS:
+        assert {job.id for job in parts.jobs.list(ANYBODY, JobFilter(order=order))} == set(jobs)
+    assert [job.id for job in parts.jobs.list(ANYBODY, JobFilter(verdict="good"))] == jobs[:1]
+    assert parts.jobs.count(ANYBODY, JobFilter(search="RUN")) == 2

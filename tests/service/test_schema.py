@@ -173,6 +173,7 @@ STEPS = "; ".join((*migrations.STEPS[1], *migrations.STEPS[2]))
                 (
                     *migrations.STEPS[1],
                     *migrations.STEPS[2],
+                    "ALTER TABLE job ADD COLUMN tag VARCHAR",
                     "DROP TABLE asset",
                     f"PRAGMA user_version={SCHEMA_VERSION}",
                 )

@@ -64,6 +64,34 @@ def free_port() -> int:
         return int(found.getsockname()[1])
 
 
+def environment(**variables: str) -> dict[str, str]:
+    """The variables of a server or worker that keeps tests short."""
+    return {k: v for k, v in os.environ.items() if not k.startswith("HSLOC_")} | {
+        "HSLOC_MIN_FREE_BYTES": "1M",
+        "HSLOC_GRACE_S": "0.3",
+        "HSLOC_HEARTBEAT_S": "0.5",
+        "HSLOC_LEASE_S": "5",
+        "HSLOC_WORKER_COMMAND": ",".join(FAKE),
+        **variables,
+    }
+
+
+class Worker:
+    """`hsloc work` as a process."""
+
+    def __init__(self, folder: Path, *arguments: str, **variables: str) -> None:
+        folder.mkdir(exist_ok=True)
+        self.log = folder / "worker.log"
+        command = [sys.executable, "-m", "hsloc.cli.main", "work", "--data", str(folder / "data"), *arguments]
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(command, env=environment(**variables), stdout=log, stderr=log)
+
+    def end(self, which: int = signal.SIGTERM) -> int:
+        """Send a signal; the exit code."""
+        self.process.send_signal(which)
+        return self.process.wait(30.0)
+
+
 class Live:
     """`hsloc serve` as a process."""
 
@@ -77,18 +105,10 @@ class Live:
         return f"http://127.0.0.1:{self.port}"
 
     def start(self) -> Live:
-        environment = {k: v for k, v in os.environ.items() if not k.startswith("HSLOC_")} | {
-            "HSLOC_MIN_FREE_BYTES": "1M",
-            "HSLOC_GRACE_S": "0.3",
-            "HSLOC_HEARTBEAT_S": "0.5",
-            "HSLOC_LEASE_S": "5",
-            "HSLOC_WORKER_COMMAND": ",".join(FAKE),
-            **self._variables,
-        }
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "hsloc.cli.main", "serve", "--data", str(self.data), "--port", str(self.port)],
-                env=environment,
+                env=environment(**self._variables),
                 stdout=log,
                 stderr=log,
             )

@@ -38,8 +38,8 @@ def need_postgresql() -> Path:
 class Server:
     """A running PostgreSQL."""
 
-    def __init__(self, folder: Path, programs: Path) -> None:
-        self.folder, self._programs = folder, programs
+    def __init__(self, folder: Path, programs: Path, fsync: bool = False) -> None:
+        self.folder, self._programs, self._fsync = folder, programs, fsync
         self._user = None
         if os.getuid() == 0:  # PostgreSQL does not run as root
             self._user = "postgres"
@@ -48,7 +48,8 @@ class Server:
         self._run("initdb", "-D", str(folder / "db"), "-U", "hsloc", "--auth=trust", "--no-sync", "-E", "UTF8")
 
     def start(self) -> None:
-        options = f"-k {self.folder} -c listen_addresses= -c fsync=off -c shared_buffers=16MB -c max_connections=200"
+        options = f"-k {self.folder} -c listen_addresses= -c shared_buffers=16MB -c max_connections=200"
+        options += f" -c fsync={'on' if self._fsync else 'off'}"
         self._run("pg_ctl", "-D", str(self.folder / "db"), "-w", "-o", options, "-l", str(self.folder / "log"), "start")
 
     def stop(self, mode: str = "fast") -> None:
@@ -77,10 +78,10 @@ class Server:
 
 
 @contextmanager
-def running() -> Iterator[Server]:
+def running(fsync: bool = False) -> Iterator[Server]:
     """A server that ends with the block. Its socket's path must be short."""
     with tempfile.TemporaryDirectory(prefix="hsloc-pg-", ignore_cleanup_errors=True) as folder:
-        server = Server(Path(folder), need_postgresql())
+        server = Server(Path(folder), need_postgresql(), fsync)
         server.start()
         try:
             yield server

@@ -62,11 +62,11 @@ def migrate(connection: Connection, name: str) -> tuple[int, int]:
             for version in range(before, FIRST_OF_ALEMBIC):
                 for statement in STEPS[version]:
                     connection.exec_driver_sql(statement)
-        Base.metadata.create_all(connection)
         if before > 0:
             _run_scripts(connection, stamped=VERSION_TABLE in tables)
         else:
             _stamp(connection, SCHEMA_VERSION)
+        Base.metadata.create_all(connection)
         if connection.dialect.name == "sqlite":
             connection.exec_driver_sql(f"PRAGMA user_version={SCHEMA_VERSION}")
     _need_columns(connection, name, before or SCHEMA_VERSION)

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from sqlalchemy import JSON, BigInteger, Index, Integer, Text, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 """Stored in the database; what leads from one to the next is in `migrations`."""
 
 JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
@@ -101,6 +101,8 @@ class JobRow(Base):
     """Where that folder is: the URL of an object store; None is the data folder."""
     summary: Mapped[dict[str, Any] | None]
     webhook: Mapped[str | None]
+    tag: Mapped[str | None]
+    """What a server or worker must be started with to run the job."""
     bytes: Mapped[int] = mapped_column(default=0)
     """What the results take, by their manifest."""
     __table_args__ = (
@@ -135,6 +137,33 @@ class UploadDeletionRow(Base):
     __tablename__ = "upload_deletion"
     id: Mapped[str] = mapped_column(primary_key=True)
     created: Mapped[float]
+
+
+class UploadPartRow(Base):
+    """A block of an upload that is in an object store, under the name `<file_id>.<number>`."""
+
+    __tablename__ = "upload_part"
+    file_id: Mapped[str] = mapped_column(primary_key=True)
+    start: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    size: Mapped[int]
+    number: Mapped[int]
+
+
+class WorkerRow(Base):
+    """A server or worker that shares the database, and when it was last there."""
+
+    __tablename__ = "worker"
+    id: Mapped[str] = mapped_column(primary_key=True)
+    """The owner in the leases of its jobs."""
+    kind: Mapped[str]
+    """server, worker"""
+    host: Mapped[str]
+    pid: Mapped[int]
+    version: Mapped[str]
+    slots: Mapped[int]
+    draining: Mapped[bool]
+    started: Mapped[float]
+    heartbeat: Mapped[float]
 
 
 class CounterRow(Base):

@@ -1,8 +1,7 @@
 """Who starts the jobs. The job's row with its lease decides; a dispatcher only chooses when it is read.
 
-`LocalDispatcher` runs the jobs of this machine in N slots. A dispatcher over PostgreSQL and Procrastinate would satisfy
-the same protocol: `enqueue` defers a task that carries nothing but the job's id, in the transaction that inserts the
-row; its workers call the same `Supervisor`; a task delivered twice finds the row taken and ends.
+`LocalDispatcher` runs jobs in N slots of this machine, whether the database is its own or shared with others: a slot
+that is free looks for a job once a second, and at once when this server took one.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import TYPE_CHECKING, Protocol
 from sqlalchemy.exc import OperationalError
 
 from hsloc_service.execution.processes import kill_marked
-from hsloc_service.execution.supervisor import Supervisor
 from hsloc_service.jobs.leases import new_owner
 from hsloc_service.logs import log
 from hsloc_service.reconciliation import reconcile
@@ -23,12 +21,8 @@ from hsloc_service.reconciliation import reconcile
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hsloc_service.execution.sandbox import Sandbox
-    from hsloc_service.jobs.leases import Leases
+    from hsloc_service.execution.supervisor import Supervisor
     from hsloc_service.results.deletion_queue import DeletionQueue
-    from hsloc_service.results.stores import ResultStores
-    from hsloc_service.settings import Settings
-    from hsloc_service.storage import Storage
 
 IDLE_S = 1.0
 
@@ -54,6 +48,11 @@ class Dispatcher(Protocol):
         ...
 
     @property
+    def owner(self) -> str:
+        """Name of this server in the leases."""
+        ...
+
+    @property
     def sandbox_kind(self) -> str:
         """What keeps jobs from the server's files: see `Sandbox`."""
         ...
@@ -76,22 +75,12 @@ class LocalDispatcher:
     started it, so a thread lives at least as long as its job."""
 
     def __init__(
-        self,
-        leases: Leases,
-        storage: Storage,
-        settings: Settings,
-        stores: ResultStores,
-        deletions: DeletionQueue,
-        sandbox: Sandbox,
-        *,
-        ended: Callable[[str, float, float], None] = lambda state, seconds, waited_s: None,
-        store_failed: Callable[[], None] = lambda: None,
+        self, supervisor: Supervisor, deletions: DeletionQueue, ended: Callable[[str, float, float], None]
     ) -> None:
-        self._leases, self._storage, self._settings, self._deletions = leases, storage, settings, deletions
-        self._supervisor = Supervisor(leases, storage, settings, stores, sandbox, store_failed)
-        self._ended = ended
-        self._owner = new_owner(storage.instance)
-        self._stop = threading.Event()
+        self._supervisor, self._deletions, self._ended = supervisor, deletions, ended
+        self._leases, self._storage, self._settings = supervisor.leases, supervisor.storage, supervisor.settings
+        self._owner = new_owner(self._storage.instance)
+        self._stop, self._draining = threading.Event(), threading.Event()
         self._work = threading.Condition()
         self._claiming = threading.Lock()
         """A job is claimed and entered into `_running` in one step; else another slot would take it for abandoned."""
@@ -128,6 +117,17 @@ class LocalDispatcher:
         for thread in self._threads:
             thread.join()
 
+    @property
+    def is_draining(self) -> bool:
+        """Whether no job is begun any more."""
+        return self._draining.is_set()
+
+    def drain(self) -> None:
+        """Begin no more jobs; those that run go on. `capacity` says when they have ended."""
+        self._draining.set()
+        with self._work:
+            self._work.notify_all()
+
     def enqueue(self, job_id: str) -> None:
         """Wake a slot."""
         del job_id
@@ -145,7 +145,7 @@ class LocalDispatcher:
         return Capacity(self._settings.slots, len(self._running))
 
     def _slot(self) -> None:
-        while not self._stop.is_set():
+        while not self._stop.is_set() and not self._draining.is_set():
             try:
                 if not self._run_next():
                     with self._work:

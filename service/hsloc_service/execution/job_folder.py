@@ -12,6 +12,7 @@ from hsloc_service.storage import safe_name
 from hsloc_service.stored_request import MAP_STATE, UPLOADS, logs_of
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from hsloc_service.execution.sandbox import Sandbox
@@ -21,11 +22,13 @@ if TYPE_CHECKING:
     from hsloc_service.storage import Storage
 
 
-def prepare(folder: Path, claim: Claim, storage: Storage, settings: Settings, sandbox: Sandbox) -> None:
+def prepare(
+    folder: Path, claim: Claim, files: Mapping[str, Path], storage: Storage, settings: Settings, sandbox: Sandbox
+) -> None:
     """`job.json`, the input under its own names (read-only), and an empty folder for temporary files.
 
     The logs are in `input`, `input-2`, and so on, because two parts of a run may have the same name. The saved map of a
-    job that is extended belongs beside `job.json`: see `download`.
+    job that is extended belongs beside `job.json`: see `download`. `files` are the uploads by their ids.
     """
     storage.remove_work(folder)
     for name in ("map", "tmp"):
@@ -35,7 +38,7 @@ def prepare(folder: Path, claim: Claim, storage: Storage, settings: Settings, sa
     def link(place: str, file_id: str, default: str) -> str:
         name = safe_name(claim.names.get(file_id, ""), default)
         (folder / place).mkdir(exist_ok=True, mode=0o700)
-        (folder / place / name).symlink_to(storage.upload_path(file_id).absolute())
+        (folder / place / name).symlink_to(files[file_id].absolute())
         return name
 
     places = [("input" if k == 0 else f"input-{k + 1}", ident) for k, ident in enumerate(logs_of(request))]
@@ -54,7 +57,7 @@ def prepare(folder: Path, claim: Claim, storage: Storage, settings: Settings, sa
     if request.get("map") is not None:
         job["map"] = link("map", request["map"]["yaml"], "map.yaml")
         # A name that no YAML can ask for; the worker links the name that this YAML does ask for.
-        (folder / "map" / ".image").symlink_to(storage.upload_path(request["map"]["image"]).absolute())
+        (folder / "map" / ".image").symlink_to(files[request["map"]["image"]].absolute())
         job["map_image"] = ".image"
     job |= {name: link(name, request[name], name) for name in UPLOADS if request.get(name) is not None}
     if claim.source is not None:

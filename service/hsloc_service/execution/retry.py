@@ -6,7 +6,7 @@ import math
 import time
 from typing import TYPE_CHECKING, TypeVar
 
-from hsloc_service.call_timeout import start_call
+from hsloc_service.call_timeout import MIN_BYTES_PER_S, start_call
 from hsloc_service.errors import StoreError
 from hsloc_service.logs import log
 
@@ -19,8 +19,6 @@ T = TypeVar("T")
 TICK_S = 0.05
 FIRST_WAIT_S = 1.0
 MAX_WAIT_S = 30.0
-MIN_BYTES_PER_S = 1 << 18
-"""A store that is slower than this counts as dead [B/s]."""
 
 
 class Interrupted(Exception):

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from hsloc_service.execution.input_cache import InputCache
     from hsloc_service.execution.sandbox import Sandbox
     from hsloc_service.jobs.leases import Claim, Leases
     from hsloc_service.results.stores import ResultStores
@@ -36,6 +37,7 @@ class Supervisor:
     settings: Settings
     stores: ResultStores
     sandbox: Sandbox
+    inputs: InputCache
     store_failed: Callable[[], None]
 
     def run(self, claim: Claim, *, stop: threading.Event, cancel: threading.Event) -> str:
@@ -52,12 +54,15 @@ class Supervisor:
     def _attempt(self, claim: Claim, folder: Path, heartbeat: Heartbeat, retry: Retry) -> Outcome:
         mark = f"{self.storage.instance}:{claim.job_id}.{claim.attempt}"
         try:
-            prepare(folder, claim, self.storage, self.settings, self.sandbox)
-            self._fetch_map(claim, folder, heartbeat, retry)
-            log("job.start", job=claim.job_id, tenant=claim.tenant, attempt=claim.attempt)
-            if random.random() < self.settings.fault_fail_jobs:
-                return Outcome("failed", "fault_injection", "this server fails jobs on purpose (fault_fail_jobs)")
-            return JobProcess(folder, mark, heartbeat, self.storage, self.settings, self.sandbox).run()
+            if self.inputs.is_remote or claim.source is not None:
+                heartbeat.enter("fetch")
+            with self.inputs.files(claim, retry) as files:
+                prepare(folder, claim, files, self.storage, self.settings, self.sandbox)
+                self._fetch_map(claim, folder, heartbeat, retry)
+                log("job.start", job=claim.job_id, tenant=claim.tenant, attempt=claim.attempt)
+                if random.random() < self.settings.fault_fail_jobs:
+                    return Outcome("failed", "fault_injection", "this server fails jobs on purpose (fault_fail_jobs)")
+                return JobProcess(folder, mark, heartbeat, self.storage, self.settings, self.sandbox).run()
         except Interrupted as end:
             return interrupted(end.reason)
         except StoreError as error:
@@ -72,6 +77,5 @@ class Supervisor:
         if claim.source is None:
             return
         source, store = claim.source, self.stores.of(claim.source.store)
-        heartbeat.enter("fetch")
         timeout_s = transfer_timeout_s(store, [source.size], self.settings.store_timeout_s)
         retry.retry("fetch", lambda: download(store, source, folder), timeout_s)

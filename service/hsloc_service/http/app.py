@@ -14,9 +14,6 @@ import hsloc.report
 from hsloc.version import __version__
 from hsloc_service.auth import Tokens
 from hsloc_service.call_timeout import BoundedExecutor
-from hsloc_service.db.database import open_database
-from hsloc_service.execution.dispatcher import LocalDispatcher
-from hsloc_service.execution.sandbox import choose_sandbox
 from hsloc_service.execution.warm_up import WarmUp
 from hsloc_service.housekeeping import Housekeeping
 from hsloc_service.http import (
@@ -35,13 +32,11 @@ from hsloc_service.http.context import Context, known_query
 from hsloc_service.http.error_handlers import add_error_handlers
 from hsloc_service.http.guard import Guard
 from hsloc_service.http.openapi import add_openapi
-from hsloc_service.jobs.leases import Leases
 from hsloc_service.jobs.repository import Jobs
+from hsloc_service.jobs.workers import Presence
 from hsloc_service.logs import log
-from hsloc_service.results.deletion_queue import DeletionQueue
-from hsloc_service.results.stores import ResultStores
-from hsloc_service.settings import WORKER, SettingsError
-from hsloc_service.storage import Storage
+from hsloc_service.parts import open_parts
+from hsloc_service.settings import WORKER
 from hsloc_service.uploads.repository import Files
 from hsloc_service.uploads.upload_stream import UploadReceiver
 from hsloc_service.webhooks import WebhookSender
@@ -101,27 +96,9 @@ def create_app(settings: Settings) -> FastAPI:
 
 def open_context(settings: Settings) -> Context:
     """The parts of a service on its data folder; nothing runs yet. Raises SettingsError."""
-    settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
-    storage = Storage(settings.data, settings.min_free_bytes)
-    try:
-        sandbox = choose_sandbox(settings.sandbox, settings.data, settings.worker_command)
-        database, stores = open_database(settings), ResultStores(storage, settings)
-    except SettingsError:
-        storage.close()
-        raise
-    stores.expect(database)
-    files = Files(database, storage, settings)
-    deletions = DeletionQueue(database, storage, stores, settings.store_timeout_s)
-    dispatcher = LocalDispatcher(
-        Leases(database, settings.lease_s, settings.max_attempts),
-        storage,
-        settings,
-        stores,
-        deletions,
-        sandbox,
-        ended=metrics.attempt_ended,
-        store_failed=metrics.STORE_ERRORS.inc,
-    )
+    parts = open_parts(settings, ended=metrics.attempt_ended, store_failed=metrics.STORE_ERRORS.inc)
+    database, storage = parts.database, parts.storage
+    files = Files(database, storage, settings, parts.upload_parts)
     return Context(
         settings=settings,
         database=database,
@@ -129,9 +106,9 @@ def open_context(settings: Settings) -> Context:
         files=files,
         jobs=Jobs(database, storage, settings),
         receiver=UploadReceiver(files, settings),
-        dispatcher=dispatcher,
-        stores=stores,
-        deletions=deletions,
+        dispatcher=parts.dispatcher,
+        stores=parts.stores,
+        deletions=parts.deletions,
         store_calls=BoundedExecutor(settings.store_timeout_s),
     )
 
@@ -140,12 +117,15 @@ def open_context(settings: Settings) -> Context:
 async def running(context: Context) -> AsyncIterator[None]:
     """The lifespan: slots, webhooks and housekeeping run inside it; the data folder is closed behind it."""
     settings, database, storage = context.settings, context.database, context.storage
-    helpers: list[WebhookSender | Housekeeping | WarmUp] = [
+    helpers: list[WebhookSender | Housekeeping | WarmUp | Presence] = [
         WebhookSender(database, settings),
         Housekeeping(database, storage, settings, context.deletions),
     ]
     if context.dispatcher.sandbox_kind != "none" and settings.worker_command == WORKER:
         helpers.append(WarmUp(storage.cache.absolute()))
+    if database.shared:
+        slots = settings.slots
+        helpers.append(Presence(database, context.dispatcher.owner, "server", slots, settings.heartbeat_s))
     context.dispatcher.start()
     for helper in helpers:
         helper.start()

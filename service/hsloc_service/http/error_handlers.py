@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from fastapi import Request, Response
 from fastapi.exceptions import RequestValidationError
-from sqlalchemy.exc import DatabaseError, OperationalError
+from sqlalchemy.exc import DatabaseError, InterfaceError, OperationalError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match
@@ -66,9 +66,10 @@ def add_error_handlers(app: FastAPI, storage: Storage, routes: Sequence[BaseRout
         return _answer(500, "database", "the server's database is damaged; report it", {"connection": "close"})
 
     @app.exception_handler(OperationalError)
-    async def database(_request: Request, error: OperationalError) -> Response:
+    @app.exception_handler(InterfaceError)
+    async def database(_request: Request, error: OperationalError | InterfaceError) -> Response:
         log("database.error", error=str(error.orig))
-        if is_disk_full(error):
+        if isinstance(error, OperationalError) and is_disk_full(error):
             storage.drop_ballast()
             return _answer(507, "no_space", "the server's disk is full; try again", {"Retry-After": "1"})
         return _answer(503, "database", "the database is busy", {"Retry-After": "1"})

@@ -13,6 +13,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from anyio import to_thread
+from sqlalchemy.exc import InterfaceError, OperationalError
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import Message
@@ -114,7 +115,11 @@ class Guard:
         if path in PUBLIC or path.startswith(PUBLIC_PREFIX):
             return None
         client = (scope.get("client") or ("unknown", 0))[0]
-        who = await self._principal(headers)
+        try:
+            who = await self._principal(headers)
+        except (OperationalError, InterfaceError) as error:
+            log("database.error", error=str(error.orig))
+            raise ServiceError(503, "database", "the database is busy", {"Retry-After": "1"}) from error
         if who is None:
             slow = self._settings.refusals_per_s
             self._rates.take(("refused", client), slow, 20.0 * slow)

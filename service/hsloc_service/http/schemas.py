@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from hsloc.options import Option
 
+TAG_PATTERN = r"^[a-z0-9][a-z0-9-]{0,39}$"
 UUID_PATTERN = r"^[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}$"
 Ident = Annotated[str, Field(pattern=UUID_PATTERN, examples=["3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f"])]
 PoseList = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3, examples=[[1.0, 2.0, 0.0]])]
@@ -129,6 +130,11 @@ class RunRequest(_Run):  # type: ignore[misc, valid-type]
     read: ReadRequest | None = None  # type: ignore[valid-type]
     webhook: Annotated[str, Field(max_length=2000, pattern=r"^https?://[^\s]+$")] | None = Field(
         default=None, description="URL that is called when the job has ended"
+    )
+    tag: Annotated[str, Field(pattern=TAG_PATTERN)] | None = Field(
+        default=None,
+        description="run only where servers or workers were started with this tag",
+        examples=["big-memory"],
     )
 
 
@@ -250,6 +256,29 @@ class JobList(BaseModel):
     jobs: list[JobView]
     next: int | None
     total: int | None = Field(default=None, description="how many jobs the filter leaves, where `brief` was asked for")
+
+
+class WorkerView(BaseModel):
+    """A server or worker."""
+
+    id: str
+    kind: Literal["server", "worker"]
+    host: str
+    pid: int
+    version: str
+    slots: int
+    busy: int = Field(description="slots that run a job, of any tenant")
+    jobs: list[Ident] = Field(description="your jobs that it runs")
+    draining: bool = Field(description="it was asked to stop, and begins no more jobs")
+    started: AwareDatetime
+    heartbeat_age_s: float
+    alive: bool = Field(description="its last heartbeat is younger than a lease; else its jobs go to others")
+
+
+class WorkerList(BaseModel):
+    """The servers and workers that share a database; empty where it is one server's own."""
+
+    workers: list[WorkerView]
 
 
 class AssetView(BaseModel):

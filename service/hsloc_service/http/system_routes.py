@@ -16,7 +16,9 @@ from hsloc_service.db.tables import DeliveryRow, JobRow
 from hsloc_service.errors import ServiceError
 from hsloc_service.http import metrics
 from hsloc_service.http.context import Admin, Context, Ctx, Reader, problems
-from hsloc_service.http.schemas import Health, Info, Options, Problem, SecretView
+from hsloc_service.http.schemas import Health, Info, Options, Problem, SecretView, WorkerList
+from hsloc_service.http.views import worker_view
+from hsloc_service.jobs.workers import workers
 from hsloc_service.webhooks import secret_of
 
 router = APIRouter(tags=["system"])
@@ -67,6 +69,12 @@ def info(ctx: Ctx, who: Reader) -> Info:
         max_upload_bytes=ctx.settings.max_upload_bytes,
         free_bytes=ctx.storage.free_bytes(),
     )
+
+
+@router.get("/v1/workers", responses=problems())
+def list_workers(ctx: Ctx, who: Admin) -> WorkerList:
+    """The servers and workers that share the database, with your jobs that they run. Needs the scope `admin`."""
+    return WorkerList(workers=[worker_view(each, ctx.settings.lease_s) for each in workers(ctx.database, who)])
 
 
 @router.get("/v1/options", responses=problems())

@@ -5,11 +5,20 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any, cast
 
-from hsloc_service.http.schemas import DeliveryView, FileView, JobView, ProgressView, known_moment, moment
+from hsloc_service.http.schemas import (
+    DeliveryView,
+    FileView,
+    JobView,
+    ProgressView,
+    WorkerView,
+    known_moment,
+    moment,
+)
 
 if TYPE_CHECKING:
     from hsloc_service.db.tables import DeliveryRow, FileRow, JobRow
     from hsloc_service.http.schemas import State
+    from hsloc_service.jobs.workers import WorkerState
 
 
 def file_view(row: FileRow) -> FileView:
@@ -23,6 +32,25 @@ def file_view(row: FileRow) -> FileView:
         sha256=row.sha256,
         created=known_moment(row.created),
         expires=moment(row.expires),
+    )
+
+
+def worker_view(state: WorkerState, lease_s: float) -> WorkerView:
+    """A server or worker."""
+    row = state.row
+    return WorkerView(
+        id=row.id,
+        kind="server" if row.kind == "server" else "worker",
+        host=row.host,
+        pid=row.pid,
+        version=row.version,
+        slots=row.slots,
+        busy=state.busy,
+        jobs=state.jobs,
+        draining=row.draining,
+        started=known_moment(row.started),
+        heartbeat_age_s=round(state.age_s, 3),
+        alive=state.age_s < lease_s,
     )
 
 

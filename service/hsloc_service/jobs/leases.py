@@ -75,11 +75,13 @@ class Leases:
     database: Database
     lease_s: float
     max_attempts: int
+    tags: tuple[str, ...] = ()
+    """Tags of jobs that are taken, besides those without one."""
 
     def claim(self, owner: str) -> Claim | None:
         """Take the oldest waiting job of the tenant whose turn it is; None if none waits."""
         with self.database.write() as session:
-            job = session.scalar(_next())
+            job = session.scalar(_next(self.tags))
             if job is None:
                 return None
             now = self.database.now(session)
@@ -213,8 +215,10 @@ def instance_of(owner: str) -> str:
     return owner.partition(":")[0]
 
 
-def _next() -> Any:
-    """The next job, tenants in turn: who has least running comes first, then who was served longest ago.
+def _next(tags: tuple[str, ...]) -> Any:
+    """The next job without a tag or with one of these, tenants in turn.
+
+    Who has least running comes first, then who was served longest ago.
 
     One statement, so portable as it stands. A tenant's jobs are begun in the order of `seq`, so that its last start is
     found at the end of its index, whatever number of jobs it has.
@@ -238,7 +242,7 @@ def _next() -> Any:
     )
     return (
         select(JobRow)
-        .where(JobRow.state == "queued")
+        .where(JobRow.state == "queued", or_(JobRow.tag.is_(None), JobRow.tag.in_(tags)))
         .order_by(running, func.coalesce(served, 0.0), JobRow.seq)
         .limit(1)
         .with_for_update(skip_locked=True, of=JobRow)

@@ -212,6 +212,7 @@ class Jobs:
             attempt=0,
             cancel=False,
             webhook=request.get("webhook"),
+            tag=request.get("tag"),
         )
         session.add(job)
         session.flush()

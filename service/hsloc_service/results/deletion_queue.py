@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hsloc_service.db.tables import FileRow
     from hsloc_service.results.store import ResultStore
     from hsloc_service.results.stores import ResultStores
+    from hsloc_service.results.upload_parts import UploadParts
     from hsloc_service.storage import Storage
 
 BATCH = 200
@@ -34,9 +35,10 @@ class DeletionQueue:
     storage: Storage
     stores: ResultStores
     timeout_s: float
+    parts: UploadParts | None = None
 
     def clear_uploads(self) -> int:
-        """Remove the bytes of deleted uploads; how many there were."""
+        """Remove the bytes of deleted uploads; how many there were. Raises StoreError."""
         count = 0
         while True:
             with self.database.read() as session:
@@ -45,6 +47,8 @@ class DeletionQueue:
                 return count
             for file_id in found:
                 self.storage.upload_path(file_id).unlink(missing_ok=True)
+                if self.parts is not None:
+                    self.parts.remove(file_id)
             with self.database.write() as session:
                 session.execute(delete(UploadDeletionRow).where(UploadDeletionRow.id.in_(found)))
             count += len(found)

@@ -1,7 +1,8 @@
 """Results in an object store, or whatever else fsspec knows: `s3://bucket/prefix`, `gcs://…`, `file:///mnt/results`.
 
-Objects are written one by one under `<url>/<instance>/<job>.<attempt>/`. The instance is that of the data folder: two
+Objects are written one by one under `<url>/<folder>/<job>.<attempt>/`. The folder is the data folder's instance: two
 servers may share a bucket, and one that starts on an empty folder does not take the results of another for leftovers.
+Where servers share a database it is `results`, for all of them: the rows say what is whose.
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ class ObjectStore:
     Raises SettingsError for a URL that cannot be used; whether the store answers is seen when it is needed.
     """
 
-    def __init__(self, url: str, instance: str) -> None:
+    def __init__(self, url: str, folder: str, setting: str = "HSLOC_RESULTS_URL") -> None:
         parts = urlsplit(url)
         if not parts.scheme or "::" in url:
-            raise SettingsError(f"HSLOC_RESULTS_URL is {url!r}; it must be a URL such as s3://bucket/prefix")
+            raise SettingsError(f"{setting} is {url!r}; it must be a URL such as s3://bucket/prefix")
         if parts.username is not None or parts.password is not None or parts.query:
             # The URL stands in the database and in errors.
             raise SettingsError(
-                f"HSLOC_RESULTS_URL: leave user, password and query out of the {parts.scheme} URL; "
+                f"{setting}: leave user, password and query out of the {parts.scheme} URL; "
                 "credentials stand where the file system looks for them, such as AWS_ACCESS_KEY_ID"
             )
         try:
@@ -52,12 +53,12 @@ class ObjectStore:
         except ImportError as error:
             package = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs"}.get(parts.scheme)
             hint = f": pip install {package}" if package else f": {error}"
-            raise SettingsError(f"HSLOC_RESULTS_URL is {url!r}; its file system is not installed{hint}") from error
+            raise SettingsError(f"{setting} is {url!r}; its file system is not installed{hint}") from error
         except Exception as error:
-            raise SettingsError(f"HSLOC_RESULTS_URL is {url!r}, which cannot be used: {error}") from error
+            raise SettingsError(f"{setting} is {url!r}, which cannot be used: {error}") from error
         self._flat = parts.scheme in FLAT
         self._url = url if url.endswith("://") else url.rstrip("/")
-        self._root = f"{str(root).rstrip('/')}/{instance}"
+        self._root = f"{str(root).rstrip('/')}/{folder}"
         self._there = False
         """Whether our folder was seen to be there."""
 

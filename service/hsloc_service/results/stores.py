@@ -23,7 +23,14 @@ class ResultStores:
     def __init__(self, storage: Storage, settings: Settings) -> None:
         self.folder = FolderStore(storage.results)
         self.current: ResultStore = self.folder
-        if settings.results_url:
+        self.parts_store: ResultStore | None = None
+        """Where the parts of uploads are; None: uploads are files of the data folder."""
+        if settings.store_url:
+            from hsloc_service.results.object_store import ObjectStore
+
+            self.current = ObjectStore(settings.store_url, "results", "HSLOC_STORE_URL")
+            self.parts_store = ObjectStore(settings.store_url, "uploads", "HSLOC_STORE_URL")
+        elif settings.results_url:
             # fsspec is imported where it is needed alone.
             from hsloc_service.results.object_store import ObjectStore
 
@@ -45,5 +52,7 @@ class ResultStores:
         if url is None:
             return self.folder
         if url != self.current.url:
-            raise StoreError(f"these results are in {url}, which this server is not set to (HSLOC_RESULTS_URL)")
+            raise StoreError(
+                f"these results are in {url}, which this server is not set to (HSLOC_STORE_URL, HSLOC_RESULTS_URL)"
+            )
         return self.current

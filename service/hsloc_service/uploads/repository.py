@@ -7,9 +7,9 @@ import uuid
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sqlalchemy import case, func, select, tuple_
+from sqlalchemy import case, delete, func, select, tuple_
 
-from hsloc_service.db.tables import ACTIVE, FileRow, JobRow
+from hsloc_service.db.tables import ACTIVE, FileRow, JobRow, UploadPartRow
 from hsloc_service.errors import ServiceError, conflict, no_space, not_found
 from hsloc_service.results.deletion_queue import delete_upload
 from hsloc_service.stored_request import files_of
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from hsloc_service.auth import Principal
     from hsloc_service.db.database import Database
+    from hsloc_service.results.upload_parts import UploadParts
     from hsloc_service.settings import Settings
     from hsloc_service.storage import Storage
 
@@ -32,6 +33,8 @@ class Files:
     database: Database
     storage: Storage
     settings: Settings
+    parts: UploadParts | None = None
+    """Where uploads are that are in an object store; None: they are files of the data folder."""
 
     def create(self, who: Principal, name: str, size: int | None, file_id: str | None = None) -> FileRow:
         """A row for an upload of `size` bytes (None: not known yet), which are reserved.
@@ -72,6 +75,9 @@ class Files:
 
     def _need_room(self, session: Session, who: Principal, size: int) -> None:
         need_quota(session, who, self.settings.tenant_bytes, size)
+        if self.parts is not None:
+            self.storage.need_space()
+            return
         # What others announced and have not sent yet is theirs already.
         pending = session.scalar(
             select(func.coalesce(func.sum(FileRow.size - FileRow.received), 0)).where(
@@ -120,6 +126,7 @@ class Files:
             row = _file(session, who, file_id)
             if row.state == "complete":
                 raise conflict("complete", "this upload is finished and cannot be changed")
+            session.execute(delete(UploadPartRow).where(UploadPartRow.file_id == file_id))
             row.received, row.size = 0, None  # what was reserved for it is free again
             session.flush()
             self._need_room(session, who, size or 0)

@@ -15,6 +15,7 @@ from starlette.requests import ClientDisconnect
 
 from hsloc_service.errors import ServiceError, conflict, no_space
 from hsloc_service.logs import log
+from hsloc_service.results.upload_parts import Staging
 from hsloc_service.storage import hash_file, sync_folder
 
 if TYPE_CHECKING:
@@ -85,16 +86,23 @@ class UploadReceiver:
 
     async def finish(self, file_id: str) -> FileRow:
         """All bytes are there: note size and sha256, computed on the way or (after a restart) from the file."""
-        path = self._files.storage.upload_path(file_id)
+        path, parts = self._files.storage.upload_path(file_id), self._files.parts
         digest, counted = self._hashes.pop(file_id, (None, -1))
-        size = await to_thread.run_sync(lambda: path.stat().st_size)
-        sha256 = (
-            digest.hexdigest()
-            if digest is not None and counted == size
-            else (await to_thread.run_sync(hash_file, path))[1]
-        )
+
+        def size_of() -> int:
+            return path.stat().st_size if parts is None else sum(part.size for part in parts.of(file_id))
+
+        size = await to_thread.run_sync(size_of)
+        if digest is not None and counted == size:
+            sha256 = digest.hexdigest()
+        elif parts is None:
+            sha256 = (await to_thread.run_sync(hash_file, path))[1]
+        else:
+            sha256 = (await to_thread.run_sync(parts.hash, file_id))[1]
 
         def done() -> FileRow:
+            if parts is not None:
+                return self._files.complete(file_id, size, sha256)
             sync_folder(path.parent)
             row = self._files.complete(file_id, size, sha256)
             path.chmod(0o400)  # not before: a server that died in between could not go on with the upload
@@ -129,7 +137,8 @@ class _Append:
         self, files: Files, who: Principal, row: FileRow, limit: int, digest: Any, checksum: tuple[str, bytes] | None
     ) -> None:
         self._files, self._who, self._row, self._limit = files, who, row, limit
-        self._path = files.storage.upload_path(row.id)
+        self._path, self._parts = files.storage.upload_path(row.id), files.parts
+        self._staging = Staging(files.storage.work)
         self.safe = self._at = row.received
         self.digest = digest
         self._running = None if digest is None else digest.copy()
@@ -168,6 +177,8 @@ class _Append:
 
     def _open(self) -> int:
         """Open at the offset; bytes beyond it were never acknowledged and go."""
+        if self._parts is not None:
+            return self._staging.open()
         flags = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
         descriptor = os.open(self._path, flags, 0o600)
         size = os.fstat(descriptor).st_size
@@ -207,15 +218,27 @@ class _Append:
     def _make_safe(self, descriptor: int) -> None:
         if self._at == self.safe:
             return
+        if self._parts is not None:
+            size, last = self._at - self.safe, self._at == self._row.size
+            self._parts.add(self._row.id, self.safe, self._staging.folder, size, last=last)
+            os.ftruncate(descriptor, 0)
+            os.lseek(descriptor, 0, os.SEEK_SET)
+            self._set_safe()
+            return
         os.fdatasync(descriptor)
         if self._at != self._row.size:
             self._files.advance(self._row.id, self._at)
+        self._set_safe()
+
+    def _set_safe(self) -> None:
         self.safe = self._at
         self.digest = None if self._running is None else self._running.copy()
 
     def _close(self, descriptor: int) -> None:
         """Cut off what is not acknowledged: gives the room back when the disk is full."""
         try:
-            os.ftruncate(descriptor, self.safe)
+            if self._parts is None:
+                os.ftruncate(descriptor, self.safe)
         finally:
             os.close(descriptor)
+            self._staging.remove()

@@ -1,0 +1,87 @@
+"""How fast workers take jobs from one database: N threads claim and end jobs that do nothing."""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+import postgresql
+from sqlalchemy import insert
+
+from hsloc_service.db.database import Database
+from hsloc_service.db.tables import JobRow
+from hsloc_service.jobs.leases import Leases
+
+TENANTS = 4
+
+
+def fill(database: Database, count: int) -> None:
+    """Waiting jobs of several tenants."""
+    rows = [
+        {
+            "seq": k + 1,
+            "id": f"job-{k}",
+            "tenant": f"tenant-{k % TENANTS}",
+            "file_id": "",
+            "log_name": "",
+            "request": {"log": ""},
+            "state": "queued",
+            "created": time.time(),
+            "attempt": 0,
+            "cancel": False,
+            "bytes": 0,
+        }
+        for k in range(count)
+    ]
+    with database.write() as session:
+        session.execute(insert(JobRow), rows)
+
+
+def measure(database: Database, workers: int, count: int) -> tuple[float, list[float]]:
+    """Jobs per second, and the time of each claim [s]."""
+    fill(database, count)
+    leases, times = Leases(database, 30.0, 3), list[float]()
+
+    def run(name: str) -> None:
+        while True:
+            begin = time.perf_counter()
+            claim = leases.claim(name)
+            if claim is None:
+                return
+            times.append(time.perf_counter() - begin)
+            leases.fail(claim, "failed", "none", "")
+
+    threads = [threading.Thread(target=run, args=(f"w:{k}",)) for k in range(workers)]
+    begin = time.perf_counter()
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return len(times) / (time.perf_counter() - begin), times
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--jobs", type=int, default=400)
+    arguments = parser.parse_args()
+    print("database    workers  jobs/s  claim p50 [ms]  p99 [ms]")
+    with postgresql.running(fsync=True) as server, tempfile.TemporaryDirectory() as folder:
+        for name in ("sqlite", "postgresql"):
+            for workers in (1, 4, 16, 64):
+                path = Path(folder) / f"{workers}.db"
+                database = Database(path if name == "sqlite" else server.new_database())
+                rate, times = measure(database, workers, arguments.jobs)
+                database.close()
+                middle, late = statistics.median(times), statistics.quantiles(times, n=100)[98]
+                print(f"{name:11} {workers:7} {rate:7.0f} {1e3 * middle:15.1f} {1e3 * late:9.1f}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,233 @@
+"""Jobs on two servers and several workers that share a PostgreSQL and a store, while all of them are mistreated.
+
+At random: kill -9 of workers, servers and jobs' processes, a worker that stands still for longer than its lease and
+comes back, a restart of PostgreSQL. Afterwards: every accepted job has ended exactly once, its results are right and
+there once, every upload is whole, every webhook came, and no process is left.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
+import postgresql
+from rig import Server, Worker, jobs_processes
+from sqlalchemy import select
+
+from hsloc.client import Client, ClientError
+from hsloc_service.db.database import Database
+from hsloc_service.db.tables import AssetRow, EventRow, FileRow, JobRow
+from hsloc_service.results.object_store import ObjectStore
+from hsloc_service.results.upload_parts import UploadParts
+
+ENDS = ("succeeded", "failed", "crashed", "cancelled")
+LEASE_S = 4.0
+
+
+class Fleet:
+    def __init__(self, folder: Path, database: postgresql.Server, workers: int) -> None:
+        self.folder, self.database, self.url = folder, database, database.new_database()
+        self.store = f"file://{folder}/store"
+        shared = {
+            "HSLOC_DATABASE_URL": self.url,
+            "HSLOC_STORE_URL": self.store,
+            "HSLOC_LEASE_S": str(LEASE_S),
+            "HSLOC_HEARTBEAT_S": "0.5",
+            "HSLOC_MAX_ATTEMPTS": "60",
+            "HSLOC_MAX_QUEUED": "10000",
+            "HSLOC_WEBHOOK_PRIVATE": "1",
+            "HSLOC_WEBHOOK_ATTEMPTS": "50",
+            "HSLOC_WEBHOOK_BACKOFF_S": "0.2",
+        }
+        self.servers = [Server(folder / f"s{k}", HSLOC_SLOTS="0", **shared).start() for k in range(2)]
+        self.workers = [Worker(folder / f"w{k}", HSLOC_SLOTS="2", **shared).start() for k in range(workers)]
+
+    def folders(self) -> list[Path]:
+        return [each.data for each in (*self.servers, *self.workers)]
+
+    def mistreat(self, rng: random.Random) -> str:
+        """Do one thing to one of them; what it was."""
+        kind = rng.choices(("worker", "job process", "server", "stop", "database"), (40, 30, 20, 7, 3))[0]
+        if kind == "job process":
+            pids = [pid for folder in self.folders() for pid in jobs_processes(folder)]
+            if not pids:
+                return self.mistreat(rng)
+            with suppress(ProcessLookupError):
+                os.kill(rng.choice(pids), signal.SIGKILL)
+        elif kind == "server":
+            server = rng.choice(self.servers)
+            server.end(signal.SIGKILL)
+            server.start()
+        elif kind == "database":
+            self.database.stop("immediate")
+            time.sleep(rng.uniform(0.0, 2.0))
+            self.database.start()
+        else:
+            worker = rng.choice(self.workers)
+            if kind == "stop":
+                assert worker.process is not None
+                worker.process.send_signal(signal.SIGSTOP)
+                time.sleep(1.5 * LEASE_S)
+                worker.process.send_signal(signal.SIGCONT)
+            else:
+                worker.end(signal.SIGKILL)
+                worker.start()
+        return kind
+
+
+class Receiver(ThreadingHTTPServer):
+    """Counts webhooks by their event's id."""
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.jobs: dict[str, str] = {}
+        self.count: Counter[str] = Counter()
+
+
+class Handler(BaseHTTPRequestHandler):
+    server: Receiver
+
+    def do_POST(self) -> None:
+        body = json.loads(self.rfile.read(int(self.headers["content-length"])))
+        self.server.count[body["event_id"]] += 1
+        self.server.jobs[body["event_id"]] = body["job"]
+        self.send_response(200)
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def submit_all(url: str, count: int, seed: int, hook: str, accepted: dict[str, tuple[int, str]]) -> None:
+    """Upload and submit, as a client that tries again; one in ten is cancelled soon after."""
+    rng = random.Random(seed)
+    client = Client(url, attempts=300, timeout_s=10.0, block=20_000)
+    path = Path(tempfile.gettempdir()) / f"fleet-{os.getpid()}-{seed}.mcap"
+    for k in range(count):
+        path.write_bytes(f"slow {rng.uniform(0.5, 3.0):.3f} {k} ".encode() + rng.randbytes(50_000))
+        number = seed * 100_000 + k
+        job = client.submit(client.upload(path), seed=number, webhook=hook)
+        accepted[job["id"]] = (number, hashlib.sha256(path.read_bytes()).hexdigest())
+        if rng.random() < 0.1:
+            with suppress(ClientError):
+                client.cancel(job["id"])
+        time.sleep(rng.uniform(0.0, 0.6))
+    path.unlink()
+
+
+def judge(fleet: Fleet, accepted: dict[str, tuple[int, str]], receiver: Receiver) -> list[str]:
+    """What is wrong; nothing, if all is well."""
+    wrong: list[str] = []
+    database = Database(fleet.url)
+    results, uploads = ObjectStore(fleet.store, "results"), ObjectStore(fleet.store, "uploads")
+    parts = UploadParts(database, uploads, 30.0)
+    with database.read() as session:
+        jobs = {job.id: job for job in session.scalars(select(JobRow))}
+        files = {row.id: row for row in session.scalars(select(FileRow))}
+        events: list[Any] = list(session.scalars(select(EventRow).where(EventRow.kind == "state")))
+        assets = list(session.scalars(select(AssetRow)))
+    ends = Counter(event.job_id for event in events if event.data["state"] in ENDS)
+    for job_id, (number, digest) in accepted.items():
+        job = jobs.get(job_id)
+        if job is None:
+            wrong.append(f"{job_id}: lost")
+        elif ends[job_id] != 1 or job.state not in ENDS:
+            wrong.append(f"{job_id}: ended {ends[job_id]} times, is {job.state}")
+        elif files[job.file_id].sha256 != digest or parts.hash(job.file_id)[1] != digest:
+            wrong.append(f"{job_id}: its upload is not what was sent")
+        elif job.state == "succeeded":
+            for asset in [each for each in assets if each.job_id == job_id]:
+                content = results.read(job.folder or "", asset.name, 0, asset.size)
+                if hashlib.sha256(content).hexdigest() != asset.sha256:
+                    wrong.append(f"{job_id}: {asset.name} is not what its manifest says")
+                if asset.name == "trajectory.tum" and not content.startswith(f"{number} ".encode()):
+                    wrong.append(f"{job_id}: has the results of another")
+    folders = {job.folder for job in jobs.values() if job.folder is not None}
+    if set(jobs) != set(accepted):
+        wrong.append(f"{len(jobs)} jobs in the database, {len(accepted)} accepted")
+    if set(results.names()) != folders:
+        wrong.append(f"{len(results.names())} folders of results, {len(folders)} jobs that succeeded")
+    if set(receiver.jobs.values()) != set(accepted) or len(receiver.jobs) != len(accepted):
+        wrong.append(f"{len(receiver.jobs)} webhooks for {len(accepted)} jobs")
+    for folder in fleet.folders():
+        if left := jobs_processes(folder):
+            wrong.append(f"processes are left: {left}")
+        if list((folder / "work").iterdir()):
+            wrong.append(f"{folder.name}: folders of attempts are left")
+    database.close()
+    return wrong
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--jobs", type=int, default=100)
+    parser.add_argument("--kills", type=int, default=60)
+    parser.add_argument("--workers", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    folder, rng = Path(tempfile.mkdtemp(prefix="hsloc-fleet-")), random.Random(arguments.seed)
+    accepted: dict[str, tuple[int, str]] = {}
+    receiver = Receiver()
+    threading.Thread(target=receiver.serve_forever, daemon=True).start()
+    hook = f"http://127.0.0.1:{receiver.server_port}/"
+    with postgresql.running() as database:
+        fleet = Fleet(folder, database, arguments.workers)
+        begin = time.monotonic()
+        clients = []
+        for k, server in enumerate(fleet.servers):
+            work = (server.url, arguments.jobs // 2, arguments.seed * 10 + k, hook, accepted)
+            clients.append(threading.Thread(target=submit_all, args=work, daemon=True))
+            clients[-1].start()
+        done: Counter[str] = Counter()
+        while sum(done.values()) < arguments.kills:
+            time.sleep(rng.uniform(0.05, 1.5))
+            done[fleet.mistreat(rng)] += 1
+        for thread in clients:
+            thread.join(600.0)
+        client = Client(fleet.servers[0].url)
+        states = Counter(client.wait(job)["state"] for job in accepted)
+        attempts = Counter(client.job(job)["attempt"] for job in accepted)
+        seconds = time.monotonic() - begin
+        deadline = time.monotonic() + 60.0
+        while len(receiver.jobs) < len(accepted) and time.monotonic() < deadline:
+            time.sleep(0.2)
+        for each in (*fleet.workers, *fleet.servers):
+            each.end()
+        # One more start and stop: what killed ones left behind is swept in a server's first round.
+        for server in fleet.servers:
+            server.start()
+        time.sleep(3.0)
+        for server in fleet.servers:
+            server.end()
+        for worker in fleet.workers:
+            worker.start()
+        time.sleep(5.0)
+        for worker in fleet.workers:
+            worker.end()
+        wrong = judge(fleet, accepted, receiver)
+    print(f"{len(accepted)} jobs accepted; {sum(done.values())} mishaps: {dict(done)}; {seconds:.0f} s")
+    print(f"states: {dict(states)}; attempts: {dict(sorted(attempts.items()))}")
+    print(f"webhooks: {len(receiver.count)} events, {sum(receiver.count.values()) - len(receiver.count)} sent again")
+    print("\n".join(wrong) or "nothing lost, nothing twice, no process left")
+    if not wrong:
+        shutil.rmtree(folder)
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -41,12 +41,18 @@ def beam_angles(count: int) -> tuple[float, float]:
     return -pi / 2.0, pi / max(count - count % 2, 1)
 
 
+def numbers(words: Sequence[str]) -> NDArray[np.float32]:
+    """Words as numbers; what single precision does not hold is infinite. Raises ValueError."""
+    with np.errstate(over="ignore"):
+        return np.array(words, dtype=np.float32)
+
+
 def readings(words: Sequence[str]) -> tuple[NDArray[np.float32], int]:
     """A count and so many numbers at the head of `words`; returns them and how many words they took."""
     count = int(words[0])
     if not 0 <= count <= MAX_BEAMS or len(words) < 1 + count:
         raise ValueError(f"{words[0]} readings in {len(words)} words")
-    return np.array(words[1 : 1 + count], dtype=np.float32), 1 + count
+    return numbers(words[1 : 1 + count]), 1 + count
 
 
 class Carmen:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.log.text.carmen import beam_angles
+from hsloc.log.text.carmen import beam_angles, numbers
 from hsloc.log.text.line_format import Line, pose, rounded, stamp_ns
 from hsloc.model import Odometry, Scan
 
@@ -48,7 +48,7 @@ class Wean:
         if words[0] == "O":
             return Line(odometry=odometry)
         mounting = T_odom_base.between(pose(words[4:7], METRES))
-        ranges = np.array(words[7:-1], dtype=np.float32) * np.float32(METRES)
+        ranges = numbers(words[7:-1]) * np.float32(METRES)
         angle_min, increment = beam_angles(BEAMS)
         scan = Scan(stamp, ranges, angle_min, increment, 0.0, 0.0, T_base_laser=rounded(mounting), frame_id="laser")
         return Line(odometry=odometry, scan=scan)

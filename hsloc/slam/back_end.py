@@ -21,6 +21,7 @@ from hsloc.slam.marginals import all_edges, marginal_covariances
 from hsloc.slam.occupancy_mapper import build_grid
 from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
 from hsloc.slam.result import MappingQuality, MappingResult
+from hsloc.slam.slips import compare_with_odometry, without_slips
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_session import MapSession
     from hsloc.slam.parameters import GraphMapperParameters, Resume
+    from hsloc.slam.slips import Stretches
     from hsloc.slam.trajectory_correction import EventLog
 
     F64 = NDArray[np.float64]
@@ -71,6 +73,13 @@ def finish(
         raise MapError(unconnected(resume.state))
     edges = Edges.concatenate([gathered.steps, loop_edges])
     refined, passes = _refine(poses, gathered.scans, edges, parameters, lambda part: report(0.5 + 0.4 * part))
+    stretches = compare_with_odometry(refined, gathered.steps)
+    if parameters.use_odometry and stretches.contradicted.any():
+        steps = without_slips(gathered.steps, stretches.slipped(len(gathered.steps)))
+        gathered = replace(gathered, steps=steps)
+        edges = Edges.concatenate([steps, loop_edges])
+        refined, more = _refine(refined.poses, gathered.scans, edges, _near_the_end(parameters), _silent)
+        passes += more
     covariances = marginal_covariances(refined, edges)
     grid = build_grid(refined.poses, gathered.scans, parameters.occupancy)
     report(1.0)
@@ -94,11 +103,13 @@ def finish(
         quality=_quality(refined, covariances, passes, loops, loop_edges, grid, gathered.scans),
         calibration=calibration,
         state=_state(gathered, refined.poses, loop_edges, grid, parameters),
-        evidence=weigh(_recorded(gathered, refined, loops, parameters.use_odometry)),
+        evidence=weigh(_recorded(gathered, refined, loops, stretches, parameters.use_odometry)),
     )
 
 
-def _recorded(gathered: MapSession, refined: Registration, loops: list[Loop], use_odometry: bool) -> Recorded:
+def _recorded(
+    gathered: MapSession, refined: Registration, loops: list[Loop], stretches: Stretches, use_odometry: bool
+) -> Recorded:
     reference = gathered.places.reference
     ends = np.array([(reference[loop.first], reference[loop.second]) for loop in loops], dtype=np.int64).reshape(-1, 2)
     ranges = gathered.scans.ranges
@@ -115,6 +126,7 @@ def _recorded(gathered: MapSession, refined: Registration, loops: list[Loop], us
         loops=ends[[loop.accepted for loop in loops]],
         torn=ends[[loop.reason.startswith(TORN) for loop in loops]],
         no_return_share=float(np.isposinf(ranges).sum()) / measured,
+        stretches=stretches,
     )
 
 
@@ -163,8 +175,7 @@ def _refine(
 ) -> tuple[Registration, int]:
     """Passes over the whole log, each with partners chosen again, until nothing moves."""
     most, p = parameters.passes, parameters.joint_registration
-    # Later passes begin near their end: no wide gates.
-    later = replace(p, gates=p.gates[-1:])
+    later = _near_the_end(parameters).joint_registration
     refined = refine(poses, scans, edges, p, lambda part: progress(part / most))
     passes = 1
     while passes < most and refined.moved >= _UNSETTLED_M:
@@ -177,6 +188,12 @@ def _refine(
         if moved_scans(change) < p.convergence_tolerance:
             break
     return refined, passes
+
+
+def _near_the_end(parameters: GraphMapperParameters) -> GraphMapperParameters:
+    """Without the wide gates of the first rounds."""
+    registration = parameters.joint_registration
+    return replace(parameters, joint_registration=replace(registration, gates=registration.gates[-1:]))
 
 
 def _revision(odometry_poses: F64, track: EventLog) -> tuple[tuple[int, Pose2], ...]:

@@ -18,6 +18,8 @@ from hsloc.model.pose2 import relative_poses, wrap_angles
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hsloc.slam.slips import Stretches
+
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
     Bools = NDArray[np.bool_]
@@ -76,7 +78,8 @@ class Recorded:
     had them; `refused` (n,) where it had not the scans' word. `odometry` (n, 3) is as recorded, None without any.
     `pairs` (m, 2) of keyscans that see the same walls, with `counts` (m, 5) as in `kernels.point_to_line.pair_terms`.
     `loops` (k, 2) are pairs of keyscans that accepted loops join, `torn` (j, 2) those of loops that the solved graph
-    contradicted. `no_return_share` is the part of the beams that met nothing.
+    contradicted. `no_return_share` is the part of the beams that met nothing. `stretches` are what the scans alone
+    say of the motion along short parts of the path.
     """
 
     stamps_ns: I64
@@ -90,6 +93,7 @@ class Recorded:
     loops: I64
     torn: I64
     no_return_share: float
+    stretches: Stretches
 
     def lengths(self) -> F64:
         """Metres to each keyscan from the one before."""
@@ -131,6 +135,12 @@ _ODOMETRY_SHARE = 0.5
 """Difference of the two, as a part of the way, that is not a matter of calibration."""
 _ODOMETRY_TURN = 0.5
 """The same of the heading [rad]."""
+_SLIP_SIGMAS = 4.0
+"""Standard deviations that a slip must have to be noticed, as in `slips`."""
+_SLIP_M = 0.25
+"""Error [m] that a noticed slip may leave behind, at so many standard deviations of the motion by the scans."""
+_UNNOTICED_M = 0.5
+"""Slip [m] that must be noticed: half of the largest that wheels were seen to make in a second."""
 _BLIND_M = 2.0
 """A step longer than this [m], and than five times the usual one, was driven without enough returns."""
 _BLIND_SHARE = 0.1
@@ -146,6 +156,8 @@ def weigh(recorded: Recorded) -> Evidence:
         _open_joints(recorded),
         _second_visits(recorded),
         _against_odometry(recorded),
+        _slips(recorded),
+        _unobserved(recorded),
         _torn_loops(recorded),
         _blind(recorded),
         _no_returns(recorded),
@@ -218,6 +230,39 @@ def _against_odometry(r: Recorded) -> Reason | None:
         return None
     text = f"map and odometry contradict each other over {len(wrong)} stretch(es) that no loop spans"
     return _reason(r, "odometry", text, wrong, failed=False)
+
+
+def _slips(r: Recorded) -> Reason | None:
+    """Slips of the wheels where the scans hardly say how long they were."""
+    weak = r.stretches.contradicted & (_SLIP_SIGMAS * r.stretches.sigma > _SLIP_M)
+    if not weak.any():
+        return None
+    runs = _joined(r.stretches.ends[weak])
+    sigma = float(r.stretches.sigma[weak].max())
+    text = f"the wheels slipped in {len(runs)} stretch(es) in which the scans know the motion to {sigma:.2f} m only"
+    return _reason(r, "slip", text, runs, failed=False)
+
+
+def _unobserved(r: Recorded) -> Reason | None:
+    """Stretches in which a slip would not be noticed: plain corridors, long halls."""
+    weak = _SLIP_SIGMAS * r.stretches.sigma > _UNNOTICED_M
+    if not weak.any():
+        return None
+    runs = _joined(r.stretches.ends[weak])
+    sigma = float(r.stretches.sigma[weak].max())
+    text = (
+        f"in {len(runs)} stretch(es) the scans know the motion to {sigma:.2f} m only: "
+        "the position along them rests on the odometry, and a slip would not be noticed"
+    )
+    return _reason(r, "unobserved", text, runs, failed=False)
+
+
+def _joined(ends: I64) -> list[tuple[int, int]]:
+    """Stretches (m, 2) in ascending order as runs: those that overlap are one."""
+    runs: list[tuple[int, int]] = []
+    for first, last in ends.tolist():
+        runs[-1:] = [(runs[-1][0], last)] if runs and first <= runs[-1][1] else [*runs[-1:], (first, last)]
+    return runs
 
 
 def _driven(poses: F64) -> tuple[F64, F64]:

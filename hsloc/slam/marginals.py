@@ -40,7 +40,7 @@ def marginal_covariances(refined: Registration, edges: Edges) -> F64:
     pairs = np.concatenate((refined.pairs, edges.pairs))
     system = BlockSystem(len(refined.poses), pairs[:, 0], pairs[:, 1])
     diagonal, off_diagonal, _ = normal_equations(
-        refined.linearised_at, refined.pairs, refined.terms, _information_of_a_point(refined), edges
+        refined.linearised_at, refined.pairs, refined.terms, information_of_a_point(refined), edges
     )
     covariances = system.inverse_blocks(anchored(diagonal), off_diagonal)
     covariances[0] = 0.0
@@ -70,7 +70,7 @@ def all_edges(refined: Registration, edges: Edges) -> Edges:
     # The gradient lies in the span of the information: what is added hardly moves the pose that solves for it.
     added = _UNOBSERVED * np.trace(hessian, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     offset = np.linalg.solve(hessian + added, gradient[:, :, None])[:, :, 0]
-    of_a_point = _information_of_a_point(refined)
+    of_a_point = information_of_a_point(refined)
     measured = relative - refined.weight / of_a_point * offset
     measured[:, 2] = wrap_angles(measured[:, 2])
     return Edges(
@@ -81,8 +81,8 @@ def all_edges(refined: Registration, edges: Edges) -> Edges:
     )
 
 
-def _information_of_a_point(refined: Registration) -> float:
-    """1/m^2, by the noise of this log's points."""
+def information_of_a_point(refined: Registration) -> float:
+    """Information of a paired point (1/m^2), by the noise of this log's points."""
     return 1.0 / (noise_of(refined.rms, refined.gate, refined.scale) ** 2 * _CORRELATED_POINTS)
 
 

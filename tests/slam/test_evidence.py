@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hsloc.slam.evidence import Recorded, nothing_seen, weigh
+from hsloc.slam.slips import Stretches
 
 N = 200
 
@@ -32,7 +33,25 @@ def lap() -> Recorded:
         loops=np.array([(10, 110)]),
         torn=np.zeros((0, 2), dtype=np.int64),
         no_return_share=0.1,
+        stretches=stretches(np.full(3, 0.01), np.ones(3)),
     )
+
+
+def stretches(sigma: np.ndarray, normalised: np.ndarray) -> Stretches:
+    """Three stretches, of which the first two overlap."""
+    ends = np.array([(40, 60), (45, 65), (120, 140)])
+    return Stretches(ends, np.zeros((3, 3)), normalised, sigma)
+
+
+def test_slips_and_stretches_in_which_none_would_be_noticed_are_named(lap: Recorded) -> None:
+    sigma, normalised = np.array((0.02, 0.08, 0.02)), np.array((9.0, 6.0, 12.0))
+    (reason,) = weigh(replace(lap, stretches=stretches(sigma, normalised))).reasons
+    assert reason.code == "slip"
+    assert reason.times_s == ((44.0, 65.0),), "only where the scans hardly know the motion"
+    assert codes(replace(lap, stretches=stretches(sigma, np.ones(3)))) == ("good", [])
+    (reason,) = weigh(replace(lap, stretches=stretches(np.array((0.2, 0.3, 0.2)), np.ones(3)))).reasons
+    assert reason.code == "unobserved"
+    np.testing.assert_allclose(reason.times_s, ((39.0, 65.0), (119.0, 140.0)))
 
 
 def codes(recorded: Recorded) -> tuple[str, list[str]]:

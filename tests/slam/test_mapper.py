@@ -12,6 +12,7 @@ from drives import ape_rmse, drive
 from hsloc.dataclass_json import to_json
 from hsloc.model import IDENTITY, Estimate, Odometry, PairedScan, Pose2, Scan, Status
 from hsloc.model.pose2 import relative_poses, wrap_angles
+from hsloc.simulation.odometer import Slip
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.marginals import noise_of
 from hsloc.slam.parameters import GraphMapperParameters
@@ -173,6 +174,13 @@ def test_slipping_wheels_and_people_do_no_harm() -> None:
     events, truth = drive("slip", seed=2, duration_s=40.0)
     result, _ = mapped(events)
     assert ape_rmse(events, result.scan_poses, truth) < 0.03
+
+
+def test_a_slip_along_a_corridor_is_found_and_mended(loop: Any) -> None:
+    """A slip of 0.8 m in 2 s, of which no single step is conspicuous: before, it stayed in the map."""
+    events, truth = drive("drifting-loop", seed=5, slips=(Slip(20.0, 2.0, 1.33),), duration_s=45.0)
+    result, _ = mapped(events)
+    assert ape_rmse(events, result.scan_poses, truth) < 0.08
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -135,12 +135,9 @@ _ODOMETRY_SHARE = 0.5
 """Difference of the two, as a part of the way, that is not a matter of calibration."""
 _ODOMETRY_TURN = 0.5
 """The same of the heading [rad]."""
-_SLIP_SIGMAS = 4.0
-"""Standard deviations that a slip must have to be noticed, as in `slips`."""
-_SLIP_M = 0.25
-"""Error [m] that a noticed slip may leave behind, at so many standard deviations of the motion by the scans."""
-_UNNOTICED_M = 0.5
-"""Slip [m] that must be noticed: half of the largest that wheels were seen to make in a second."""
+_WEAK_M = 0.125
+"""Standard deviation [m] of the motion by the scans from which on a slip of half a metre, the largest that wheels were
+seen to make in a second, would not be noticed: as noticed counts what has 4 standard deviations (`slips`)."""
 _BLIND_M = 2.0
 """A step longer than this [m], and than five times the usual one, was driven without enough returns."""
 _BLIND_SHARE = 0.1
@@ -234,7 +231,7 @@ def _against_odometry(r: Recorded) -> Reason | None:
 
 def _slips(r: Recorded) -> Reason | None:
     """Slips of the wheels where the scans hardly say how long they were."""
-    weak = r.stretches.contradicted & (_SLIP_SIGMAS * r.stretches.sigma > _SLIP_M)
+    weak = r.stretches.contradicted & (r.stretches.sigma > _WEAK_M)
     if not weak.any():
         return None
     runs = _joined(r.stretches.ends[weak])
@@ -245,7 +242,7 @@ def _slips(r: Recorded) -> Reason | None:
 
 def _unobserved(r: Recorded) -> Reason | None:
     """Stretches in which a slip would not be noticed: plain corridors, long halls."""
-    weak = _SLIP_SIGMAS * r.stretches.sigma > _UNNOTICED_M
+    weak = ~r.stretches.contradicted & (r.stretches.sigma > _WEAK_M)
     if not weak.any():
         return None
     runs = _joined(r.stretches.ends[weak])

@@ -8,7 +8,7 @@ becomes a keyscan. Drift is left to the loop closer, precision to the joint regi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import hypot, radians
 from typing import TYPE_CHECKING
 
@@ -99,6 +99,8 @@ class LocalMatch:
     evaluations: int = 0
     reason: str = ""
     is_doubtful: bool = False
+    scans: tuple[MovingScan, ...] = ()
+    """The scan and its companions, prepared; of a keyscan."""
 
 
 FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
@@ -174,7 +176,7 @@ class FrontEnd:
         else:
             scans = _moving(paired)
             near = points[np.hypot(points[:, 0], points[:, 1]) < p.local_range]
-            found = self._matched(near, scans, motion, covariance)
+            found = replace(self._matched(near, scans, motion, covariance), scans=scans)
         if not self._use_odometry:
             found = self._without_odometry(paired, found)
         return self._keep(paired, points, found) if found.is_keyscan else found
@@ -304,21 +306,12 @@ class FrontEnd:
         motion = found.motion
         moved = hypot(motion.x, motion.y) >= p.keyscan_min_d or abs(motion.theta) >= p.keyscan_min_a
         keep = found.is_keyscan and (moved or self._refused >= p.restart_after)
-        return LocalMatch(
-            found.pose,
-            motion,
-            found.covariance,
-            found.status,
-            keep,
-            found.fitness,
-            found.evaluations,
-            found.reason,
-            found.is_doubtful,
-        )
+        return replace(found, is_keyscan=keep)
 
     def _keep(self, paired: PairedScan, points: F64, found: LocalMatch) -> LocalMatch:
         """Make the scan a keyscan: add it to the local maps."""
         p = self._parameters
+        scans = found.scans or _moving(paired)
         self._way += hypot(found.motion.x, found.motion.y) + p.turn_length * abs(wrap_angle(found.motion.theta))
         if self._refused >= p.restart_after:
             self._maps, self._refused = [], 0
@@ -333,8 +326,8 @@ class FrontEnd:
         if found.status is Status.MATCHED or len(self._maps) == 1:
             for local, _ in self._maps:
                 local.add(moved, _KNOWN)
-            self._recent.add(found.pose, _moving(paired))
-        return found
+            self._recent.add(found.pose, scans)
+        return replace(found, scans=scans)
 
 
 def odometry_chi(motion: Pose2, found: Pose2, noise: OdometryNoise) -> float:

@@ -38,6 +38,11 @@ _WIDENED = (16.0, 8.0, 4.0, 2.0)
 """Factors of the robust scales in the first rounds of a solve."""
 _STILL = 1e-3
 """A solve between two loops ends when no place moves farther (m; rad): the windows are metres wide."""
+_OFF_M = 0.1
+"""Distance [m] by which a new loop may be off in the graph before that is solved again: a cell of the fields that the
+windows are searched on."""
+_OFF_RAD = 0.02
+"""And the angle [rad]: as much at 5 m."""
 _NARROWER = 0.7
 """A pair is searched again if its window is narrower than before by this factor."""
 _CONNECTED_PATH_LENGTH = 12.0
@@ -64,6 +69,7 @@ class LoopCloser:
         self.poses = places.poses[places.reference].copy()
         self._found = {(loop.first, loop.second): loop for loop in known}
         self._first = first
+        self._unsolved = False
 
     @property
     def loops(self) -> list[Loop]:
@@ -85,6 +91,8 @@ class LoopCloser:
                 found += self._visit(place)
                 if progress is not None:
                     progress((sweep + (place + 1) / len(self._places)) / _SWEEPS)
+            if self._unsolved:
+                self.solve()
             torn = self._tear()
             if found == 0 and torn == 0:
                 break
@@ -106,22 +114,32 @@ class LoopCloser:
         places = self._places
         steps = Edges.chain(places.steps, places.covariances, places.uncertain)
         self.poses = solve_edges(self.poses, Edges.concatenate([steps, self.edges()]), still=_STILL, widened=_WIDENED)
+        self._unsolved = False
 
     def _visit(self, place: int) -> int:
         """Search the candidates of a place that are not known yet; returns how many loops were accepted."""
-        searched = accepted = 0
+        searched = 0
+        new: list[Loop] = []
         left = self._unknown(place)
         while left and searched < self._parameters.max_candidates:
             old, path_length = left[0]
             loop = self._search(old, place, path_length)
             self._found[old, place] = loop
             searched += 1
-            accepted += loop.accepted
+            new += [loop] if loop.accepted else []
             # What the loop ties to this place need not be searched any more.
             left = self._unknown(place) if loop.accepted else left[1:]
-        if accepted:
-            self.solve()
-        return accepted
+        if new:
+            self._unsolved = True
+            if self._contradict(new):
+                self.solve()
+        return len(new)
+
+    def _contradict(self, loops: list[Loop]) -> bool:
+        """Whether one of these is off by more than noise in the graph as it is solved; if none is, solving can wait."""
+        edges = loop_edges(loops, np.arange(len(self._places)), self._parameters.robust)
+        distance, angle, chi = edge_errors(self.poses, edges)
+        return bool(((distance > _OFF_M) | (angle > _OFF_RAD) | (chi > 1.0)).any())
 
     def _unknown(self, place: int) -> list[tuple[int, float]]:
         """Candidates that were not searched, or in a much wider window, and the path length to each."""

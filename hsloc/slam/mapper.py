@@ -18,7 +18,6 @@ from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.slam.back_end import finish
 from hsloc.slam.front_end import FLOOR, FrontEnd
-from hsloc.slam.keyscans import KeyScan
 from hsloc.slam.trajectory_correction import EventLog
 
 if TYPE_CHECKING:
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
 
     from hsloc.model.events import Scan
     from hsloc.slam.front_end import LocalMatch
+    from hsloc.slam.keyscans import KeyScan
     from hsloc.slam.parameters import GraphMapperParameters, Resume
     from hsloc.slam.result import MappingResult
 
@@ -74,7 +74,7 @@ class Mapper:
         self._track.add(T_odom_base, is_scan=True, is_key=found.is_keyscan)
         if found.is_keyscan:
             self._covariance, self._T_map_key = covariance, found.pose
-            self._keep(event.scan, local)
+            self._keep(event.scan, found.scans[0].scan, local)
         self._T_map_odom = found.pose @ T_odom_base.inverse()
         self._T_last_scan = found.pose
         return Estimate(
@@ -87,10 +87,11 @@ class Mapper:
             found.reason,
         )
 
-    def _keep(self, scan: Scan, local: LocalMatch) -> None:
-        self._scans.append(KeyScan.of(scan))
+    def _keep(self, scan: Scan, prepared: KeyScan, local: LocalMatch) -> None:
+        self._scans.append(prepared)
         self._stamps.append(scan.stamp_ns)
-        self._local.append(local)
+        # What is prepared need not live as long as the match.
+        self._local.append(replace(local, scans=()))
 
     def _keep_companions(self, event: PairedScan, found: LocalMatch) -> LocalMatch:
         """Make the companions of a keyscan keyscans before it; the keyscan's match, seen from the last of them.
@@ -100,11 +101,15 @@ class Mapper:
         numbers = {id(held.scan): number for number, held in self._held}
         motion, covariance = found.motion, found.covariance
         previous = event
-        for companion in event.companions:
+        for companion, moving in zip(event.companions, found.scans[1:], strict=True):
             self._track.make_key(numbers[id(companion.scan)])
             place = event.to(companion)
             motion = found.motion @ place if previous is event else previous.to(companion)
-            self._keep(companion.scan, replace(found, pose=found.pose @ place, motion=motion, covariance=covariance))
+            self._keep(
+                companion.scan,
+                moving.scan,
+                replace(found, pose=found.pose @ place, motion=motion, covariance=covariance),
+            )
             previous, motion, covariance = companion, companion.to(event), FLOOR
         return replace(found, motion=motion, covariance=covariance)
 

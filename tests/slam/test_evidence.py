@@ -44,11 +44,11 @@ def stretches(sigma: np.ndarray, normalised: np.ndarray) -> Stretches:
 
 
 def test_slips_and_stretches_in_which_none_would_be_noticed_are_named(lap: Recorded) -> None:
-    sigma, normalised = np.array((0.02, 0.08, 0.02)), np.array((9.0, 6.0, 12.0))
+    sigma, normalised = np.array((0.02, 0.15, 0.02)), np.array((9.0, 6.0, 12.0))
     (reason,) = weigh(replace(lap, stretches=stretches(sigma, normalised))).reasons
     assert reason.code == "slip"
     assert reason.times_s == ((44.0, 65.0),), "only where the scans hardly know the motion"
-    assert codes(replace(lap, stretches=stretches(sigma, np.ones(3)))) == ("good", [])
+    assert codes(replace(lap, stretches=stretches(0.5 * sigma, normalised))) == ("good", [])
     (reason,) = weigh(replace(lap, stretches=stretches(np.array((0.2, 0.3, 0.2)), np.ones(3)))).reasons
     assert reason.code == "unobserved"
     np.testing.assert_allclose(reason.times_s, ((39.0, 65.0), (119.0, 140.0)))

@@ -132,6 +132,10 @@ OPTIONS: tuple[Option, ...] = (
         help="Topic of the odometry (default: the only one).",
     ),
     Option(
+        name="wheels", flag="--wheels", kind="text", metavar="RADIUS,TRACK", place="read", group=_READING,
+        help="Make odometry of joint states: radius of the wheels and distance between them [m].",
+    ),
+    Option(
         name="truth_topic", flag="--truth-topic", kind="text", metavar="TOPIC", place="read", group=_READING,
         help="Topic of reference poses in the log, or tf for map -> base in /tf.",
     ),

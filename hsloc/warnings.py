@@ -85,6 +85,8 @@ class WarningCode(StrEnum):
     """The log states an initial pose long before the first event; it is not used."""
     START_LATE = "start_late"
     """The log states an initial pose long after the first event; it is not used."""
+    ODOMETRY_FROM_VELOCITIES = "odometry_from_velocities"
+    """The log has no odometry; it is made of measured velocities."""
     ODOMETRY_RESET = "odometry_reset"
     """The odometry jumps; it is continued from the pose before the jump."""
     ODOMETRY_JUMPS = "odometry_jumps"

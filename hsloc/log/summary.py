@@ -37,8 +37,9 @@ class ReadOptions:
     `scan_fix` overrides fields of scans (see `hsloc.log.session.scan_geometry.ScanFixes`). `slice` are two heights
     above the base [m], `LOW,HIGH`: point clouds are read as scans, the nearest point of each direction between them.
     `time_offset` (`TOPIC=SECONDS`, several with commas, or `auto`) is added to the stamps of a topic. With `stamps`
-    "log" the log's times are used in place of the header stamps. `calibration` corrects the odometry, and mounting and
-    stamps of the lidars that it names; a `laser_pose` is used instead of its mounting, a `time_offset` in addition.
+    "log" the log's times are used in place of the header stamps. `wheels` are radius and track [m], `RADIUS,TRACK`:
+    odometry is then made of joint states. `calibration` corrects the odometry, and mounting and stamps of the lidars
+    that it names; a `laser_pose` is used instead of its mounting, a `time_offset` in addition.
     """
 
     scan_topic: str | None = None
@@ -55,6 +56,7 @@ class ReadOptions:
     slice: str | None = None
     time_offset: str | None = None
     stamps: str = "header"
+    wheels: str | None = None
     calibration: Calibration | None = None
 
     def __post_init__(self) -> None:
@@ -62,6 +64,19 @@ class ReadOptions:
             raise ConfigError(f"stamps is {self.stamps!r}; it must be one of {', '.join(STAMPS)}")
         self.heights()
         self.offsets_s()
+        self.wheel_size()
+
+    def wheel_size(self) -> tuple[float, float] | None:
+        """Radius and track of `wheels` [m]. Raises ConfigError."""
+        if self.wheels is None:
+            return None
+        try:
+            radius, track = (float(part) for part in self.wheels.split(","))
+        except ValueError:
+            radius = track = 0.0
+        if not (0.0 < radius < 100.0 and 0.0 < track < 100.0):
+            raise ConfigError(f"--wheels {self.wheels}: must be RADIUS,TRACK, both above 0 metres")
+        return radius, track
 
     def heights(self) -> tuple[float, float] | None:
         """The two heights of `slice` [m]. Raises ConfigError."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import LogFormatError
 from hsloc.log.messages import cdr_batch_decode as columns
-from hsloc.log.messages import decode, definitions, foxglove, from_objects, point_cloud, ros_json
+from hsloc.log.messages import decode, definitions, foxglove, from_objects, point_cloud, ros_json, velocities
 from hsloc.log.messages import definition_compatibility as schema
 from hsloc.log.messages.definitions import long_name
 from hsloc.warnings import RunWarning, WarningCode
@@ -25,7 +25,9 @@ _ALIASES = {"tf/msg/tfMessage": definitions.TF_MESSAGE} | foxglove.TYPES
 """ROS 1's old name of a type that is otherwise the same, and Foxglove's types."""
 
 BY_HAND = decode.BY_HAND | {definitions.POINT_CLOUD2: point_cloud.point_cloud}
-FROM_OBJECT = from_objects.FROM_OBJECT | {definitions.POINT_CLOUD2: point_cloud.object_point_cloud}
+FROM_OBJECT = (
+    from_objects.FROM_OBJECT | velocities.FROM_OBJECT | {definitions.POINT_CLOUD2: point_cloud.object_point_cloud}
+)
 _ENCODINGS = ("cdr", "ros1", "json")
 _ZSTD = b"\x28\xb5\x2f\xfd"
 """How a payload begins that rosbag2 compressed by itself (`--compression-mode message`); CDR begins with a zero."""
@@ -46,7 +48,7 @@ def is_decodable(channel: Channel) -> bool:
     """Whether hsloc has a decoder for the channel's type and encoding."""
     if channel.typename.startswith(foxglove.PREFIX):
         return foxglove.is_foxglove(channel)
-    return channel.message_encoding in _ENCODINGS and canonical_type(channel.typename) in BY_HAND
+    return channel.message_encoding in _ENCODINGS and canonical_type(channel.typename) in FROM_OBJECT
 
 
 def decoder_for(channel: Channel, warnings: list[RunWarning] | None = None) -> Decoder:
@@ -60,7 +62,9 @@ def decoder_for(channel: Channel, warnings: list[RunWarning] | None = None) -> D
     typename = canonical_type(channel.typename)
     if channel.message_encoding == "json":
         return _guarded(ros_json.decoder(FROM_OBJECT[typename]))
-    if channel.message_encoding == "cdr" and _is_known(channel, typename):
+    if typename not in BY_HAND and not (channel.message_encoding == "ros1" or channel.schema.strip()):
+        channel = dataclasses.replace(channel, schema_encoding="")
+    elif channel.message_encoding == "cdr" and typename in BY_HAND and _is_known(channel, typename):
         return _by_hand(channel, typename)
     if _is_incomplete(channel, typename):
         if warnings is not None:
@@ -69,7 +73,8 @@ def decoder_for(channel: Channel, warnings: list[RunWarning] | None = None) -> D
             )
             warnings.append(RunWarning(WarningCode.DEFINITION_INCOMPLETE, text))
         channel = dataclasses.replace(channel, schema=b"", schema_encoding="")
-        return _by_hand(channel, typename) if channel.message_encoding == "cdr" else _by_rosbags(channel, typename)
+        by_hand = channel.message_encoding == "cdr" and typename in BY_HAND
+        return _by_hand(channel, typename) if by_hand else _by_rosbags(channel, typename)
     return _by_rosbags(channel, typename)
 
 

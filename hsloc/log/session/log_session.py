@@ -11,6 +11,7 @@ from hsloc.log.session.extrinsics import Extrinsics, calibrated_mountings
 from hsloc.log.session.scan_geometry import ScanFixes, ScanSurvey, survey
 from hsloc.log.session.split_recordings import check_parts
 from hsloc.log.session.topic_selection import (
+    ODOMETRY_TYPES,
     TF,
     TRUTH_TYPES,
     choose_scans,
@@ -165,7 +166,7 @@ class LogSession:
         if topic is None or topic == TF:
             return definitions.ODOMETRY
         kinds = {canonical_type(channel.typename) for _, channel in self.channels(topic)}
-        return next((kind for kind in TRUTH_TYPES if kind in kinds), definitions.ODOMETRY)
+        return next((kind for kind in (*TRUTH_TYPES, *ODOMETRY_TYPES) if kind in kinds), definitions.ODOMETRY)
 
     def _survey(self, topic: str) -> ScanSurvey:
         """A look at the first scans of a topic, with what the user overrides."""

@@ -16,6 +16,7 @@ from hsloc.log.session.log_session import FirstMessage, LogSession
 from hsloc.log.session.ordering import KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH, Arrivals, Reorder, TopicClock, one_by_one
 from hsloc.log.session.topic_selection import TF
 from hsloc.log.session.transform_topics import BASE_FRAMES
+from hsloc.log.session.velocity_odometry import VelocityFeed, WheelFeed
 from hsloc.log.source import Observation
 from hsloc.log.summary import NANOSECONDS, Losses
 from hsloc.model import Pose2
@@ -102,7 +103,13 @@ class RosSource:
             tf_odometry = self._clock(TF, KIND_ODOMETRY, None, losses)
         elif choice.odom is not None:
             clock = self._clock(choice.odom, KIND_ODOMETRY, survey.odom, losses)
-            feeds.append(_pose_feed(clock, losses, survey.odom_type, False, survey.T_child_base))
+            wheels = survey.options.wheel_size()
+            if survey.odom_type == definitions.JOINT_STATE and wheels is not None:
+                feeds.append(WheelFeed(clock, losses, wheels, survey.T_child_base))
+            elif survey.odom_type in definitions.VELOCITY_TYPES:
+                feeds.append(VelocityFeed(clock, losses, survey.odom_type, survey.T_child_base))
+            else:
+                feeds.append(_pose_feed(clock, losses, survey.odom_type, False, survey.T_child_base))
         for topic, first in survey.scans.items():
             clock = self._clock(topic, KIND_SCAN, first, losses)
             if survey.scan_types[topic] == definitions.POINT_CLOUD2:

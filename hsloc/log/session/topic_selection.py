@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 TF, TF_STATIC = "/tf", "/tf_static"
 TF_NAMES = ("tf", "/tf")
 """How a user names transforms in place of a topic."""
+ODOMETRY_TYPES = (*definitions.VELOCITY_TYPES, definitions.JOINT_STATE)
+"""What odometry can be made of."""
 TRUTH_TYPES = (definitions.ODOMETRY, definitions.POSE_STAMPED, definitions.POSE_WITH_COVARIANCE_STAMPED)
 _TRUTH_NAME = re.compile(r"ground_?truth|(^|/)truth($|/)|(^|/)gt($|/)")
 _ODOMETRY_NAME = re.compile(r"(^|/)odom(etry)?($|/)")
@@ -77,9 +79,18 @@ def choose_topics(
     else:
         others = [c for c in channels if c.topic != choice.truth and not is_truth_name(c.topic)]
         named = options.odom_topic is not None
-        candidates = _odometry_candidates(channels if named else others, named)
+        candidates = _odometry_candidates(channels if named else others, named, options.wheels is not None)
         if not named and tf_has_odometry and not candidates:
             choice.odom = TF
+        elif not (named or candidates) and (velocities := _velocities(others)):
+            choice.odom = velocities[0]
+            choice.warnings.append(
+                RunWarning(
+                    WarningCode.ODOMETRY_FROM_VELOCITIES,
+                    f"there is no odometry; it is made of the velocities on {choice.odom}",
+                    "choose another topic with --odom-topic, or go by the scans alone: --no-odom",
+                )
+            )
         else:
             choice.odom = _pick(
                 where,
@@ -135,12 +146,25 @@ def choose_scans(
     return {topic: kinds[topic] for topic in chosen if topic is not None}
 
 
-def _odometry_candidates(channels: Sequence[Channel], named: bool) -> list[str]:
-    """Topics of odometry; poses count if they are named, or if their name speaks and nothing else is there."""
+def _velocities(channels: Sequence[Channel]) -> list[str]:
+    """Topics of velocities that were measured, by their names: what is commanded is not what was driven."""
+    types = (definitions.TWIST_STAMPED, definitions.TWIST_WITH_COVARIANCE_STAMPED)
+    return [topic for kind in types for topic in of_type(channels, kind) if "cmd" not in topic.lower()]
+
+
+def _odometry_candidates(channels: Sequence[Channel], named: bool, wheels: bool) -> list[str]:
+    """Topics of odometry; poses count if they are named, or if their name speaks and nothing else is there.
+
+    Velocities count if they are named, joint states where the size of the `wheels` is known, and then alone.
+    """
+    joints = of_type(channels, definitions.JOINT_STATE) if wheels else []
+    if joints and not named:
+        return joints
     found = of_type(channels, definitions.ODOMETRY)
     poses = [topic for typename in TRUTH_TYPES[1:] for topic in of_type(channels, typename)]
     if named:
-        return found + sorted(poses)
+        velocities = [topic for typename in definitions.VELOCITY_TYPES for topic in of_type(channels, typename)]
+        return found + sorted(poses) + sorted(velocities) + joints
     return found or sorted(topic for topic in poses if _ODOMETRY_NAME.search(topic))
 
 
@@ -171,6 +195,8 @@ def _pick(
         warning = RunWarning(WarningCode.TOPIC_AMBIGUOUS, text, remedy)
     else:
         remedy = "motion can be estimated from the scans alone: --no-odom" if kind == "odom" and required else ""
+        if remedy and of_type(channels, definitions.JOINT_STATE):
+            remedy += "; or it is made of joint states with --wheels RADIUS,TRACK"
         if kind == "scan" and of_type(channels, definitions.POINT_CLOUD2):
             remedy = (
                 "point clouds are read as scans with --slice LOW,HIGH, the heights above the base [m] between which "
@@ -192,6 +218,8 @@ def _not_there(
         trouble = f"{named} is {other.typename or 'of no type'} ({other.message_encoding}), not {typename}"
     else:
         trouble = f"no topic {named}"
+    if other is not None and canonical_type(other.typename) == definitions.JOINT_STATE:
+        return f"{where}: odometry is made of {named} with the size of the wheels: --wheels RADIUS,TRACK"
     remedy = f"{flag} may be {', '.join(candidates[:_LISTED])}" if candidates else f"it holds {listed(channels)}"
     return f"{where}: {trouble}; {remedy}"
 

@@ -76,13 +76,15 @@ def main() -> None:
     """Print a line for each seed, and a table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--step", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--world", default="office")
     arguments = parser.parse_args()
     errors: dict[str, list[tuple[float, float]]] = {name: [] for name in LIMITS}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.mcap"
-        for seed in range(arguments.seeds):
+        for seed in range(arguments.first, arguments.first + arguments.seeds * arguments.step, arguments.step):
             begin = time.perf_counter()
             truth = write_log(path, seed, arguments.seconds, arguments.world)
             for name, each in compare(path, truth).items():

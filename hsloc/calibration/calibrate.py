@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from hsloc.calibration.estimator import Undetermined, estimate
 from hsloc.calibration.laser_track import tracks
 from hsloc.errors import LogError, TopicError
@@ -21,10 +23,10 @@ if TYPE_CHECKING:
     from hsloc.log import LogSummary, ReadOptions
     from hsloc.slam.parameters import GraphMapperParameters
 
-_MOST_PASSES = 4
+_MOST_PASSES = 6
 """Passes over a log; each one deskews by the estimate of the one before."""
-_SETTLED_S = 0.002
-"""Change of the time offset (s) with which the passes end: a beam is then moved by 2 mm at 1 m/s."""
+_SETTLED = 0.25
+"""Change of each value in standard deviations with which the passes end. Internal: it is then lost in the noise."""
 
 _WORSE = 1.2
 """Ratio of what is left of the steps, from which on a pass made it worse. Internal: beyond its variation by chance."""
@@ -99,9 +101,16 @@ def calibrate(
             # The times of the beams are wrong: deskewed by them, scans fit less well than as they are.
             now, number = found, number - 1
             break
+        settled = found is not None and _is_settled(found, now)
         found = now
-        change = -float(now.values[6])
-        offset_s += change
-        if not seen.is_swept or (number > 1 and abs(change) < _SETTLED_S):
+        offset_s -= float(now.values[6])
+        if settled or not seen.is_swept:
             break
     return LogCalibration(topic, now, offset_s, nominal, summary, number)
+
+
+def _is_settled(before: Estimate, now: Estimate) -> bool:
+    """Whether a pass changed nothing that counts; each pass finds what is left of the time offset."""
+    change = np.abs(now.values - before.values)
+    change[6] = abs(now.values[6])
+    return bool(np.all(change[now.determined] <= _SETTLED * now.sigmas[now.determined]))

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from sqlalchemy import func, or_, select
 from sqlalchemy.exc import DBAPIError
+from sqlalchemy.orm import aliased
 
 from hsloc_service.db.database import is_unreachable
 from hsloc_service.db.tables import AssetRow, FileRow, JobRow
@@ -81,7 +82,7 @@ class Leases:
     def claim(self, owner: str) -> Claim | None:
         """Take the oldest waiting job of the tenant whose turn it is; None if none waits."""
         with self.database.write() as session:
-            job = session.scalar(_next(self.tags))
+            job = _next(session, self.tags)
             if job is None:
                 return None
             now = self.database.now(session)
@@ -215,38 +216,38 @@ def instance_of(owner: str) -> str:
     return owner.partition(":")[0]
 
 
-def _next(tags: tuple[str, ...]) -> Any:
-    """The next job without a tag or with one of these, tenants in turn.
+def _next(session: Session, tags: tuple[str, ...]) -> JobRow | None:
+    """The next job without a tag or with one of these, locked; tenants in turn.
 
-    Who has least running comes first, then who was served longest ago.
-
-    One statement, so portable as it stands. A tenant's jobs are begun in the order of `seq`, so that its last start is
-    found at the end of its index, whatever number of jobs it has.
+    Who has least running comes first, then who was served longest ago. A row that another claim has locked is skipped,
+    so that a claim may find nothing while jobs wait, and is tried again. A tenant's jobs are begun in the order of
+    `seq`, so that its last start is found at the end of its index, whatever number of jobs it has.
     """
-    from sqlalchemy.orm import aliased
-
+    waiting = (JobRow.state == "queued", or_(JobRow.tag.is_(None), JobRow.tag.in_(tags)))
+    tenants = select(JobRow.tenant).where(*waiting).distinct().subquery()
     other = aliased(JobRow)
-    running = (
-        select(func.count())
-        .where(other.tenant == JobRow.tenant, other.state.in_(("running", "cancelling")))
-        .correlate(JobRow)
-        .scalar_subquery()
-    )
+    running = select(func.count()).where(other.tenant == tenants.c.tenant, other.state.in_(("running", "cancelling")))
     served = (
         select(other.started)
-        .where(other.tenant == JobRow.tenant, other.started.is_not(None))
+        .where(other.tenant == tenants.c.tenant, other.started.is_not(None))
         .order_by(other.seq.desc())
         .limit(1)
-        .correlate(JobRow)
-        .scalar_subquery()
     )
-    return (
-        select(JobRow)
-        .where(JobRow.state == "queued", or_(JobRow.tag.is_(None), JobRow.tag.in_(tags)))
-        .order_by(running, func.coalesce(served, 0.0), JobRow.seq)
-        .limit(1)
-        .with_for_update(skip_locked=True, of=JobRow)
-    )
+    first = select(func.min(other.seq)).where(other.tenant == tenants.c.tenant, other.state == "queued")
+    turns = session.execute(
+        select(
+            running.correlate(tenants).scalar_subquery(),
+            func.coalesce(served.correlate(tenants).scalar_subquery(), 0.0),
+            first.correlate(tenants).scalar_subquery(),
+            tenants.c.tenant,
+        )
+    ).all()
+    for *_, tenant in sorted(map(tuple, turns), key=lambda turn: (turn[0], turn[1], turn[2] or 0)):
+        query = select(JobRow).where(*waiting, JobRow.tenant == tenant).order_by(JobRow.seq).limit(1)
+        job = session.scalar(query.with_for_update(skip_locked=True))
+        if job is not None:
+            return job
+    return None
 
 
 def _held(session: Session, claim: Claim) -> JobRow | None:

@@ -158,10 +158,11 @@ def _similar(path: tuple[str, ...], known: Iterable[tuple[str, ...]]) -> str:
 
 def differences(config: Config, base: Config) -> list[str]:
     """KEY=VALUE for each parameter in which `config` differs from `base`; `nested` reads them."""
+    standard = to_dict(base)
     return [
         f"{'.'.join(path)}={value if isinstance(value, str) else json.dumps(value)}"
         for path, value in _leaves(to_dict(config))
-        if value != _get(to_dict(base), path)
+        if value != _get(standard, path)
     ]
 
 

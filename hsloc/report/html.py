@@ -163,7 +163,7 @@ def _laser(laser: LaserMetrics) -> str:
 def _provenance(provenance: Provenance) -> str:
     parts = []
     if provenance.command:
-        parts.append(f"<h3>Command</h3><pre>{escape(provenance.command)}</pre>")
+        parts.append(f'<h3>Command</h3><pre tabindex="0">{escape(provenance.command)}</pre>')
     for heading, entries in (("Versions", provenance.versions), ("SHA-256 of the input", provenance.hashes)):
         if entries:
             rows = "".join(
@@ -172,7 +172,7 @@ def _provenance(provenance: Provenance) -> str:
             )
             parts.append(f'<h3>{heading}</h3><div class="scroll"><table>{rows}</table></div>')
     if provenance.config:
-        parts.append(f"<h3>Configuration</h3><pre>{escape(provenance.config)}</pre>")
+        parts.append(f'<h3>Configuration</h3><pre tabindex="0">{escape(provenance.config)}</pre>')
     return f"<section><h2>To repeat this run</h2>{''.join(parts)}</section>" if parts else ""
 
 

@@ -167,7 +167,7 @@ def _scans(parts: ReportParts, start_ns: int) -> dict[str, Any] | None:
         **_columns(t=(overlay.stamps_ns[rows] - start_ns) / 1e9, x=poses[:, 0], y=poses[:, 1], decimals=3),
         **_columns(theta=poses[:, 2], far=overlay.far[rows], decimals=4),
         "count": [len(cloud) for cloud in clouds],
-        "status": [f"{name}: {reason}" if reason else name for name, reason in words],
+        "status": [f"{name}: {reason}" if reason and reason not in name else name for name, reason in words],
         "points": b64encode(points.tobytes()).decode("ascii"),
         "distances": b64encode(bytes_of_distances.tobytes()).decode("ascii"),
     }

@@ -20,7 +20,7 @@
       const built = runs.some((run) => run.data.summary?.mode === "slam");
       view.setAttribute("role", "region"); view.setAttribute("aria-label", "map with all paths");
       charts.setAttribute("role", "region"); charts.setAttribute("aria-label", "curves over time");
-      root.replaceChildren(this.table(runs), make("h3", `Paths on the map of ${first.name}`));
+      root.replaceChildren(this.table(runs), make("h2", `Paths on the map of ${first.name}`));
       if (built) root.append(make("p", "A map that a run built has a frame of its own, which begins at the first pose of the log.", "rv-help"));
       root.append(view, charts);
       const data = { ...first.data, end: Math.max(...runs.map((run) => run.data.end)), others: [], charts: [], status: [] };

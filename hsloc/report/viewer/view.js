@@ -78,6 +78,8 @@
       const tools = make("div", { class: "rv-tools" }, button("in", "+", "zoom in"), button("out", "−", "zoom out"),
         button("all", "⤢", "show all"), button("measure", "↔", "measure a distance"), button("picture", "PNG", "save the map as a picture"));
       this.$frame = make("div", { class: "rv-frame" }, this.$base, this.$over, this.$place, this.$scale, tools);
+      const [x0, y0, x1, y1] = this.data.extent;
+      this.$frame.style.setProperty("--rv-aspect", String(Math.min(Math.max((x1 - x0) / (y1 - y0), 0.8), 3)));
       this.$time = make("input", { type: "range", min: "0", max: String(this.data.end || 1), step: "any", value: "0", "aria-label": "time" });
       this.$now = make("output", { class: "rv-now" });
       this.$event = make("p", { class: "rv-event", role: "status", "aria-live": "polite" });

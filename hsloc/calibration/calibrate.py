@@ -46,6 +46,8 @@ class LogCalibration:
     nominal: Pose2
     summary: LogSummary
     passes: int
+    wheels: tuple[float, float] | None = None
+    """Radius and track (m) that were assumed, where the odometry is that of wheels."""
 
     def calibration(self) -> Calibration:
         """What replaces the log's values; what is not determined keeps its value."""
@@ -106,7 +108,7 @@ def calibrate(
         offset_s -= float(now.values[6])
         if settled or not seen.is_swept:
             break
-    return LogCalibration(topic, now, offset_s, nominal, summary, number)
+    return LogCalibration(topic, now, offset_s, nominal, summary, number, options.wheel_size())
 
 
 def _is_settled(before: Estimate, now: Estimate) -> bool:

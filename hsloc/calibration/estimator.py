@@ -123,6 +123,23 @@ class Estimate:
         slope = factor * np.array((1.0 / self.values[0], -1.0 / self.values[1]))
         return factor, float(np.sqrt(slope @ self.covariance[:2, :2] @ slope))
 
+    def wheels(self, radius: float, track: float) -> dict[str, tuple[float, float]]:
+        """Radii of the left and the right wheel and the track (m) with standard deviations, of those assumed.
+
+        With radii that differ by a part d, the base that drives straight is d track / 4 beside the middle of the axle.
+        """
+
+        def of(values: F64) -> F64:
+            scale, rotation, turn = values
+            apart = 0.5 * turn * track / rotation
+            return np.array((scale * radius * (1.0 - apart), scale * radius * (1.0 + apart), scale * track / rotation))
+
+        values = self.values[:3]
+        slopes = np.column_stack([(of(values + d) - of(values - d)) / 2e-6 for d in 1e-6 * np.eye(3)])
+        sigmas = np.sqrt(np.diag(slopes @ self.covariance[:3, :3] @ slopes.T))
+        names = ("left_radius", "right_radius", "track")
+        return dict(zip(names, zip(of(values).tolist(), sigmas.tolist(), strict=True), strict=True))
+
 
 class Undetermined(ValueError):
     """Nothing can be estimated; the text says why."""

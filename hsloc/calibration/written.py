@@ -37,6 +37,10 @@ def as_json(found: LogCalibration) -> dict[str, Any]:
             for k, name in enumerate(NAMES)
         },
         "track_factor": {"value": track, "interval": estimate.quantile * track_sigma},
+        "wheels": {
+            name: {"value": value, "unit": "m", "interval": estimate.quantile * sigma}
+            for name, (value, sigma) in _wheels(found).items()
+        },
         "covariance": [[float(value) for value in row] for row in estimate.covariance],
         "steps": estimate.steps,
         "outliers": estimate.outliers,
@@ -128,11 +132,20 @@ def as_lines(found: LogCalibration) -> list[str]:
         if name == "turn_per_metre" and estimate.determined[:2].all():
             track, sigma = estimate.track
             lines.append(f"{'track':<16}{track:>12.5f}  +- {estimate.quantile * sigma:<9.5f} of the assumed track")
+    for name, (value, sigma) in _wheels(found).items():
+        lines.append(f"{name:<16}{value:>12.5f}  +- {estimate.quantile * sigma:<9.5f} m")
     reasons: dict[str, list[str]] = {}
     for name, reason in estimate.reasons.items():
         reasons.setdefault(reason, []).append(name)
     lines += [f"not determined: {', '.join(names)} ({reason})" for reason, names in reasons.items()]
     return lines
+
+
+def _wheels(found: LogCalibration) -> dict[str, tuple[float, float]]:
+    """Radii and track with standard deviations, where odometry is made of wheels and the motion determines them."""
+    if found.wheels is None or not found.estimate.determined[:3].all():
+        return {}
+    return found.estimate.wheels(*found.wheels)
 
 
 def _values(found: LogCalibration) -> list[float]:

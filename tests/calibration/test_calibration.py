@@ -53,6 +53,9 @@ def test_all_parameters_are_found_within_their_intervals() -> None:
     assert np.all(np.abs(apart) < (1e-3, 1e-3, 1e-3, 2e-3, 2e-3, 1e-3, 2e-3))
     track, sigma = found.track
     assert abs(track - 1.02 / 0.97) < 3.0 * sigma
+    wheels = {name: value for name, (value, _) in found.wheels(0.1, 0.4).items()}
+    assert abs(wheels["track"] - 0.4 * 1.02 / 0.97) < 1e-3
+    assert abs(wheels["right_radius"] - wheels["left_radius"] - 0.008 * wheels["track"] * 0.1) < 1e-4
 
 
 @pytest.mark.parametrize(

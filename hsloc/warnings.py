@@ -65,6 +65,8 @@ class WarningCode(StrEnum):
     """The same by a tenth of a second or more."""
     CLOCK_OFFSET_APPLIED = "clock_offset_applied"
     """The offset between scans and odometry was estimated and removed, as asked for."""
+    CALIBRATION_UNUSED = "calibration_unused"
+    """A calibration names a lidar whose scans are not read."""
     CLOCKS_APART = "clocks_apart"
     """The stamps of scans and odometry differ by more than their log times: they may come from two clocks."""
     PARTS_GAP = "parts_gap"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from itertools import tee
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ from hsloc.log.files import NO_LOG, LogFile, Scratch
 from hsloc.log.files import expand as _expand
 from hsloc.log.summary import NANOSECONDS, LogSummary, Losses, ReadOptions
 from hsloc.model.calibration import NO_CORRECTION, corrected_odometry
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
     from hsloc.log.container import Container
     from hsloc.log.source import Observation, Source
     from hsloc.model import Event, OccupancyGrid, Pose2
-    from hsloc.model.calibration import OdometryCorrection
+    from hsloc.model.calibration import Calibration, OdometryCorrection
 
 
 class Log:
@@ -38,11 +40,13 @@ class Log:
         self._options = options
         self._files = tuple(files)
         self.losses = source.losses_at_opening.copy()
+        found = source.summary
+        self._summary = replace(found, warnings=(*found.warnings, *_unused(options.calibration, found.scan_topic)))
 
     @property
     def summary(self) -> LogSummary:
         """What the log holds and what is taken from it."""
-        return self._source.summary
+        return self._summary
 
     def events(self) -> Iterator[Event]:
         """All events in a total, repeatable order (see `hsloc.log.session.ordering`), with their own header stamps.
@@ -100,6 +104,18 @@ class Log:
             except OSError as error:
                 raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
         return digest.hexdigest()
+
+
+def _unused(calibration: Calibration | None, scan_topic: str | None) -> Iterator[RunWarning]:
+    """A warning for each lidar of a calibration whose scans are not read."""
+    read = {name.strip().lstrip("/") for part in (scan_topic or "").split(",") for name in part.split(" + ")}
+    for topic, _ in calibration.lidars if calibration is not None else ():
+        if read.isdisjoint({topic.lstrip("/")}):
+            yield RunWarning(
+                WarningCode.CALIBRATION_UNUSED,
+                f"the calibration of {topic} is not used: no scans of it are read",
+                "calibrate this log's lidar, or name its topic in the file",
+            )
 
 
 def _corrected(events: Iterator[tuple[int, Event]], correction: OdometryCorrection) -> Iterator[tuple[int, Event]]:

@@ -143,6 +143,9 @@ def test_a_calibration_is_applied_when_a_log_is_read(tmp_path: Path) -> None:
     plain, right = (open_log(log, ReadOptions(calibration=each)) for each in (None, known))
     assert right.summary.extrinsics == "calibration"
     assert right.summary.laser_flipped
+    other = open_log(log, ReadOptions(calibration=Calibration(lidars=(("/front", LidarCalibration(MOUNTING)),))))
+    assert [warning.code for warning in other.summary.warnings] == ["calibration_unused"]
+    assert other.summary.extrinsics == "/tf_static"
     first = [next(event for event in each.events() if isinstance(event, Scan)) for each in (plain, right)]
     assert first[1].T_base_laser == MOUNTING
     assert first[0].stamp_ns - first[1].stamp_ns == 70_000_000

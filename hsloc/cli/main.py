@@ -29,6 +29,7 @@ COMMANDS = (
     "record",
     "replay",
     "map",
+    "merge",
     "info",
     "check",
     "eval",

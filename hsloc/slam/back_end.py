@@ -68,9 +68,24 @@ def finish(
     gathered = from_front_end(scans, stamps_ns, local, track, parameters)
     if resume is not None:
         gathered = connect(resume, gathered, parameters, rng)
+    return finish_session(gathered, track, parameters, rng, report, resume.state if resume is not None else None)
+
+
+def finish_session(
+    gathered: MapSession,
+    track: EventLog,
+    parameters: GraphMapperParameters,
+    rng: Generator,
+    report: Callable[[float], None],
+    extended: MapState | None,
+) -> MappingResult:
+    """Close the loops of a session, refine, build the map; `track` has the events of the log that was read.
+
+    Raises MapError if in the end no loop joins the session with the map that it extends.
+    """
     poses, loops, loop_edges = _close_loops(gathered, parameters, rng, lambda part: report(0.5 * part))
-    if resume is not None and not any(loop.accepted and _connects(loop, gathered) for loop in loops):
-        raise MapError(unconnected(resume.state))
+    if extended is not None and not any(loop.accepted and _connects(loop, gathered) for loop in loops):
+        raise MapError(unconnected(extended))
     edges = Edges.concatenate([gathered.steps, loop_edges])
     refined, passes = _refine(poses, gathered.scans, edges, parameters, lambda part: report(0.5 + 0.4 * part))
     stretches = compare_with_odometry(refined, gathered.steps)

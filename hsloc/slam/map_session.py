@@ -109,7 +109,7 @@ def from_map_state(state: MapState, parameters: GraphMapperParameters) -> MapSes
 
 def concatenate(old: MapSession, new: MapSession) -> MapSession:
     """The old map and a further log, which is in the map's frame."""
-    n = len(old.poses)
+    n, m = len(old.poses), len(old.places)
     seam = relative_poses(old.poses[None, -1], new.poses[None, 0])
     unknown = Edges(
         np.array([[n - 1, n]]),
@@ -127,9 +127,9 @@ def concatenate(old: MapSession, new: MapSession) -> MapSession:
         refused=np.concatenate((old.refused, [False], new.refused[1:])),
         steps=Edges.concatenate([old.steps, unknown, later]),
         places=Submaps.concatenate(old.places, new.places),
-        known=old.known,
+        known=(*old.known, *(replace(loop, first=loop.first + m, second=loop.second + m) for loop in new.known)),
         first=n,
-        first_place=len(old.places),
+        first_place=m,
     )
 
 

@@ -16,14 +16,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.kernels.beam_classes import SHORT, THROUGH, UNMAPPED, classify_beams
-from hsloc.kernels.branch_and_bound import Excluded, Lattice, best_on_lattice, pool
 from hsloc.kernels.fitness import point_scores
+from hsloc.localisation.hypotheses import Own, bounded_search, fittest_other
 from hsloc.matching.harmony_search import low_discrepancy_order
+from hsloc.matching.local_refinement import refine
+from hsloc.matching.window import Window
 from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hsloc.localisation.whole_map_search import WholeMapSearch
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.model.events import PairedScan
     from hsloc.model.occupancy_grid import OccupancyGrid
@@ -44,8 +47,8 @@ class PlaceCheckParameters(Parameters):
     """Number of scans that are joined."""
     points: Count = 8
     """Number of points taken of each scan."""
-    cell: Positive = 0.2
-    """Spacing of the lattice of other places [m]; multiples of the map's resolution are used."""
+    max_boxes: Count = 20_000_000
+    """Maximum number of boxes of poses in one comparison; a million take about 0.1 s."""
     own_distance: Positive = 1.0
     """Places nearer than this, and within `own_angle`, are the same place [m]."""
     own_angle: Angle = 0.5
@@ -72,28 +75,19 @@ _MARGIN_M = 0.1
 """A wall this near before a beam's end is the one that it ends at (m)."""
 _NEEDED = 0.85
 """Other places below this part of the own fitness are not looked for: they make no difference."""
-_OWN_HALF, _OWN_HALF_ANGLE = 0.4, 0.15
-"""The own place is the best of the lattice within these half-widths (m, rad): it gets the lattice's chances, too."""
-_LEVELS = 6
-_MOST_VISITS = 2_000_000
-"""Bounds computed in one comparison, at most: about a second."""
-_MOST_VISITS_OF_FITTEST = 300_000
-"""The same in the search for the fittest place."""
-_LEVER_QUANTILE = 70.0
-_LEAST_LEVER = 2.0
-"""Headings are so close that a point at this distance (m), or at this percentile of all, moves by a cell."""
+_OWN_HALF, _OWN_HALF_ANGLE = 0.2, 0.1
+"""The scans of the own place are moved as a whole within these half-widths (m, rad), as those of another one are."""
 
 
 class PlaceCheck:
-    """Compares places of one map; holds its cells and a pyramid of its field, but no state."""
+    """Compares places of one map; holds its cells and the search of the whole of it, but no state."""
 
     def __init__(self, grid: OccupancyGrid, likelihood: LikelihoodField, parameters: PlaceCheckParameters) -> None:
         self.parameters = parameters
         self._grid = grid
         self._T_grid_map = grid.origin.inverse()
         self._field = likelihood
-        self._coarser = max(round(parameters.cell / likelihood.resolution), 1)
-        self._pooled: NDArray[np.float32] | None = None
+        self._search: WholeMapSearch | None = None
 
     def explain(self, paired: PairedScan, pose: Pose2) -> Explanation:
         """What the map explains of a scan with the base at `pose` in the map.
@@ -140,70 +134,27 @@ class PlaceCheck:
         """The points of a scan that take part in a comparison, spread evenly over its beams."""
         return np.asarray(points[low_discrepancy_order(len(points))[: self.parameters.points]])
 
-    def rival(self, scans: list[tuple[Pose2, F64]], pose: Pose2) -> float:
-        """Fitness of the fittest other place on the map divided by that of this one; at least 0.85.
+    @property
+    def search(self) -> WholeMapSearch:
+        """The search of the whole map, made when it is first asked for: a second and 50 MB on a large map."""
+        if self._search is None:
+            self._search = bounded_search(self._grid, self._field)
+        return self._search
+
+    def rival(self, scans: list[tuple[Pose2, F64]], pose: Pose2) -> tuple[float, Pose2 | None]:
+        """Fitness of the fittest other place on the map divided by that of this one, at least 0.85; and that place.
 
         `scans` are poses of the base in the map and points (n, 2) seen from them, `pose` is the place in question.
+        Where the work allowed does not suffice, the ratio is the bound that was reached, at most 1, without a place.
         """
-        pooled = self._pyramid()
-        points, step = self._cloud(scans, pose)
-        side = self._field.resolution * self._coarser
-        here = self._field.to_cells(pose)
-        here[:2] /= self._coarser
-        nowhere = np.array((-1.0, -1.0, -1.0))
-        found = np.empty(3)
-        near = np.array((_OWN_HALF / side, _OWN_HALF / side, _OWN_HALF_ANGLE))
-        own, _ = best_on_lattice(
-            pooled, points, Lattice(here, near, step), Excluded(here, nowhere), 0.0, _MOST_VISITS, found
-        )
-        if own <= 0.0:
-            return 1.0
-        height, width = pooled.shape[1:]
-        middle = np.array((width / 2.0, height / 2.0, 0.0))
-        whole = np.array((width / 2.0, height / 2.0, np.pi))
         p = self.parameters
-        same = np.array((p.own_distance / side, p.own_distance / side, p.own_angle))
-        other, _ = best_on_lattice(
-            pooled, points, Lattice(middle, whole, step), Excluded(here, same), _NEEDED * own, _MOST_VISITS, found
-        )
-        return 1.0 if other < 0.0 else other / own
-
-    def fittest(self, scans: list[tuple[Pose2, F64]], last: Pose2, needed: float) -> Pose2 | None:
-        """The fittest place on the whole map for scans joined by odometry; None if none is fitter than `needed`.
-
-        `scans` are poses of the base and points (n, 2) seen from them, `last` is the pose of the base whose place in
-        the map is asked for, all in the frame of the odometry.
-        """
-        pooled = self._pyramid()
-        points, step = self._cloud(scans, last)
-        height, width = pooled.shape[1:]
-        middle = np.array((width / 2.0, height / 2.0, 0.0))
-        whole = np.array((width / 2.0, height / 2.0, np.pi))
-        nowhere = np.array((-1.0, -1.0, -1.0))
-        lattice = Lattice(middle, whole, step)
-        found = np.empty(3)
-        best, _ = best_on_lattice(
-            pooled, points, lattice, Excluded(middle, nowhere), needed, _MOST_VISITS_OF_FITTEST, found
-        )
-        if best <= needed:
-            return None
-        found[:2] *= self._coarser
-        return self._field.from_cells(found)
-
-    def _cloud(self, scans: list[tuple[Pose2, F64]], pose: Pose2) -> tuple[NDArray[np.float32], float]:
-        """The points of scans seen from a pose, in units of the lattice, and the step between headings (rad)."""
         cloud = np.vstack([pose.between(other) @ points for other, points in scans])
-        side = self._field.resolution * self._coarser
-        lever = max(float(np.percentile(np.hypot(cloud[:, 0], cloud[:, 1]), _LEVER_QUANTILE)), _LEAST_LEVER)
-        return np.ascontiguousarray(cloud / side, dtype=np.float32), side / lever
-
-    def _pyramid(self) -> NDArray[np.float32]:
-        """The field's scores, pooled: of each block of nodes the largest, and on each level those of four blocks."""
-        if self._pooled is None:
-            scores = self._field.packed[:, :, 0]
-            k = self._coarser
-            height, width = -(-scores.shape[0] // k), -(-scores.shape[1] // k)
-            padded = np.zeros((height * k, width * k), dtype=np.float32)
-            padded[: scores.shape[0], : scores.shape[1]] = scores
-            self._pooled = pool(np.ascontiguousarray(padded.reshape(height, k, width, k).max(axis=(1, 3))), _LEVELS)
-        return self._pooled
+        if len(cloud) == 0:
+            return 1.0, None
+        own = refine(cloud, self._field, Window(pose, _OWN_HALF, _OWN_HALF, _OWN_HALF_ANGLE)).fitness
+        if own <= 0.0:
+            return 1.0, None
+        place = Own(pose, own, p.own_distance, p.own_angle, _NEEDED)
+        other, fitness = fittest_other(self.search, self._field, cloud, place, p.max_boxes)
+        ratio = max(fitness / own, _NEEDED)
+        return (min(ratio, 1.0) if other is None else ratio), other

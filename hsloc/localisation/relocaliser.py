@@ -1,13 +1,11 @@
 """The relocaliser: where on the whole map the robot could be, until one hypothesis wins.
 
-The free space is cut into tiles; HIDE searches each of them over all headings, and what it finds becomes a hypothesis.
-Each further scan moves the hypotheses with the odometry, matches them again in a small window and adds to their record.
-Hypotheses that fall behind are dropped, those that meet are merged. The winner must be ahead of all others by a sum
-of fitness that grows over several scans and some way: in a place that exists twice, no answer is sure. The scans
-seen until then are matched again, backwards, so that the trajectory can be completed.
-
-(Counting out the points whose beam runs through a wall was tried and made it worse: in the Wean Hall log a fifth of
-the beams at the true poses do, for doors are drawn shut.)
+Branch and bound searches the whole map with the first scans, and every place that fits becomes a hypothesis; later
+scans may add others, for there may be people around at first. Each further scan moves the hypotheses with the odometry,
+matches them again in a small window and adds to their record. Hypotheses that fall behind are dropped, those that meet
+are merged. The winner must be ahead of all others by a sum of fitness that grows over several scans and some way: in a
+place that exists twice, no answer is sure. The scans seen until then are matched again, backwards, so that the
+trajectory can be completed.
 """
 
 from __future__ import annotations
@@ -15,20 +13,29 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from math import hypot, pi, radians
+from math import hypot, radians
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.localisation.global_search import RelocaliserResult
-from hsloc.localisation.hypotheses import Hypothesis, Places, fits_better, tiles
+from hsloc.localisation.hypotheses import (
+    RECORDED,
+    CandidateLimits,
+    DistinctPoses,
+    Hypothesis,
+    bounded_search,
+    fits_better,
+    likely_places,
+)
 from hsloc.localisation.motion import fuse, predict_covariance
 from hsloc.localisation.motion_gate import MotionGate
-from hsloc.localisation.track_evidence import MOST_FROM_RIVAL, USUAL_EXPLAINED, fit_evidence, rival_evidence
+from hsloc.localisation.track_evidence import MOST_FROM_RIVAL, USUAL_EXPLAINED, place_evidence, rival_evidence
+from hsloc.localisation.whole_map_search import join_scans
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Evidence, State
-from hsloc.model.pose2 import Pose2, wrap_angle
+from hsloc.model.pose2 import Pose2
 from hsloc.parameters import Count, NonNegative, Parameters, Positive, Ratio
 
 if TYPE_CHECKING:
@@ -37,6 +44,7 @@ if TYPE_CHECKING:
 
     from hsloc.localisation.motion_models import MotionModel
     from hsloc.localisation.place_check import PlaceCheck
+    from hsloc.localisation.whole_map_search import WholeMapSearch
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
     from hsloc.model.events import PairedScan
@@ -49,14 +57,14 @@ if TYPE_CHECKING:
 class RelocaliserParameters(Parameters):
     """How the whole map is searched, and when a hypothesis is accepted."""
 
-    tile: Positive = 1.5
-    """Side of a tile of free space that is searched at once [m]."""
-    sectors: Count = 4
-    """Number of parts in which the headings are searched."""
-    budget: Count = 240
-    """Number of fitness evaluations in each tile and sector."""
+    search_margin: Ratio = 0.2
+    """Fitness below the best within which a place of the whole map becomes a hypothesis."""
+    search_boxes: Count = 10_000_000
+    """Maximum number of boxes of poses in one search of the whole map; a million take about 0.1 s."""
     search_points: Count = 60
-    """Maximum number of points of a scan that are used while tiles are searched."""
+    """Maximum number of points that the whole map is searched with, and a hypothesis is matched with."""
+    budget: Count = 240
+    """Number of fitness evaluations of a match of a hypothesis."""
     hypotheses: Count = 400
     """Maximum number of hypotheses."""
     step_min_d: NonNegative = 0.3
@@ -64,7 +72,7 @@ class RelocaliserParameters(Parameters):
     step_min_a: NonNegative = 0.3
     """Minimum rotation between two scans that update the hypotheses [rad]; a larger translation is enough, too."""
     seed_scans: Count = 3
-    """Number of scans with which the whole map is searched."""
+    """Number of first scans that are joined for a search of the whole map; the first is searched for by itself, too."""
     min_points: Count = 20
     """Minimum number of hits of a scan that updates the hypotheses."""
     min_scans: Count = 4
@@ -84,18 +92,26 @@ class RelocaliserParameters(Parameters):
     min_evidence: NonNegative = 4.0
     """Minimum logarithm of the odds that its scans and the whole map give an accepted hypothesis."""
     renew_distance: Positive = 3.0
-    """Path length after which the whole map is searched again while no hypothesis fits [m]."""
+    """Path length after which the whole map is searched again [m]; doubled each time while a hypothesis fits."""
     restart_below: Ratio = 0.3
     """Mean fitness of the best hypothesis below which the search starts again."""
 
 
-_STEP_WINDOW = (0.25, radians(8.0))
+_STEP_WINDOW = (0.25, 0.25, radians(8.0))
+_REFINE_POINTS = 120
+"""Points with which a place is refined before its record is made."""
+_OF_SEVERAL = 0.5
+"""Part of the margin where several scans are joined: they tell places apart better than one."""
+_JOINED = 6
+"""Scans that are joined for a later search: about two metres, over which odometry is good to some centimetres."""
+_NEW_MARGIN = 0.05
+"""Mean fitness below the best hypothesis's from which a place that is found late is one, too."""
 _FITS = 0.8
 """Going backwards, a scan fits with at least this part of the winner's fitness."""
 _WEIGHED = 12
 """Scans that the winner is weighed by, at most."""
-_FULL_M = 3.0
-"""Comparisons with other places count in full over this path length (m): on the spot one view is repeated."""
+_WEIGHED_AGAIN = 4
+"""It is weighed again after so many scans, at most: on a large map that takes a second."""
 _OFF_MAP = 0.87
 """Explained fitness by the usual one below which the best place does not fit."""
 _TRACE_LOST = 3
@@ -105,7 +121,7 @@ REMEMBERED = 1000
 
 
 class Relocaliser:
-    """A `GlobalSearch` by tiles; its state is a list of hypotheses."""
+    """A `GlobalSearch` by branch and bound; its state is a list of hypotheses."""
 
     def __init__(
         self,
@@ -120,17 +136,21 @@ class Relocaliser:
     ) -> None:
         self._check = place_check
         self._path_length = 0.0
-        self._renewed_at = 0.0
+        self._searched_at = 0.0
+        self._search_after = parameters.renew_distance
         self._explained: float | None = None
+        self._weigh_at = 0
         self._state = State.LOST
         self._usual = USUAL_EXPLAINED
         self._field = likelihood
         self._matcher = matcher
+        self._quick = _quick(matcher, parameters)
         self._parameters = parameters
         self._motion_model = motion_model
         self._gate = MotionGate(parameters.step_min_d, parameters.step_min_a)
         self._rng = rng
-        self._tiles = tiles(grid, self._parameters.tile)
+        self._grid = grid
+        self._map_search: WholeMapSearch | None = None
         self._hypotheses: list[Hypothesis] = []
         self._T_odom_last: Pose2 | None = None
         self._seen: deque[tuple[int, F64, PairedScan]] = deque(maxlen=REMEMBERED)
@@ -139,10 +159,14 @@ class Relocaliser:
         """See `GlobalSearch`."""
         self._usual = USUAL_EXPLAINED if usual_explained is None else usual_explained
         self._hypotheses = []
-        self._T_odom_last = None
-        self._explained = None
+        self._T_odom_last = self._explained = None
+        self._weigh_at = 0
         self._state = State.LOST
         self._seen.clear()
+
+    def places(self) -> list[Pose2]:
+        """The hypotheses at the last scan that was used, T_map_base, the best first."""
+        return [h.pose for h in self._hypotheses]
 
     def update(self, paired: PairedScan, odometry_count: int) -> RelocaliserResult:
         """Take a scan, and how many odometry messages there were until now."""
@@ -161,79 +185,89 @@ class Relocaliser:
         evaluations = self._advance(points, motion)
         scans = self._hypotheses[0].scans if self._hypotheses else 1
         self._path_length += hypot(motion.x, motion.y)
-        if scans <= p.seed_scans:
-            evaluations += self._seed(points, scans)
-            self._renewed_at = self._path_length
-        elif self._path_length - self._renewed_at >= p.renew_distance:
-            self._renewed_at = self._path_length
-            evaluations += self._renew(points, paired, scans)
+        if scans == 1 or scans == p.seed_scans:
+            evaluations += self._find(scans, p.min_fitness)
+            self._searched_at, self._search_after = self._path_length, p.renew_distance
+        elif self._path_length - self._searched_at >= (p.renew_distance if self._is_poor() else self._search_after):
+            self._searched_at = self._path_length
+            self._search_after *= 2.0
+            evaluations += self._find(_JOINED, max(self._hypotheses[0].mean - _NEW_MARGIN, p.min_fitness))
         self._keep()
         return self._verdict(Pose2(), evaluations, True)
 
-    def _seed(self, points: F64, scans: int) -> int:
-        """Search every tile; a pose that is found late is taken for as fit in the scans before."""
+    def _find(self, scans: int, needed: float) -> int:
+        """Search the whole map with the last `scans` scans, joined by odometry; new places become hypotheses.
+
+        They are matched in the scans before as well, so that a place that is found late has a record of its own.
+        """
         p = self._parameters
-        half = 0.6 * p.tile, 0.6 * p.tile, 1.1 * pi / p.sectors
-        headings = [wrap_angle(2.0 * pi * sector / p.sectors) for sector in range(p.sectors)]
-        windows = [Window(Pose2(x, y, heading), *half) for x, y in self._tiles for heading in headings]
-        poses, fitness, evaluations = self._search(points, windows)
-        unsure = np.diag(np.square(half))
-        self._hypotheses += [
-            Hypothesis(pose, unsure, float(fit), float(fit) * scans, scans, [float(fit)])
-            for pose, fit in zip(poses, fitness, strict=True)
-        ]
+        if self._map_search is None:
+            self._map_search = bounded_search(self._grid, self._field) if self._check is None else self._check.search
+        last = list(self._seen)[-scans:]
+        joined = join_scans([points for _, points, _ in last], [paired.T_odom_base for _, _, paired in last])
+        limits = CandidateLimits(
+            count=p.hypotheses,
+            margin=p.search_margin if scans == 1 else _OF_SEVERAL * p.search_margin,
+            min_fitness=needed,
+            points=p.search_points,
+            refined_points=_REFINE_POINTS,
+            max_boxes=p.search_boxes,
+        )
+        taken = DistinctPoses()
+        for hypothesis in self._hypotheses:
+            taken.add(hypothesis.pose)
+        evaluations = 0
+        known = tuple(self._hypotheses)
+        count = max((hypothesis.scans for hypothesis in self._hypotheses), default=1)
+        for pose, covariance, _ in likely_places(self._map_search, self._field, joined, limits):
+            if taken.add(pose):
+                hypothesis, more = self._with_record(pose, covariance, count)
+                evaluations += more
+                # A place whose record leads back to a hypothesis is its continuation with the odometry left aside.
+                first, n = hypothesis.trail[0], len(hypothesis.trail)
+                if n == 1 or not any(other.was_at(first, n) for other in known):
+                    self._hypotheses.append(hypothesis)
         return evaluations
 
-    def _renew(self, points: F64, paired: PairedScan, scans: int) -> int:
-        """While no hypothesis fits, look at the whole map again: the robot may have come back to it only now."""
-        best = self._hypotheses[0]
-        poor = self._explained is not None and self._explained < _OFF_MAP * self._usual
-        if self._check is None or not poor:
-            return 0
-        joined = [(seen.T_odom_base, self._check.few(p)) for _, p, seen in list(self._seen)[-_WEIGHED:]]
-        found = self._check.fittest(joined, paired.T_odom_base, best.mean)
-        if found is None:
-            return 0
-        half, half_angle = _STEP_WINDOW
-        match = self._matcher.match(points, self._field, Window(found, half, half, half_angle), self._rng)
-        fitness = match.fitness
-        self._hypotheses.append(Hypothesis(match.pose, match.covariance, fitness, fitness * scans, scans, [fitness]))
-        return match.evaluations
-
-    def _search(self, points: F64, windows: list[Window]) -> tuple[list[Pose2], F64, int]:
-        """The fittest pose in each window, how fit, and the evaluations spent."""
-        quick = self._quick_matcher()
-        if isinstance(quick, HarmonySearch):
-            return quick.match_boxes(points, self._field, windows, self._rng)
-        found = [quick.match(points, self._field, window, self._rng) for window in windows]
-        fitness = np.array([match.fitness for match in found])
-        return [match.pose for match in found], fitness, sum(match.evaluations for match in found)
+    def _with_record(self, pose: Pose2, covariance: F64, count: int) -> tuple[Hypothesis, int]:
+        """A hypothesis for the last scan that is matched backwards in up to `count` remembered scans."""
+        history: list[float] = []
+        trail: deque[Pose2] = deque(maxlen=RECORDED)
+        at = pose
+        evaluations = 0
+        # Where no hypothesis fits, the robot may have been off the map before.
+        seen = list(self._seen)[-min(count, _JOINED if self._is_poor() else RECORDED) :]
+        for k in range(len(seen) - 1, -1, -1):
+            _, points, paired = seen[k]
+            match = self._quick.match(points, self._field, Window(at, *_STEP_WINDOW), self._rng)
+            evaluations += match.evaluations
+            history.append(match.fitness)
+            trail.appendleft(match.pose)
+            covariance = match.covariance if len(trail) == 1 else covariance
+            at = match.pose @ paired.to(seen[max(k - 1, 0)][2])
+        history.reverse()
+        total = float(np.mean(history)) * count
+        return Hypothesis(trail[-1], covariance, history[-1], total, count, history, trail), evaluations
 
     def _advance(self, points: F64, motion: Pose2) -> int:
         """Move the hypotheses with the odometry and match them again."""
         evaluations = 0
-        half, half_angle = _STEP_WINDOW
+        half, _, half_angle = _STEP_WINDOW
         spread = 3.0 * np.sqrt(np.diag(self._motion_model.covariance(motion)))
         half = max(half, float(spread[:2].max()))
         half_angle = max(half_angle, float(spread[2]))
-        quick = self._quick_matcher()
         for hypothesis in self._hypotheses:
             window = Window(hypothesis.pose @ motion, half, half, half_angle)
-            match = quick.match(points, self._field, window, self._rng)
+            match = self._quick.match(points, self._field, window, self._rng)
             evaluations += match.evaluations
-            hypothesis.pose = match.pose
-            hypothesis.covariance = match.covariance
-            hypothesis.fitness = match.fitness
-            hypothesis.total += match.fitness
-            hypothesis.scans += 1
-            hypothesis.history.append(match.fitness)
+            hypothesis.follow(match)
         return evaluations
 
     def _keep(self) -> None:
         """Drop the hypotheses that fell behind, merge those that met: of each place the best stays."""
         p = self._parameters
         self._hypotheses.sort(key=lambda h: -h.total)
-        taken = Places()
+        taken = DistinctPoses()
         kept: list[Hypothesis] = []
         for hypothesis in self._hypotheses:
             best = self._hypotheses[0]
@@ -258,13 +292,16 @@ class Relocaliser:
         evidence: Evidence | None = None
         if fresh:
             self._state = self._judge(best, pose)
-        proven = fresh and ahead and self._is_proven(best)
-        sure = proven or (fresh and ahead and ratio <= p.max_rival_ratio)
-        if sure and self._check is not None:
+        others = self._hypotheses[1:]
+        proven = bool(others) and all(fits_better(best.history, other.history, p.confidence) for other in others)
+        sure = fresh and ahead and (proven or ratio <= p.max_rival_ratio)
+        if sure and self._check is not None and best.scans < self._weigh_at:
+            sure = False
+        elif sure and self._check is not None:
+            self._weigh_at = best.scans + min(1 + best.scans // 8, _WEIGHED_AGAIN)
             evidence = self._weigh(best, motion)
             of_rivals = MOST_FROM_RIVAL if proven else max(rival_evidence(ratio), 0.0)
-            others = min(evidence.distance / _FULL_M, 1.0) * (of_rivals + rival_evidence(evidence.rival))
-            sure = others + min(fit_evidence(evidence, self._usual), 0.0) >= p.min_evidence
+            sure = place_evidence(evidence, of_rivals, self._usual) >= p.min_evidence
         track, whole = self._retrace(best, motion) if sure else ((), False)
         return RelocaliserResult(
             pose,
@@ -279,11 +316,9 @@ class Relocaliser:
             evidence if sure else None,
         )
 
-    def _is_proven(self, best: Hypothesis) -> bool:
-        """Whether the best fits better than each other one in a paired t-test over blocks of scans."""
-        confidence = self._parameters.confidence
-        others = self._hypotheses[1:]
-        return all(fits_better(best.history, other.history, confidence) for other in others) if others else False
+    def _is_poor(self) -> bool:
+        """Whether the map explains too little of the scans at the best hypothesis."""
+        return self._explained is not None and self._explained < _OFF_MAP * self._usual
 
     def _judge(self, best: Hypothesis, pose: Pose2) -> State:
         """Why it is not sure: the best place does not fit, or several do."""
@@ -293,7 +328,7 @@ class Relocaliser:
             self._explained = said if self._explained is None else self._explained + 0.3 * (said - self._explained)
         if best.scans < p.min_scans:
             return State.LOST
-        if self._explained is not None and self._explained < _OFF_MAP * self._usual:
+        if self._is_poor():
             return State.OFF_MAP
         alike = sum(hypothesis.mean >= p.max_rival_ratio * best.mean for hypothesis in self._hypotheses)
         return State.AMBIGUOUS if alike > 1 else State.LOST
@@ -306,8 +341,8 @@ class Relocaliser:
         scans = [(pose, self._check.few(paired.points_base())) for _, pose, paired, _ in traced]
         path = sum(a[1].distance(b[1]) for a, b in pairwise(traced))
         means = np.mean([(e.fitness, e.short, e.through, e.unmapped) for e in said], axis=0)
-        rival = self._check.rival(scans, winner.pose @ motion)
-        return Evidence(path, float(means[0]), float(means[1]), float(means[2]), float(means[3]), rival)
+        rival, other = self._check.rival(scans, winner.pose @ motion)
+        return Evidence(path, float(means[0]), float(means[1]), float(means[2]), float(means[3]), rival, other)
 
     def _retrace(self, winner: Hypothesis, motion: Pose2) -> tuple[tuple[tuple[int, Pose2], ...], bool]:
         """The scans seen while searching, localised backwards from where the robot is now known to be.
@@ -328,7 +363,6 @@ class Relocaliser:
 
     def _trace(self, winner: Hypothesis, motion: Pose2, most: int) -> list[tuple[int, Pose2, PairedScan, float]]:
         """(odometry messages before, T_map_base, scan, fitness) of the last scans, backwards; ends where none fits."""
-        half, half_angle = _STEP_WINDOW
         pose, covariance = winner.pose @ motion, winner.covariance
         fits = max(self._parameters.min_fitness, _FITS * winner.fitness)
         traced: list[tuple[int, Pose2, PairedScan, float]] = []
@@ -341,7 +375,7 @@ class Relocaliser:
                 covariance = predict_covariance(covariance, pose, motion, self._motion_model.covariance(motion))
                 pose = pose @ motion
             T_odom_next = T_odom_base
-            match = self._matcher.match(points, self._field, Window(pose, half, half, half_angle), self._rng)
+            match = self._matcher.match(points, self._field, Window(pose, *_STEP_WINDOW), self._rng)
             misses += 1
             if match.fitness >= fits:
                 pose, covariance = fuse(pose, covariance, match.pose, match.covariance)
@@ -351,15 +385,16 @@ class Relocaliser:
                 break
         return traced
 
-    def _quick_matcher(self) -> HarmonySearch | Matcher:
-        """The matcher with a small budget and one restart; a matcher without a budget stays as it is."""
-        if isinstance(self._matcher, HarmonySearch):
-            return replace(
-                self._matcher,
-                budget=self._parameters.budget,
-                count_improvisations=False,
-                restarts=1,
-                search_points=self._parameters.search_points,
-                polish_iterations=10,
-            )
-        return self._matcher
+
+def _quick(matcher: Matcher, parameters: RelocaliserParameters) -> Matcher:
+    """The matcher with a small budget and one restart; a matcher without a budget stays as it is."""
+    if not isinstance(matcher, HarmonySearch):
+        return matcher
+    return replace(
+        matcher,
+        budget=parameters.budget,
+        count_improvisations=False,
+        restarts=1,
+        search_points=parameters.search_points,
+        polish_iterations=10,
+    )

@@ -16,7 +16,7 @@ benchmarks/README.md). Right places: explained 0.93 to 0.97, rival 0.80 to 1.05;
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp
 from typing import TYPE_CHECKING
 
@@ -52,8 +52,15 @@ _RIVALLED, _BEATEN = 1.12, 1.3
 """A rival ratio from the second on is full evidence against the place, up to the first it is none."""
 MOST_FROM_RIVAL = 4.0
 """Log of the odds that one comparison changes, at most: 55 to 1."""
+_FULL_M = 3.0
+"""Comparisons of a place that was searched for count in full over this path length (m)."""
+_ON_THE_SPOT = 0.5
+"""How much they count on the spot: of 120 scans of another building none fitted as usual and had no rival."""
 _GOOD_FIT, _FIT_SCALE = 0.95, 0.03
 """Explained fitness by the usual one that is no evidence, and the step from it that counts 1 a metre."""
+_POOR_FIT, _MOST_FROM_POOR = 0.9, 1.5
+"""Explained fitness by the usual one up to which having no rival counts for no more than this: of 230 scans of another
+building 12 % had none, of 111 right ones in a crowd 65 %; of those that fitted as usual none and 80 %."""
 _MOST_FROM_FIT, _MOST_FROM_MISFIT = 1.0, 3.0
 """Log of the odds that a metre of good or of bad fit changes, at most."""
 _REFUSED = -1.0
@@ -77,6 +84,17 @@ def rival_evidence(ratio: float) -> float:
     return 0.0
 
 
+def comparison_evidence(evidence: Evidence, usual: float) -> float:
+    """`rival_evidence` of a scan; in favour of a place it counts in full only where the map explains as much as usual.
+
+    Off the map the best place is unique now and then, but it does not fit (see `_MOST_FROM_POOR`).
+    """
+    said = rival_evidence(evidence.rival)
+    part = (evidence.explained / usual - _POOR_FIT) / (1.0 - _POOR_FIT)
+    most = _MOST_FROM_POOR + (MOST_FROM_RIVAL - _MOST_FROM_POOR) * min(max(part, 0.0), 1.0)
+    return min(said, most)
+
+
 def fit_evidence(evidence: Evidence, usual: float) -> float:
     """Log of the likelihood ratio, fitting place to astray, of what the map explains of a scan; 0 for NaN."""
     if not evidence.explained >= 0.0:
@@ -84,6 +102,18 @@ def fit_evidence(evidence: Evidence, usual: float) -> float:
     per_metre = (evidence.explained / usual - _GOOD_FIT) / _FIT_SCALE
     seen = 1.0 - evidence.short - evidence.unmapped
     return min(max(per_metre, -_MOST_FROM_MISFIT), _MOST_FROM_FIT) * min(evidence.distance, 1.0) * seen
+
+
+def place_evidence(evidence: Evidence, of_rivals: float, usual: float) -> float:
+    """Log of the odds that a place that was searched for is the right one.
+
+    `evidence` is that of its scans together, `of_rivals` what the other hypotheses say for it. Beams that end where
+    nothing is mapped vouch for no place; on the spot one view is repeated.
+    """
+    metres = min(evidence.distance, _FULL_M)
+    weight = max(metres / _FULL_M, _ON_THE_SPOT) * (1.0 - evidence.unmapped)
+    fit = max(metres, 1.0) * min(fit_evidence(replace(evidence, distance=1.0), usual), 0.0)
+    return weight * (of_rivals + comparison_evidence(evidence, usual)) + fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +127,7 @@ class TrackRow:
     def likelihoods(self, usual: float) -> States:
         """Of right, alike and astray, up to a common factor."""
         fit = fit_evidence(self.evidence, usual) + (_REFUSED if self.status is Status.REJECTED else 0.0)
-        rival = rival_evidence(self.evidence.rival)
+        rival = comparison_evidence(self.evidence, usual)
         return exp(fit + rival), exp(fit + min(rival, 0.0)), 1.0
 
     def moved_on(self, before: States) -> States:
@@ -171,7 +201,8 @@ def usual_explained(rows: Sequence[TrackRow]) -> float:
     vouched = np.zeros(len(rows), dtype=np.bool_)
     comparisons = 0
     for k, row in enumerate(rows):
-        if row.status is Status.MATCHED and rival_evidence(row.evidence.rival) >= 0.5 * MOST_FROM_RIVAL:
+        vouches = rival_evidence(row.evidence.rival) >= 0.5 * MOST_FROM_RIVAL and row.evidence.explained >= _LEAST_USUAL
+        if row.status is Status.MATCHED and vouches:
             comparisons += 1
             vouched |= (path <= path[k]) & (path >= path[k] - _CERTIFIED_M)
     values = explained[vouched & np.isfinite(explained)]

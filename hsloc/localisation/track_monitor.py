@@ -69,13 +69,13 @@ class TrackMonitor:
         self._trail.append((self._path_length, pose, self._check.few(points)))
         while self._trail[0][0] < self._path_length - p.length:
             self._trail.popleft()
-        rival = float("nan")
+        rival, other = float("nan"), None
         if self._path_length - self._compared_at >= p.interval and len(self._trail) >= _FEWEST_JOINED:
             self._compared_at = self._path_length
             chosen = np.unique(np.linspace(0, len(self._trail) - 1, p.scans).astype(np.int64))
-            rival = self._check.rival([self._trail[k][1:] for k in chosen], pose)
+            rival, other = self._check.rival([self._trail[k][1:] for k in chosen], pose)
         found = self._check.explain(paired, pose)
-        evidence = Evidence(distance, found.fitness, found.short, found.through, found.unmapped, rival)
+        evidence = Evidence(distance, found.fitness, found.short, found.through, found.unmapped, rival, other)
         self._filter.add(TrackRow(Status.MATCHED, evidence))
         return evidence
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import ceil, floor, log2, pi, radians
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 
@@ -105,6 +105,18 @@ class WholeMapResult:
         return self.is_complete and len(self.modes) == 1
 
 
+class Places(NamedTuple):
+    """Poses (m, 3; cells, rad), the fitness (m,) at each, the boxes that were bounded, and whether these are all.
+
+    Where they are all, any pose that is fitter than the demand lies in a square of the finest level around one of them.
+    """
+
+    poses: F64
+    fitness: F64
+    boxes: int
+    is_complete: bool
+
+
 class WholeMapSearch:
     """Searches one map; what does not depend on the scan is prepared once."""
 
@@ -135,6 +147,15 @@ class WholeMapSearch:
         modes, bound, more, is_complete = self._modes(scaled, candidates, best, needed)
         return WholeMapResult(modes, bound, is_complete, boxes + more)
 
+    def places_above(self, points: F64, demand: float, max_boxes: int) -> Places:
+        """Where on the map points (n, 2) may be fitter than `demand`: nothing is proven of a single pose."""
+        if len(points) == 0 or len(self._sample) == 0:
+            return Places(np.empty((0, 3)), np.empty(0), 0, False)
+        scaled = self._field.scale(points)
+        rows, boxes, is_complete = self._candidates(scaled, demand, max_boxes)
+        poses = rows[:, :3]
+        return Places(poses, fitness_many(self._field.packed, scaled, poses), boxes, is_complete)
+
     def _seed(self, scaled: NDArray[np.float32]) -> tuple[Mode | None, int]:
         """A fit place, looked for with few points and a demand that falls; None where there is none.
 
@@ -158,7 +179,9 @@ class WholeMapSearch:
                 return None, boxes
             demand = max(demand - _SEED_STEP, p.min_fitness)
 
-    def _candidates(self, scaled: NDArray[np.float32], needed: float) -> tuple[F64, int, bool]:
+    def _candidates(
+        self, scaled: NDArray[np.float32], needed: float, max_boxes: int | None = None
+    ) -> tuple[F64, int, bool]:
         """Boxes (m, 6) in which poses may be fitter than `needed`, most promising first; and whether they are all."""
         p = self._parameters
         half_square = 0.5 * (1 << self._pyramid.shift << self._coarsest)
@@ -173,7 +196,7 @@ class WholeMapSearch:
             self._open_widths,
             half_thetas,
             (needed - _ROUNDING) * len(scaled),
-            p.max_boxes,
+            p.max_boxes if max_boxes is None else max_boxes,
             p.max_candidates,
         )
         return rows[np.argsort(-rows[:, 6], kind="stable"), :6], int(boxes), bool(is_complete)

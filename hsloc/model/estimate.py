@@ -58,7 +58,7 @@ class Evidence:
     `distance` is the path length since the scan before (m). `explained` is the mean score of the beams that no object
     in free space cut short, `short`, `through` and `unmapped` are the shares of all beams that end before a wall,
     behind one, or where the map has nothing. `rival` is the fitness of the fittest other place on the map divided by
-    that of this one, NaN where the places were not compared.
+    that of this one, NaN where the places were not compared; `other` is that place, where one was found.
     """
 
     distance: float
@@ -67,6 +67,7 @@ class Evidence:
     through: float = 0.0
     unmapped: float = 0.0
     rival: float = float("nan")
+    other: Pose2 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

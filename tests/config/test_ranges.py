@@ -25,10 +25,13 @@ from hsloc.model.occupancy_grid import OccupancyGrid
         ({"likelihood_field": {"margin": 1e-300}}, "margin is 1e-300; it must be 0, or at least 1e-9 in size"),
         ({"hide": {"budget": 10**30}}, "budget is 1000000000000000000000000000000; it must be from 1 to 1e9"),
         (
-            {"localiser": {"relocaliser": {"sectors": 0}}},
-            "localiser.relocaliser.sectors is 0; it must be from 1 to",
+            {"localiser": {"relocaliser": {"hypotheses": 0}}},
+            "localiser.relocaliser.hypotheses is 0; it must be from 1 to",
         ),
-        ({"localiser": {"relocaliser": {"tile": -1.0}}}, "relocaliser.tile is -1.0; it must be from 1e-9"),
+        (
+            {"localiser": {"relocaliser": {"renew_distance": -1.0}}},
+            "renew_distance is -1.0; it must be from 1e-9",
+        ),
         (
             {"localiser": {"max_consecutive_rejections": 0}},
             "localiser.max_consecutive_rejections is 0; it must be from 1 to",

@@ -23,7 +23,7 @@ def check_of(occupancy: OccupancyGrid) -> PlaceCheck:
 
 def rival(check: PlaceCheck, places: list[Pose2]) -> float:
     scans = [(place, check.few(seen(L_SHAPE, place, place, 0.0).points_base())) for place in places]
-    return check.rival(scans, places[-1])
+    return check.rival(scans, places[-1])[0]
 
 
 def test_a_room_that_exists_once_has_no_rival() -> None:
@@ -38,19 +38,10 @@ def test_a_wrong_place_is_beaten_by_the_right_one() -> None:
     check = check_of(grid(L_SHAPE, ONE))
     off = Pose2(4.6, -3.0, 0.9)
     scans = [(off @ place, check.few(seen(L_SHAPE, place, place, 0.0).points_base())) for place in PLACES]
-    assert check.rival(scans, off @ PLACES[-1]) > 1.2
-
-
-def test_the_fittest_place_on_the_map_is_the_right_one() -> None:
-    check = check_of(grid(L_SHAPE, ONE))
-    T_map_odom = Pose2(3.0, 1.0, 0.5)
-    scans = [
-        (T_map_odom.inverse() @ place, check.few(seen(L_SHAPE, place, place, 0.0).points_base())) for place in PLACES
-    ]
-    found = check.fittest(scans, scans[-1][0], 0.5)
-    assert found is not None
-    assert found.distance(PLACES[-1]) < 0.3
-    assert check.fittest(scans, scans[-1][0], 0.999) is None
+    ratio, other = check.rival(scans, off @ PLACES[-1])
+    assert ratio > 1.2
+    assert other is not None
+    assert other.distance(PLACES[-1]) < 0.1
 
 
 def crowded(paired: PairedScan, share: float) -> PairedScan:

@@ -109,7 +109,7 @@ def test_the_same_seed_gives_the_same_verdicts() -> None:
     assert [v.evaluations for v in first] == [v.evaluations for v in second]
 
 
-@pytest.mark.parametrize(("name", "value"), [("tile", 0.0), ("min_scans", 0), ("min_fitness", -0.1)])
+@pytest.mark.parametrize(("name", "value"), [("renew_distance", 0.0), ("min_scans", 0), ("min_fitness", -0.1)])
 def test_a_parameter_out_of_range_is_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=f"RelocaliserParameters.{name} is"):
         replace(RelocaliserParameters(), **{name: value})  # type: ignore[arg-type]

@@ -23,7 +23,6 @@ function control(option) {
   made.spellcheck = false;
   made.dataset.option = option.name;
   made.dataset.kind = option.kind;
-  made.title = option.help;
   return made;
 }
 
@@ -45,7 +44,13 @@ export function build(box, options) {
     const label = document.createElement("label"), made = control(option);
     const text = option.name.replace("read.", "").replaceAll("_", " ");
     if (option.kind === "switch") { label.className = "check"; label.append(made, ` ${text}`); } else label.append(`${text} `, made);
-    label.title = option.help;
+    const help = document.createElement("small");
+    help.className = "quiet";
+    help.textContent = option.help;
+    help.id = made.id = `option-${option.name}`;
+    help.id += "-help";
+    made.setAttribute("aria-describedby", help.id);
+    label.append(help);
     groups.get(option.group).append(label);
   }
 }

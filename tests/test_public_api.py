@@ -96,8 +96,12 @@ def test_every_localised_pose_after_the_first_match_has_a_covariance(mine: hsloc
         assert (found[begin:end, 2, 2] >= found[begin, 2, 2]).all()
 
 
-def test_a_built_map_has_no_covariances() -> None:
-    assert np.isnan(hsloc.run(SLIP, mode="slam", end_s=2.0).pose_covariances()).all()
+def test_poses_of_a_built_map_have_covariances_relative_to_the_first() -> None:
+    built = hsloc.run(SLIP, mode="slam", end_s=2.0)
+    found = built.pose_covariances()
+    assert found.shape == (len(built.trajectory), 3, 3)
+    assert (np.linalg.eigvalsh(found) >= -1e-12).all()
+    assert found[0, 0, 0] <= found[-1, 0, 0] > 0.0
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,6 @@ from hsloc_service.http import (
     metrics,
     results_routes,
     run_routes,
-    schema_routes,
     system_routes,
     tus,
 )
@@ -57,7 +56,6 @@ ROUTERS = tuple(
         events_routes,
         results_routes,
         run_routes,
-        schema_routes,
         system_routes,
     )
 )

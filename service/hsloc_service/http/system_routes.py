@@ -1,8 +1,10 @@
-"""Health, metrics, options: for operators and programs."""
+"""Health, metrics, options, schemas: for operators and programs."""
 
 from __future__ import annotations
 
+import functools
 import time
+from typing import TYPE_CHECKING, Any
 
 from fastapi import APIRouter
 from fastapi.responses import Response
@@ -13,13 +15,16 @@ from hsloc.options import describe
 from hsloc.version import __version__
 from hsloc_service import config_schema as job_options
 from hsloc_service.db.tables import DeliveryRow, JobRow
-from hsloc_service.errors import ServiceError
+from hsloc_service.errors import ServiceError, not_found
 from hsloc_service.http import metrics
 from hsloc_service.http.context import Admin, Context, Ctx, Reader, problems
 from hsloc_service.http.schemas import Health, Info, Options, Problem, SecretView, WorkerList
 from hsloc_service.http.views import worker_view
 from hsloc_service.jobs.workers import workers
 from hsloc_service.webhooks import secret_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 router = APIRouter(tags=["system"])
 _TEXT = {"description": "the metrics", "content": {"text/plain": {"schema": {"type": "string"}}}}
@@ -84,6 +89,22 @@ def options(who: Reader) -> Options:
     return Options(run=describe(), **job_options.options())
 
 
+@router.get("/v1/schemas", responses=problems())
+def schemas(who: Reader) -> list[str]:
+    """Names of the schemas."""
+    del who
+    return sorted(_SCHEMAS)
+
+
+@router.get("/v1/schemas/{name}", responses=problems(404))
+def schema(name: str, who: Reader) -> dict[str, Any]:
+    """The JSON Schema (draft 2020-12) of a file of the results: `run-metrics` of metrics.json."""
+    del who
+    if name not in _SCHEMAS:
+        raise not_found("schema", name)
+    return _SCHEMAS[name]()
+
+
 @router.get("/v1/webhook-secret", responses=problems())
 def webhook_secret(ctx: Ctx, who: Admin) -> SecretView:
     """The key that signs your webhooks; made when first asked for. Needs the scope `admin`."""
@@ -106,3 +127,13 @@ def _measure(ctx: Context) -> None:
     metrics.FREE.set(ctx.storage.free_bytes())
     metrics.OLDEST.set(0.0 if oldest is None else time.time() - oldest)
     metrics.DELIVERIES.set(pending or 0)
+
+
+@functools.cache
+def _run_metrics() -> dict[str, Any]:
+    from hsloc.run_metrics import schema
+
+    return schema()
+
+
+_SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {"run-metrics": _run_metrics}

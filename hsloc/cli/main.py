@@ -30,6 +30,7 @@ COMMANDS = (
     "replay",
     "map",
     "merge",
+    "diff",
     "info",
     "check",
     "eval",

@@ -6,7 +6,6 @@ import json
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pytest
 
 from hsloc.cli.main import main
 from hsloc.evaluation.map_changes import map_changes
@@ -15,6 +14,8 @@ from hsloc.model import OccupancyGrid, Pose2
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    import pytest
 
 
 def room(*things: tuple[int, int, int, int]) -> OccupancyGrid:

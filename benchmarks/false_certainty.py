@@ -121,7 +121,7 @@ def measure(name: str, seed: int, is_known: bool) -> str:
     start: Pose2 | None = world.start() if is_known else None
     rng = np.random.default_rng(seed)
     localiser = Localiser.from_parameters(grid, field, config.make_matcher(), config.localiser, rng, start)
-    history, squared = RunHistory(), []
+    history, squared = RunHistory(config.localiser.smoothing_model()), []
     truth: Truth | None = None
     for event, estimate in replay(crowded(drive, crowd, seed) if crowd else drive, localiser):
         history.add(event, estimate)
@@ -143,7 +143,11 @@ def measure(name: str, seed: int, is_known: bool) -> str:
     doubted = (~wrong & ~localised).sum() / max((~wrong).sum(), 1)
     nees = f"{np.mean(squared):6.2f} {100.0 * np.mean(np.array(squared) < 7.81):5.1f} %" if squared else ""
     start_name = "given" if is_known else "unknown"
-    return f"{name:26s} {start_name:8s} {100.0 * (wrong & localised).mean():5.1f} % {100.0 * doubted:5.1f} % {nees}"
+    right = np.hypot(off[~wrong, 0], off[~wrong, 1])
+    rmse = f"{100.0 * np.sqrt(np.mean(right**2)):5.2f} cm" if len(right) else ""
+    return (
+        f"{name:26s} {start_name:8s} {100.0 * (wrong & localised).mean():5.1f} % {100.0 * doubted:5.1f} % {rmse} {nees}"
+    )
 
 
 def main() -> None:
@@ -151,7 +155,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"of {'; '.join(CASES)}")
     arguments = parser.parse_args()
-    print("case, start: wrong and localised, right and not localised, NEES, coverage")
+    print("case, start: wrong and localised, right and not localised, rmse of the right ones, NEES, coverage")
     for name in arguments.cases or CASES:
         for is_known in (True, False):
             print(measure(name, arguments.seed, is_known), flush=True)

@@ -94,6 +94,7 @@ def preset(name: str) -> Config:
             window_sigmas=1.0,
             refine_first=False,
             fuse=False,
+            smooth=False,
             place_check=PlaceCheckParameters(interval=0.0),
         ),
     )

@@ -74,6 +74,8 @@ class LocaliserParameters(Parameters):
     """Whether the optimum next to the prediction is taken where it fits as well as usual; otherwise always a search."""
     fuse: bool = True
     """Whether match and prediction are weighted by their covariances (EKF); otherwise the match is taken, as in [P]."""
+    smooth: bool = True
+    """Whether the poses of the trajectory also use the scans after them, as an offline run can."""
     initial_sigma: Positive = 0.5
     """Standard deviation of a given initial pose in x and y [m]."""
     initial_sigma_angle: Positive = radians(15.0)
@@ -99,6 +101,10 @@ class LocaliserParameters(Parameters):
             "omnidirectional": self.omnidirectional_noise,
         }
         return models[self.motion_model]
+
+    def smoothing_model(self) -> MotionModel | None:
+        """The noise for smoothing backwards; None where the poses are not smoothed."""
+        return self.noise() if self.smooth else None
 
     def match_limits(self) -> MatchLimits:
         """The limits of the match gate."""

@@ -206,7 +206,7 @@ def _run_with(
         likelihood, estimator = None, _mapper(request, state, lidar_only)
     first = None if lidar_only else first_odometry(log.events())
     prepared = time.perf_counter()
-    history = RunHistory()
+    history = RunHistory(request.config.localiser.smoothing_model() if localise else None)
     events = ContinuousOdometry(_events(request, log, lidar_only, localise), log.summary.odom_topic)
     # Turns that were joined of segments are known beam by beam; a whole turn is deskewed if the user asks for it.
     deskew = request.read.deskew or (log.summary.segments > 1 and not lidar_only)

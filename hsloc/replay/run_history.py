@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.localisation.motion import predict_covariance
+from hsloc.localisation.smoothing import Anchor, between_matches, smooth_matches
 from hsloc.localisation.states import StateLog
 from hsloc.model.estimate import ScanDiagnostics, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.localisation.motion_models import MotionModel
     from hsloc.localisation.states import StateRows
     from hsloc.model.certificate import Certificate
     from hsloc.model.estimate import Estimate
@@ -27,7 +29,11 @@ if TYPE_CHECKING:
 class RunHistory:
     """Columns that grow with the log: the result itself, and all of the memory that does."""
 
-    def __init__(self) -> None:
+    def __init__(self, motion_model: MotionModel | None = None) -> None:
+        """With a motion model the trajectory is smoothed backwards; without, each pose knows the past alone."""
+        self._motion_model = motion_model
+        self._anchors: list[Anchor] = []
+        self._track_ended = True
         self._odometry_stamps = array("q")
         self._odometry = array("d")
         self._poses = array("d")
@@ -63,6 +69,7 @@ class RunHistory:
             self._truth.extend((truth.x, truth.y, truth.theta))
         elif estimate is not None:
             self._add_scan(estimate)
+            self._anchor(event, estimate)
 
     def _add_scan(self, estimate: Estimate) -> None:
         self._note_belief(estimate.status)
@@ -83,6 +90,17 @@ class RunHistory:
             self._certificates.append(estimate.certificate)
         if estimate.revision:
             self._revisions.append((len(self._odometry_stamps), estimate.revision))
+
+    def _anchor(self, paired: PairedScan, estimate: Estimate) -> None:
+        if estimate.status is Status.SEARCHING:
+            self._track_ended = True
+        is_match = estimate.status in (Status.MATCHED, Status.RELOCALISED) and estimate.covariance is not None
+        if self._motion_model is not None and is_match and estimate.covariance is not None:
+            begins = self._track_ended or estimate.status is Status.RELOCALISED
+            self._anchors.append(
+                Anchor(len(self._odometry_stamps), paired.T_odom_base, estimate.T_map_base, estimate.covariance, begins)
+            )
+            self._track_ended = False
 
     def _note_belief(self, status: Status) -> None:
         """Whoever is lost now has been since the last match that was believed: in hindsight those poses are guesses."""
@@ -109,6 +127,10 @@ class RunHistory:
     def trajectory(self) -> tuple[Trajectory, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
         """One pose for each odometry message, revised where the estimator knew better later; and which are believed."""
         estimated = _trajectory(self._odometry_stamps, self._poses)
+        if self._motion_model is not None and self._anchors:
+            matched = smooth_matches(self._anchors, self._motion_model)
+            poses = between_matches(estimated.poses, self.odometry().poses, self._anchors, matched)
+            estimated = Trajectory(estimated.stamps_ns, poses)
         if not self._revisions:
             return estimated, np.array(self._localised, dtype=np.bool_)
         odometry = self.odometry().poses

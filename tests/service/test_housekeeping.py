@@ -58,7 +58,7 @@ def test_settings_from_variables(tmp_path: Path) -> None:
     assert parse_size("3k") == 3072
     assert from_environment({"HSLOC_DATA": "/logs"}).data != Path("/logs")
     assert from_environment({"HSLOC_SERVE_DATA": "/srv"}).data == Path("/srv")
-    for name, value in (("SLOTS", "many"), ("SLOTS", "0"), ("REQUIRE_TOKEN", "perhaps"), ("HEARTBEAT_S", "60")):
+    for name, value in (("SLOTS", "many"), ("SLOTS", "-1"), ("REQUIRE_TOKEN", "perhaps"), ("HEARTBEAT_S", "60")):
         with pytest.raises(SettingsError):
             from_environment({f"HSLOC_{name}": value})
     assert settings(tmp_path).retention_s is None

@@ -124,6 +124,7 @@ def test_upload_watch_look_download(
     look_around_by_mouse(page)
     picture(page, "4-zoomed")
     look_on_a_phone_in_the_dark(page)
+    page.wait_for_function("() => location.hash.includes('&t=')")
     first = page.url
     press(page, "#job-buttons button >> text=Run again")
     page.wait_for_function("(first) => location.href !== first", arg=first)
@@ -132,6 +133,8 @@ def test_upload_watch_look_download(
     page.go_back()  # to the first result
     page.wait_for_selector("#result:not([hidden])")
     assert page.url == first
+    time = first.partition("&t=")[2]  # a link holds the time that was looked at
+    page.wait_for_function("(t) => document.querySelector('.rv-now')?.textContent.startsWith(`${t} s`)", arg=time)
     page.click("text=← all jobs")
     page.wait_for_function("() => document.querySelectorAll('#jobs tbody tr').length === 2")
     compare_two(page)

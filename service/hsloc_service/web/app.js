@@ -1,4 +1,4 @@
-// The page: which part of it is shown, by the address. #job=ID, #compare=ID,ID, #files; else the jobs.
+// The page: which part of it is shown, by the address. #job=ID&t=SECONDS, #compare=ID,ID, #files; else the jobs.
 
 import { get, hasToken, onToken, useToken } from "./api.js";
 import { $, bytes, guarded, notice } from "./dom.js";
@@ -44,7 +44,10 @@ function route(event) {
   comparison?.end();
   comparison = null;
   if (event) { notice(""); scrollTo(0, 0); }
-  if (part === "job") result.show(value, Boolean(event));
+  if (part === "job") {
+    const [id, time] = value.split("&t=");
+    result.show(id, Boolean(event), Number(time) || 0);
+  }
   else if (part === "compare") guarded(() => compare(value.split(",").filter(Boolean)));
   else if (part === "files") guarded(() => files.show(useAgain));
   else guarded(jobs.refresh);

@@ -5,15 +5,18 @@ import { $, ACTIVE, badge, button, bytes, element, guarded } from "./dom.js";
 
 let watching = null; // AbortController of the job that is shown
 let view = null;
+let addressing = null; // timer after which the address holds the time that is shown
 
 export function leave() {
   watching?.abort();
   watching = null;
+  clearTimeout(addressing);
   view?.end();
   view = null;
 }
 
-export async function show(id, focus) {
+// `time` (s) is where the result is opened, as in a link that somebody sent.
+export async function show(id, focus, time = 0) {
   leave();
   watching = new AbortController();
   const mine = watching.signal;
@@ -32,7 +35,7 @@ export async function show(id, focus) {
   const ended = await guarded(() => get(`/v1/jobs/${id}`));
   if (!ended || mine.aborted) return;
   render(ended);
-  if (ended.state === "succeeded") await guarded(() => showResult(ended, mine));
+  if (ended.state === "succeeded") await guarded(() => showResult(ended, mine, time));
 }
 
 function render(job) {
@@ -78,7 +81,7 @@ export async function load(job) {
   return { data, image };
 }
 
-async function showResult(job, mine) {
+async function showResult(job, mine, time) {
   const base = `/v1/jobs/${job.id}/results`, manifest = await get(base);
   const names = new Set(manifest.assets.map((asset) => asset.name));
   const files = manifest.assets.filter((a) => !a.name.startsWith("viewer")).map(assetLine), zip = element("li");
@@ -97,7 +100,18 @@ async function showResult(job, mine) {
   if (!loaded || mine.aborted) return;
   summary(job, loaded.data.summary);
   view = new globalThis.ResultView($("view"), loaded.data, loaded.image, $("charts"));
+  if (time > 0) view.seek(time);
 }
+
+// The address holds the time that is shown, so that it can be sent.
+$("view").addEventListener("seek", (event) => {
+  if (!view) return;
+  clearTimeout(addressing);
+  addressing = setTimeout(() => {
+    const [job] = location.hash.split("&");
+    history.replaceState(null, "", event.detail > 0 ? `${job}&t=${event.detail.toFixed(1)}` : job);
+  }, 300);
+});
 
 function assetLine(asset) {
   const item = element("li");

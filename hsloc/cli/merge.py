@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 HELP = "join maps of one building"
 EXAMPLES = """
   hsloc merge results/morning results/evening --out results/building
-  hsloc replay run.mcap --map results/building
+  hsloc merge results/floor-a results/floor-b results/floor-c --out results/building
 """
 
 

@@ -118,7 +118,7 @@ EXAMPLES: dict[str, Any] = {
     "relations": "some.relations", "scan_topic": "/front,/rear", "laser_pose": [-0.1, 0.0, -3.0], "deskew": True,
     "start_s": -2.5, "end_s": 60.125, "preset": "paper", "matcher": "icp", "mapper": "point", "seed": 77,
     "set": ["hide.budget=400", "localiser.fuse=true"], "stamps": "log", "slice": "-0.2,0.5",
-    "scan_fix": "range_max=12", "time_offset": "/odom=-0.25",
+    "scan_fix": "range_max=12", "time_offset": "/odom=-0.25", "wheels": "0.033,0.16",
 }  # fmt: skip
 
 

@@ -161,7 +161,7 @@ def _judge(probabilities: F64, sigma: F64, usual: float, before: Sequence[TrackR
     right, alike, astray = probabilities
     if right < CONFIDENCE:
         if alike > astray:
-            return State.AMBIGUOUS, "another place fits as well"
+            return State.AMBIGUOUS, _named_rival(before)
         evidence = _last_explained(before)
         if evidence is not None and evidence.explained < _POOR_FIT * usual:
             return State.OFF_MAP, f"the map explains {evidence.explained:.2f} of the scan, usually {usual:.2f}"
@@ -169,6 +169,20 @@ def _judge(probabilities: F64, sigma: F64, usual: float, before: Sequence[TrackR
     if not (max(sigma[0], sigma[1]) <= MAX_SIGMA and sigma[2] <= MAX_SIGMA_ANGLE):
         return State.PREDICTED, f"standard deviation {max(sigma[0], sigma[1]):.2f} m, {np.degrees(sigma[2]):.1f} deg"
     return State.LOCALISED, ""
+
+
+def _named_rival(rows: Sequence[TrackRow]) -> str:
+    """The other place of the last comparison, where it was found."""
+    for row in reversed(rows):
+        if np.isfinite(row.evidence.rival):
+            other = row.evidence.other
+            if other is None:
+                break
+            place = f"x {other.x:.1f} m, y {other.y:.1f} m, yaw {np.degrees(other.theta):.0f} deg"
+            return f"another place fits as well: {place} at the last comparison"
+        if row.begins:
+            break
+    return "another place fits as well"
 
 
 def _last_explained(rows: Sequence[TrackRow]) -> Evidence | None:

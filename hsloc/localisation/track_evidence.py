@@ -46,6 +46,11 @@ _ASTRAY_REFUSED = 0.05
 """Probability that it went astray where a scan was refused."""
 _ALIKE_REFUSED = 0.002
 """Probability that a right track ended in a look-alike place where a scan was refused: a parallel corridor."""
+_ALIKE_PER_M = 0.0008
+"""Rate at which a track gets into a place that looks the same (1/m): after 110 m without a comparison that leaves all
+other places behind it is no surer than the 0.9 that a localised pose needs."""
+_ALIKE_ENDS = 0.5
+"""Probability that a look-alike of the right place differs from it where a scan is refused."""
 _UNIQUE, NOT_UNIQUE = 0.85, 0.93
 """A rival ratio up to the first is full evidence for the place, from the second on it is none."""
 _RIVALLED, _BEATEN = 1.12, 1.3
@@ -54,6 +59,8 @@ MOST_FROM_RIVAL = 4.0
 """Log of the odds that one comparison changes, at most: 55 to 1."""
 _FULL_M = 3.0
 """Comparisons of a place that was searched for count in full over this path length (m)."""
+_STRAY = 0.05
+"""Share of beams that may end where nothing is mapped at any place: through windows, at the border of the map."""
 _ON_THE_SPOT = 0.5
 """How much they count on the spot: of 120 scans of another building none fitted as usual and had no rival."""
 _GOOD_FIT, _FIT_SCALE = 0.95, 0.03
@@ -89,10 +96,12 @@ def comparison_evidence(evidence: Evidence, usual: float) -> float:
 
     Off the map the best place is unique now and then, but it does not fit (see `_MOST_FROM_POOR`).
     """
-    said = rival_evidence(evidence.rival)
+    return min(rival_evidence(evidence.rival), _most_in_favour(evidence, usual))
+
+
+def _most_in_favour(evidence: Evidence, usual: float) -> float:
     part = (evidence.explained / usual - _POOR_FIT) / (1.0 - _POOR_FIT)
-    most = _MOST_FROM_POOR + (MOST_FROM_RIVAL - _MOST_FROM_POOR) * min(max(part, 0.0), 1.0)
-    return min(said, most)
+    return _MOST_FROM_POOR + (MOST_FROM_RIVAL - _MOST_FROM_POOR) * min(max(part, 0.0), 1.0)
 
 
 def fit_evidence(evidence: Evidence, usual: float) -> float:
@@ -111,8 +120,9 @@ def place_evidence(evidence: Evidence, of_rivals: float, usual: float) -> float:
     nothing is mapped vouch for no place; on the spot one view is repeated.
     """
     metres = min(evidence.distance, _FULL_M)
-    weight = max(metres / _FULL_M, _ON_THE_SPOT) * (1.0 - evidence.unmapped)
+    weight = max(metres / _FULL_M, _ON_THE_SPOT) * min(1.0 + _STRAY - evidence.unmapped, 1.0)
     fit = max(metres, 1.0) * min(fit_evidence(replace(evidence, distance=1.0), usual), 0.0)
+    of_rivals = min(of_rivals, _most_in_favour(evidence, usual))
     return weight * (of_rivals + comparison_evidence(evidence, usual)) + fit
 
 
@@ -132,19 +142,26 @@ class TrackRow:
 
     def moved_on(self, before: States) -> States:
         """Probabilities of the states after the step to this scan, before its evidence."""
-        refused = self.status is Status.REJECTED
-        astray = 1.0 - exp(-_ASTRAY_PER_M * self.evidence.distance) + (_ASTRAY_REFUSED if refused else 0.0)
-        alike = _ALIKE_REFUSED if refused else 0.0
+        alike, astray, ends = self._rates()
         right = before[0] * (1.0 - astray - alike)
-        return right, before[0] * alike + before[1] * (1.0 - astray), before[2] + (before[0] + before[1]) * astray
+        return (
+            right,
+            before[0] * alike + before[1] * (1.0 - ends),
+            before[2] + before[0] * astray + before[1] * ends,
+        )
 
     def looked_back(self, after: States) -> States:
         """Likelihoods of all that follows, from before the step to this scan; the transpose of `moved_on`."""
-        refused = self.status is Status.REJECTED
-        astray = 1.0 - exp(-_ASTRAY_PER_M * self.evidence.distance) + (_ASTRAY_REFUSED if refused else 0.0)
-        alike = _ALIKE_REFUSED if refused else 0.0
+        alike, astray, ends = self._rates()
         right = (1.0 - astray - alike) * after[0] + alike * after[1] + astray * after[2]
-        return right, (1.0 - astray) * after[1] + astray * after[2], after[2]
+        return right, (1.0 - ends) * after[1] + ends * after[2], after[2]
+
+    def _rates(self) -> States:
+        """Probabilities that a right track ends up in a look-alike or astray here, and that a look-alike ends here."""
+        is_refused = self.status is Status.REJECTED
+        alike = 1.0 - exp(-_ALIKE_PER_M * self.evidence.distance) + (_ALIKE_REFUSED if is_refused else 0.0)
+        astray = 1.0 - exp(-_ASTRAY_PER_M * self.evidence.distance)
+        return alike, astray + (_ASTRAY_REFUSED if is_refused else 0.0), astray + (_ALIKE_ENDS if is_refused else 0.0)
 
 
 class TrackFilter:

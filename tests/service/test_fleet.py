@@ -182,6 +182,28 @@ def test_parts_that_nothing_is_made_of_are_swept(servers: list[TestClient]) -> N
     assert b"".join(parts.blocks(file)) == b"one"
 
 
+def test_while_the_store_is_away_uploads_are_put_off_and_nothing_is_lost(
+    servers: list[TestClient], fleet: Fleet
+) -> None:
+    one, other = servers
+    for client in servers:
+        upload(client)
+    headers = {"Tus-Resumable": "1.0.0", "Upload-Length": "9"}
+    place = one.post("/v1/tus", headers=headers).headers["location"]
+    assert one.patch(place, headers={**PATCH, "Upload-Offset": "0"}, content=b"slow").status_code == 204
+    store, away = fleet.folder / "store", fleet.folder / "away"
+    store.rename(away)
+    answer = one.patch(place, headers={**PATCH, "Upload-Offset": "4"}, content=b" 0.1 ")
+    assert (answer.status_code, answer.json()["code"], answer.headers["retry-after"]) == (503, "store", "5")
+    assert not store.exists()
+    assert other.head(place, headers={"Tus-Resumable": "1.0.0"}).headers["upload-offset"] == "4"
+    away.rename(store)
+    assert other.patch(place, headers={**PATCH, "Upload-Offset": "4"}, content=b" 0.1 ").status_code == 204
+    file = one.get(f"/v1/files/{place.rsplit('/', 1)[1]}").json()
+    assert (file["state"], file["sha256"]) == ("complete", hashlib.sha256(b"slow 0.1 ").hexdigest())
+    assert not [path for name in "ab" for path in (fleet.folder / name / "work").iterdir()]
+
+
 def test_copies_of_inputs_are_bounded(servers: list[TestClient], tmp_path: Path) -> None:
     one, _ = servers
     context: Any = one.app.state.context  # type: ignore[attr-defined]

@@ -20,9 +20,9 @@ from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
 from hsloc.localisation.track_monitor import TrackMonitor
 from hsloc.matching.certificate import CertificateParameters, certify
+from hsloc.matching.covariance import match_information
 from hsloc.matching.exact import heuristic
 from hsloc.matching.local_refinement import refine
-from hsloc.matching.observability import match_information
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Evidence, Status
 from hsloc.model.events import HELD, Odometry, PairedScan

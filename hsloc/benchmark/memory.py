@@ -90,7 +90,7 @@ def measure_memory(folder: Path, seconds: float | None = None) -> Memory:
         short = replace(OFFICE, seed=1, duration_s=seconds)
         long = replace(OFFICE, seed=1, duration_s=TIMES * seconds)
     warm_up = folder / "warm-up.mcap"
-    record(replace(short, duration_s=1.0), warm_up)
+    record(replace(short, duration_s=8.0), warm_up)
     run(RunRequest(logs=(warm_up,)))  # a process that has to compile the kernels needs 100 MB for that alone
     one, ten = (_replayed(scenario, folder / f"{name}.mcap") for name, scenario in (("short", short), ("long", long)))
     return Memory(

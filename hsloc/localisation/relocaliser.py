@@ -28,10 +28,11 @@ from hsloc.localisation.hypotheses import (
     fits_better,
     likely_places,
 )
-from hsloc.localisation.motion import fuse, predict_covariance
+from hsloc.localisation.motion import fuse, predict_covariance, update_with_information
 from hsloc.localisation.motion_gate import MotionGate
 from hsloc.localisation.track_evidence import MOST_FROM_RIVAL, USUAL_EXPLAINED, place_evidence, rival_evidence
 from hsloc.localisation.whole_map_search import join_scans
+from hsloc.matching.covariance import match_information
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Evidence, State
@@ -219,12 +220,16 @@ class Relocaliser:
         evaluations = 0
         known = tuple(self._hypotheses)
         count = max((hypothesis.scans for hypothesis in self._hypotheses), default=1)
+        # At the right place the scans before fit as well, unless nothing known fits: the others are no rivals.
+        plausible = 0.0 if self._is_poor() else max((p.max_rival_ratio * h.mean for h in known), default=0.0)
         for pose, covariance, _ in likely_places(self._map_search, self._field, joined, limits):
             if taken.add(pose):
                 hypothesis, more = self._with_record(pose, covariance, count)
                 evaluations += more
                 # A place whose record leads back to a hypothesis is its continuation with the odometry left aside.
                 first, n = hypothesis.trail[0], len(hypothesis.trail)
+                if hypothesis.mean < plausible:
+                    continue
                 if n == 1 or not any(other.was_at(first, n) for other in known):
                     self._hypotheses.append(hypothesis)
         return evaluations
@@ -378,7 +383,11 @@ class Relocaliser:
             match = self._matcher.match(points, self._field, Window(pose, *_STEP_WINDOW), self._rng)
             misses += 1
             if match.fitness >= fits:
-                pose, covariance = fuse(pose, covariance, match.pose, match.covariance)
+                information = match_information(points, self._field, match.pose)
+                if information is None:
+                    pose, covariance = fuse(pose, covariance, match.pose, match.covariance)
+                else:
+                    pose, covariance = update_with_information(pose, covariance, match.pose, information)
                 misses = 0
             traced.append((count, pose, paired, match.fitness))
             if misses == _TRACE_LOST or len(traced) == most:

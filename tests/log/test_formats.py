@@ -242,7 +242,10 @@ def test_a_log_with_a_localisers_transforms_offers_them_as_reference(
     assert main(["replay", str(source), "--out", str(first), "-q"]) == 0
     again = ["replay", str(first / "run.mcap"), "--initial-pose=2.6,8.1,1.5707963", "--out", str(second)]
     assert main(again) == 0
-    assert "the log has poses to compare with: --truth-topic /pose or tf" in capsys.readouterr().err
+    assert (
+        "the log has poses to compare with: --truth-topic /pose or /pose_with_covariance or tf"
+        in capsys.readouterr().err
+    )
     assert not (second / "reference.tum").exists()
     assert main([*again, "--overwrite", "--truth-topic", "tf", "--json"]) == 0
     metrics = json.loads(capsys.readouterr().out)

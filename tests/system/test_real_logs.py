@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.data
 
 
-@pytest.mark.parametrize("name", ["robotdata1", "robotdata3"])
-def test_wean_hall_from_an_unknown_start(data: Path, name: Any) -> None:
+@pytest.mark.parametrize(("name", "seed"), [("robotdata1", 0), ("robotdata1", 2), ("robotdata1", 3), ("robotdata3", 0)])
+def test_wean_hall_from_an_unknown_start(data: Path, name: Any, seed: int) -> None:
     folder = data / "wean"
-    found = run(RunRequest(logs=(folder / f"{name}.log.gz",), map_path=folder / "wean.yaml"))
+    found = run(RunRequest(logs=(folder / f"{name}.log.gz",), map_path=folder / "wean.yaml", seed=seed))
     reference = np.loadtxt(folder / f"{name}.pf.ref.txt")
     poses = found.trajectory.interpolated(np.round(reference[:, 0] * 1e9).astype(np.int64))
     metres = np.hypot(poses[:, 0] - reference[:, 1], poses[:, 1] - reference[:, 2])

@@ -16,9 +16,9 @@ from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import ConfigError
-from hsloc.log.yaml_table import load_table
 from hsloc.model import Pose2, wrap_angle
 from hsloc.model.calibration import Calibration, LidarCalibration, OdometryCorrection
+from hsloc.yaml_table import load_table
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import MapError
 from hsloc.model import Pose2
+from hsloc.yaml_table import load_table
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 MODES = ("trinary", "scale", "raw")
-MAX_YAML_BYTES = 64 << 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,31 +64,8 @@ def _image(path: Path, image: str) -> Path:
 
 
 def load_yaml(path: Path) -> dict[str, Any]:
-    """The keys of map.yaml. Raises MapError for what is no YAML of a map.
-
-    Aliases are refused: no writer of maps makes them, and nested ones expand half a kilobyte to gigabytes.
-    """
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-    from ruamel.yaml.events import AliasEvent
-
-    try:
-        if path.stat().st_size > MAX_YAML_BYTES:
-            raise MapError(f"{path}: is too large for a map's YAML; name the .yaml file, not the image")
-        text = path.read_bytes().decode()
-        if any(isinstance(event, AliasEvent) for event in YAML(typ="safe", pure=True).parse(text)):
-            raise MapError(f"{path}: has a YAML alias (*name), which no map needs; write the value in its place")
-        values = YAML(typ="safe", pure=True).load(text)
-    except FileNotFoundError as error:
-        raise MapError(f"{path}: no such map") from error
-    except OSError as error:
-        raise MapError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (YAMLError, UnicodeDecodeError, ValueError, RecursionError, AttributeError) as error:
-        reason = (str(error).splitlines() or [""])[0]
-        raise MapError(f"{path}: is not YAML ({reason}); name the map's .yaml file") from error
-    if not isinstance(values, dict):
-        raise MapError(f"{path}: is not the YAML of a map: it holds no keys such as image and resolution")
-    return values
+    """The keys of map.yaml. Raises MapError for what is no YAML of a map."""
+    return load_table(path, "map", "; name the map's .yaml file, which has keys such as image", kind=MapError)
 
 
 def _value(path: Path, values: dict[str, Any], key: str) -> Any:

@@ -202,7 +202,7 @@ def test_what_is_no_map_at_all(tmp_path: Path) -> None:
     with pytest.raises(MapError, match="is a folder"):
         load_map(tmp_path)
     (tmp_path / "list.yaml").write_text("- 1\n")
-    with pytest.raises(MapError, match="not the YAML of a map"):
+    with pytest.raises(MapError, match="is not a map: it holds no keys"):
         load_map(tmp_path / "list.yaml")
     (tmp_path / "run.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(100))
     with pytest.raises(MapError, match="is not YAML"):

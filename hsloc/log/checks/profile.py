@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import ConfigError
 from hsloc.log.messages.definitions import long_name
-from hsloc.log.yaml_table import load_table
+from hsloc.yaml_table import load_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

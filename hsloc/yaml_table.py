@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from hsloc.errors import ConfigError
+from hsloc.errors import ConfigError, HslocError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 _MAX_BYTES = 64 << 10
 
 
-def load_table(path: Path, what: str, remedy: str = "") -> dict[str, Any]:
-    """The keys of a YAML file. Raises ConfigError that names the file, for what is no table.
+def load_table(path: Path, what: str, remedy: str = "", *, kind: type[HslocError] = ConfigError) -> dict[str, Any]:
+    """The keys of a YAML file. Raises `kind`, which names the file, for what is no table.
 
     Aliases are refused: nested ones expand half a kilobyte to gigabytes.
     """
@@ -23,16 +23,18 @@ def load_table(path: Path, what: str, remedy: str = "") -> dict[str, Any]:
 
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise ConfigError(f"{path}: is too large for a {what}{remedy}")
+            raise kind(f"{path}: is too large for a {what}{remedy}")
         text = path.read_bytes().decode()
         if any(isinstance(event, AliasEvent) for event in YAML(typ="safe", pure=True).parse(text)):
-            raise ConfigError(f"{path}: has a YAML alias (*name); write the value in its place")
+            raise kind(f"{path}: has a YAML alias (*name); write the value in its place")
         values = YAML(typ="safe", pure=True).load(text)
+    except FileNotFoundError as error:
+        raise kind(f"{path}: no such {what}{remedy}") from error
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror or error}){remedy}") from error
+        raise kind(f"{path}: cannot be read ({error.strerror or error}){remedy}") from error
     except (YAMLError, ValueError, RecursionError, AttributeError) as error:
         reason = (str(error).splitlines() or [""])[0]
-        raise ConfigError(f"{path}: is not YAML ({reason}){remedy}") from error
+        raise kind(f"{path}: is not YAML ({reason}){remedy}") from error
     if not isinstance(values, dict):
-        raise ConfigError(f"{path}: is not a {what}{remedy}")
+        raise kind(f"{path}: is not a {what}: it holds no keys{remedy}")
     return values

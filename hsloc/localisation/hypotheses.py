@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import floor, log, radians
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.localisation.whole_map_search import Places, WholeMapParameters, WholeMapSearch
-from hsloc.matching.harmony_search import low_discrepancy_order
+from hsloc.matching.harmony_search import HarmonySearch, low_discrepancy_order
 from hsloc.matching.local_refinement import refine
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2, wrap_angle, wrap_angles
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.matching.likelihood_field import LikelihoodField
-    from hsloc.matching.match import Match
+    from hsloc.matching.match import Match, Matcher
     from hsloc.model.occupancy_grid import OccupancyGrid
 
     F64 = NDArray[np.float64]
@@ -146,6 +146,20 @@ class DistinctPoses:
 
 def _same(first: Pose2, second: Pose2) -> bool:
     return first.distance(second) < _NEAR and abs(wrap_angle(first.theta - second.theta)) < _NEAR_ANGLE
+
+
+def quick_matcher(matcher: Matcher, budget: int, points: int) -> Matcher:
+    """The matcher with a small budget and one restart; a matcher without a budget stays as it is."""
+    if not isinstance(matcher, HarmonySearch):
+        return matcher
+    return replace(
+        matcher,
+        budget=budget,
+        count_improvisations=False,
+        restarts=1,
+        search_points=points,
+        polish_iterations=10,
+    )
 
 
 def bounded_search(grid: OccupancyGrid, field: LikelihoodField) -> WholeMapSearch:

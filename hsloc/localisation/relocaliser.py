@@ -11,7 +11,7 @@ trajectory can be completed.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from math import hypot, radians
 from typing import TYPE_CHECKING
@@ -27,13 +27,13 @@ from hsloc.localisation.hypotheses import (
     bounded_search,
     fits_better,
     likely_places,
+    quick_matcher,
 )
 from hsloc.localisation.motion import fuse, predict_covariance, update_with_information
 from hsloc.localisation.motion_gate import MotionGate
 from hsloc.localisation.track_evidence import MOST_FROM_RIVAL, USUAL_EXPLAINED, place_evidence, rival_evidence
 from hsloc.localisation.whole_map_search import join_scans
 from hsloc.matching.covariance import match_information
-from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Evidence, State
 from hsloc.model.pose2 import Pose2
@@ -145,7 +145,7 @@ class Relocaliser:
         self._usual = USUAL_EXPLAINED
         self._field = likelihood
         self._matcher = matcher
-        self._quick = _quick(matcher, parameters)
+        self._quick = quick_matcher(matcher, parameters.budget, parameters.search_points)
         self._parameters = parameters
         self._motion_model = motion_model
         self._gate = MotionGate(parameters.step_min_d, parameters.step_min_a)
@@ -393,17 +393,3 @@ class Relocaliser:
             if misses == _TRACE_LOST or len(traced) == most:
                 break
         return traced
-
-
-def _quick(matcher: Matcher, parameters: RelocaliserParameters) -> Matcher:
-    """The matcher with a small budget and one restart; a matcher without a budget stays as it is."""
-    if not isinstance(matcher, HarmonySearch):
-        return matcher
-    return replace(
-        matcher,
-        budget=parameters.budget,
-        count_improvisations=False,
-        restarts=1,
-        search_points=parameters.search_points,
-        polish_iterations=10,
-    )

@@ -120,7 +120,7 @@ def _lost_and_found(metrics: RunMetrics) -> str:
     found = metrics.scans.by_status.get(Status.RELOCALISED, 0)
     again = ", and found again" if found >= len(spans) else ""
     total = format_duration(sum(end - begin for begin, end in spans))
-    return f"; the pose was lost {_count(len(spans), 'time')}, for {total} in all{again}"
+    return f"; the pose was lost {'once' if len(spans) == 1 else f'{len(spans)} times'}, for {total} in all{again}"
 
 
 def _count(number: int, noun: str) -> str:

@@ -1,0 +1,125 @@
+"""The page's form, its table of jobs and its uploads, in a real browser; see test_page.py."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from live_service import submit, wait
+from paths import RECORDINGS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from live_service import Live
+
+
+def test_the_form_offers_what_the_server_does(make_live: Callable[..., Live], open_page: Callable[..., Any]) -> None:
+    live = make_live()
+    page = open_page(live.url)
+    page.wait_for_selector("[data-option=seed]", state="attached")
+    with live.client() as client:
+        offered = {each["name"] for each in client.get("/v1/options", timeout=60.0).json()["run"]}
+    built = set(page.evaluate("() => [...document.querySelectorAll('[data-option]')].map((e) => e.dataset.option)"))
+    assert built == offered - {"relations", "reference", "calibration", "resume"}
+    page.click("summary >> text=Map and options")
+    for group in ("reading the log", "algorithms"):
+        page.click(f"summary >> text={group}")
+    page.fill("[data-option=initial_pose]", "-1, 2, 0.5")
+    page.fill("[data-option='read.start_s']", "1.5")
+    page.fill("[data-option=seed]", "7")
+    page.select_option("[data-option=matcher]", "icp")
+    page.fill("[data-option=config]", '{"icp": {"iterations": 9}}')
+    page.set_input_files("#log", str(RECORDINGS / "slip.mcap"))
+    page.click("#go")
+    page.wait_for_selector("#job-state .state")
+    with live.client() as client:
+        (job,) = client.get("/v1/jobs").json()["jobs"]
+    request = job["request"]
+    assert (request["initial_pose"], request["read"]["start_s"], request["seed"]) == ([-1.0, 2.0, 0.5], 1.5, 7)
+    assert (request["matcher"], request["config"]) == ("icp", {"icp": {"iterations": 9}})
+
+
+def test_several_logs_are_several_jobs_or_one_and_the_table_finds_them(
+    make_live: Callable[..., Live], open_page: Callable[..., Any], tmp_path: Path
+) -> None:
+    live = make_live()
+    logs = [tmp_path / f"{name}.log" for name in ("alpha", "beta", "gamma")]
+    for log in logs:
+        log.write_bytes(b"ok")
+    page = open_page(live.url)
+    page.set_input_files("#log", [str(log) for log in logs])
+    page.click("#go")
+    page.wait_for_function("() => document.querySelectorAll('#jobs [data-state=succeeded]').length === 3")
+    page.check("input[value=parts]")
+    page.click("#go")
+    page.wait_for_selector("#job-state .state")
+    with live.client() as client:
+        jobs = client.get("/v1/jobs").json()["jobs"]
+    assert [len(job["request"].get("logs") or ()) for job in jobs] == [3, 0, 0, 0]
+    page.go_back()
+    page.fill("#search", "BET")
+    page.wait_for_function("() => document.querySelectorAll('#jobs tbody tr').length === 2")
+    assert page.locator("#jobs tbody .name").last.text_content() == "beta.log"  # and the run of three parts
+    page.fill("#search", "")
+    page.select_option("#order", "name")
+    page.wait_for_function("() => document.querySelector('#jobs tbody .name').textContent.startsWith('alpha')")
+    page.select_option("#filter", "state=failed")
+    page.wait_for_function("() => document.querySelector('#page-text').textContent === 'no such job'")
+    page.click("nav >> text=Uploads")
+    page.wait_for_function("() => document.querySelectorAll('#file-table tbody tr').length === 3")
+    page.click("#file-table button >> nth=0")  # used again, without an upload
+    page.wait_for_function("() => document.querySelector('#stored').value !== ''")
+    page.set_input_files("#log", [])
+    page.click("#go")
+    page.wait_for_selector("#job-state .state")
+    with live.client() as client:
+        assert len(client.get("/v1/jobs").json()["jobs"]) == 5
+        assert len(client.get("/v1/files").json()["files"]) == 3
+
+
+def test_a_page_goes_on_when_the_server_was_restarted(make_live: Callable[..., Live], browser: Any) -> None:
+    live = make_live()
+    with live.client() as client:
+        job = submit(client, b"slow 4")
+    context = browser.new_context()
+    page = context.new_page()  # refused connections are in the console, as they should be
+    page.goto(f"{live.url}/#job={job}")
+    page.wait_for_selector("#job-state .running")
+    assert live.end() == 0  # the stream ends in good order, and the job does not
+    page.wait_for_timeout(1000)
+    live.start()
+    page.wait_for_selector("#job-state .succeeded", timeout=30_000)
+    context.close()
+
+
+def test_an_idle_page_pulls_almost_nothing(make_live: Callable[..., Live], open_page: Callable[..., Any]) -> None:
+    live = make_live()
+    with live.client() as client:
+        for seed in range(30):
+            submit(client, seed=seed, config={"hide": {"budget": 250 + seed}})
+        for job in client.get("/v1/jobs").json()["jobs"]:
+            wait(client, job["id"])
+    page = open_page(live.url)
+    page.wait_for_function("() => document.querySelectorAll('#jobs [data-state=succeeded]').length === 30")
+    page.wait_for_timeout(3500)
+    answers: list[Any] = []
+    page.on("response", lambda answer: answers.append(answer))
+    page.wait_for_timeout(7000)
+    assert len(answers) >= 2
+    assert {answer.status for answer in answers} == {304}
+
+
+SPARSE = """() => {
+  const root = document.createElement("div"); root.className = "rv rv-charts"; document.body.append(root);
+  const t = [...Array(50).keys()], fill = (v) => t.map((k) => k % 10 ? null : v);
+  const seen = (v) => { root.replaceChildren(); const chart = { title: "a", unit: "m",
+      explanation: "", t, v, time: true, log: false, top: null };
+    ResultCharts(root, { end: 50, charts: [chart], status: [], lost: [] }, () => {}).draw();
+    return root.querySelector("canvas").toDataURL(); };
+  return seen(fill(0.5)) !== seen(fill(0.5).map((v, k) => k === 20 ? null : v)); }"""
+
+
+def test_a_curve_of_single_values_is_visible(make_live: Callable[..., Live], open_page: Callable[..., Any]) -> None:
+    page = open_page(make_live().url)
+    assert page.evaluate(SPARSE)

@@ -2,9 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Processes that run the tests, one more than there are cores: those of the service wait most of their time. A file's
-# tests stay in one process, so that its fixtures are made once.
-JOBS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
+# Processes that run the tests; a file's tests stay in one of them, so that its fixtures are made once.
+JOBS ?= auto
 PYTEST := $(BIN)/pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test lint docs clean

@@ -58,6 +58,7 @@ def run_line(line: str, capsys: pytest.CaptureFixture[str]) -> int:
     return status
 
 
+@pytest.mark.no_cover  # what they run has tests of its own; tracing it takes half as long again
 @pytest.mark.parametrize("path", [path for path in GUIDES if commands(path)], ids=lambda path: path.name)
 def test_every_command_of_a_guide_does_what_it_says(path: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for line in commands(path):
@@ -68,6 +69,7 @@ def test_every_command_of_a_guide_does_what_it_says(path: Path, here: Path, caps
         assert "Traceback" not in printed.err
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("path", [path for path in GUIDES if blocks(path, "python")], ids=lambda path: path.name)
 def test_the_examples_run_from_top_to_bottom(path: Path, here: Path) -> None:
     names: dict[str, object] = {"__name__": "example"}

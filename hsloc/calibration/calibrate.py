@@ -27,7 +27,6 @@ _MOST_PASSES = 6
 """Passes over a log; each one deskews by the estimate of the one before."""
 _SETTLED = 0.25
 """Change of each value in standard deviations with which the passes end. Internal: it is then lost in the noise."""
-
 _WORSE = 1.2
 """Ratio of what is left of the steps, from which on a pass made it worse. Internal: beyond its variation by chance."""
 
@@ -86,7 +85,7 @@ def calibrate(
     offset_s = 0.0
     for number in range(1, _MOST_PASSES + 1):
 
-        def tell(stamp_ns: int, number: int = number) -> None:
+        def report(stamp_ns: int, number: int = number) -> None:
             if progress is not None:
                 progress(number, min(max((stamp_ns - begin) / span, 0.0), 1.0))
 
@@ -95,7 +94,7 @@ def calibrate(
             items.append(f"{topic}={offset_s!r}")
         log = open_log(paths, replace(reading, time_offset=",".join(items) or None))
         try:
-            seen = tracks(log.events(), parameters, found, tell)
+            seen = tracks(log.events(), parameters, found, report)
             now = estimate(seen.laser, seen.odometry, nominal)
         except Undetermined as error:
             raise LogError(f"{paths[0]}: nothing can be calibrated: {error}") from None

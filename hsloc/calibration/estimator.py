@@ -69,10 +69,8 @@ class Track:
     @staticmethod
     def of(stamps_ns: I64, poses: F64) -> Track:
         """Sorted by time, and of each stamp the first."""
-        order = np.argsort(stamps_ns, kind="stable")
-        stamps, first = np.unique(stamps_ns[order], return_index=True)
-        sorted_poses = poses[order][first]
-        return Track(stamps, np.column_stack((sorted_poses[:, :2], np.unwrap(sorted_poses[:, 2]))))
+        stamps, first = np.unique(stamps_ns, return_index=True)
+        return Track(stamps, np.column_stack((poses[first, :2], np.unwrap(poses[first, 2]))))
 
     def headings(self) -> Headings:
         """Its headings alone."""

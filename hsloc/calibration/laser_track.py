@@ -14,6 +14,7 @@ from hsloc.model.pose2 import IDENTITY
 from hsloc.preprocessing.odometry_resets import ContinuousOdometry
 from hsloc.replay.engine import pair
 from hsloc.slam.mapper import Mapper
+from hsloc.slam.time_offset import half_sweep_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
     from hsloc.calibration.estimator import Estimate
     from hsloc.model.events import Event
     from hsloc.slam.parameters import GraphMapperParameters
-
-_LONGEST_HALF_S = 0.5
-"""Half of a sweep that is longer (s) is an error of time_increment, not a lidar that turns so slowly."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +55,7 @@ def tracks(
     for event in _paired(_noted(events, odometry), known):
         scan = event.scan
         is_swept |= scan.time_increment != 0.0
-        middles[scan.stamp_ns] = scan.stamp_ns + (0 if scan.T_base_beam is not None else _half_sweep_ns(scan))
+        middles[scan.stamp_ns] = scan.stamp_ns + (0 if scan.T_base_beam is not None else half_sweep_ns(scan))
         mapper.update(event)
         if progress is not None:
             progress(scan.stamp_ns)
@@ -72,12 +70,6 @@ def tracks(
         Track.of(np.array([row[0] for row in odometry], dtype=np.int64), np.array([row[1:] for row in odometry])),
         is_swept,
     )
-
-
-def _half_sweep_ns(scan: Scan) -> int:
-    """From the first beam to the middle of a scan (ns)."""
-    half = 0.5 * max(len(scan.ranges) - 1, 0) * scan.time_increment
-    return round(half * 1e9) if abs(half) <= _LONGEST_HALF_S else 0
 
 
 def _noted(events: Iterable[Event], odometry: list[tuple[int, float, float, float]]) -> Iterator[Event]:

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from hsloc.model.occupancy_grid import UNKNOWN, OccupancyGrid
-from hsloc.model.pose2 import Pose2
+from hsloc.model.pose2 import IDENTITY
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from hsloc.model.pose2 import Pose2
 
     Bools = NDArray[np.bool_]
 
@@ -57,7 +59,7 @@ def map_changes(
     """
     from scipy.ndimage import distance_transform_edt
 
-    pose = T_first_second or Pose2(0.0, 0.0, 0.0)
+    pose = T_first_second or IDENTITY
     seen = _resampled(first, second, pose)
     now = _cells_of(first, pose @ second.centres(second.occupied()))
     before = first.occupied()
@@ -117,15 +119,17 @@ def _things(
         mask, np.ones((3, 3), dtype=np.bool_), iterations=max(round(0.5 * _JOINED_M / grid.resolution), 1)
     )
     labels, count = label(around, np.ones((3, 3), dtype=np.bool_))
+    centres, numbers = grid.centres(mask), labels[mask]
+    large = []
     things = []
     for k in range(1, count + 1):
-        cells = mask & (labels == k)
-        points = grid.centres(cells)
+        points = centres[numbers == k]
         low, high = points.min(axis=0), points.max(axis=0)
         size = float((high - low).max()) + grid.resolution
         if size < min_size:
             continue
-        kept |= cells
+        large.append(k)
         x, y = (float(value) for value in 0.5 * (low + high))
         things.append(MapChange(kind=kind, x=x, y=y, size=size, cells=len(points)))
+    kept[mask] = np.isin(numbers, large)
     return things, kept

@@ -167,10 +167,8 @@ def bounded_search(grid: OccupancyGrid, field: LikelihoodField) -> WholeMapSearc
     return WholeMapSearch(grid, field, WholeMapParameters(max_candidates=_CANDIDATES))
 
 
-def likely_places(
-    search: WholeMapSearch, field: LikelihoodField, points: F64, limits: CandidateLimits
-) -> list[tuple[Pose2, F64, float]]:
-    """Pose, covariance (3, 3) and fitness of places of the whole map where points (n, 2) fit, the fittest first.
+def likely_places(search: WholeMapSearch, field: LikelihoodField, points: F64, limits: CandidateLimits) -> list[Pose2]:
+    """Places of the whole map where points (n, 2) fit, the fittest first.
 
     All that fit within `limits.margin` of the best are among them as far as the work and the number allow.
     """
@@ -182,7 +180,7 @@ def likely_places(
     matches = [refine(even[: limits.refined_points], field, _around(field.from_cells(found.poses[k]))) for k in best]
     taken = DistinctPoses()
     distinct = [
-        (match.pose, match.covariance, match.fitness)
+        match.pose
         for match in sorted(matches, key=lambda match: -match.fitness)
         if match.fitness >= limits.min_fitness and taken.add(match.pose)
     ]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from hsloc.localisation.match_gate import MatchGate, MatchLimits
-from hsloc.localisation.motion import fuse, normalised_innovation, predict_covariance, update_with_information
+from hsloc.localisation.motion import fuse_match, normalised_innovation, predict_covariance
 from hsloc.localisation.motion_gate import MotionGate
 from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, OdometryNoise, OmnidirectionalNoise
 from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
@@ -232,11 +232,10 @@ class Localiser:
         if reason:
             return self._refuse(paired, predicted, covariance, match, evaluations, reason)
         information = match_information(points, self._field, match.pose)
-        if p.fuse and information is None:
-            pose, covariance = fuse(predicted, covariance, match.pose, match.covariance)
-        elif p.fuse and information is not None:
-            self._weigh_innovation(predicted, covariance, match.pose, information)
-            pose, covariance = update_with_information(predicted, covariance, match.pose, information)
+        if p.fuse:
+            if information is not None:
+                self._weigh_innovation(predicted, covariance, match.pose, information)
+            pose, covariance = fuse_match(predicted, covariance, match, information)
         else:
             pose, covariance = match.pose, match.covariance
         self._match_gate.accept(match.fitness)

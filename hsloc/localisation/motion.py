@@ -13,17 +13,25 @@ from hsloc.model.pose2 import Pose2, wrap_angle
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hsloc.matching.match import Match
+
     F64 = NDArray[np.float64]
 
 __all__ = ["OdometryNoise", "fuse", "predict_covariance"]
 
 
+def transition(pose: Pose2, motion: Pose2) -> F64:
+    """`F` (3, 3) of the prediction: how an error of `pose` in the map frame moves `pose @ motion`."""
+    c, s = cos(pose.theta), sin(pose.theta)
+    return np.array(
+        ((1.0, 0.0, -s * motion.x - c * motion.y), (0.0, 1.0, c * motion.x - s * motion.y), (0.0, 0.0, 1.0)),
+    )
+
+
 def predict_covariance(covariance: F64, pose: Pose2, motion: Pose2, motion_covariance: F64) -> F64:
     """Covariance of `pose @ motion` in the map frame: `F P F^T + V M V^T`, all (3, 3)."""
     c, s = cos(pose.theta), sin(pose.theta)
-    f = np.array(
-        ((1.0, 0.0, -s * motion.x - c * motion.y), (0.0, 1.0, c * motion.x - s * motion.y), (0.0, 0.0, 1.0)),
-    )
+    f = transition(pose, motion)
     v = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
     result: F64 = f @ covariance @ f.T + v @ motion_covariance @ v.T
     return result
@@ -53,6 +61,13 @@ def update_with_information(prediction: Pose2, covariance: F64, measured: Pose2,
     updated = 0.5 * (updated + updated.T)
     pose = Pose2.from_array(prediction.to_array() + updated @ information @ difference(measured, prediction))
     return pose, updated
+
+
+def fuse_match(prediction: Pose2, covariance: F64, match: Match, information: F64 | None) -> tuple[Pose2, F64]:
+    """The EKF's update with a match: by the information of its walls, or by its covariance where that is not known."""
+    if information is None:
+        return fuse(prediction, covariance, match.pose, match.covariance)
+    return update_with_information(prediction, covariance, match.pose, information)
 
 
 def normalised_innovation(prediction: Pose2, covariance: F64, measured: Pose2, information: F64) -> tuple[float, float]:

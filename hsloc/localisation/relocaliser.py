@@ -29,7 +29,7 @@ from hsloc.localisation.hypotheses import (
     likely_places,
     quick_matcher,
 )
-from hsloc.localisation.motion import fuse, predict_covariance, update_with_information
+from hsloc.localisation.motion import fuse_match, predict_covariance
 from hsloc.localisation.motion_gate import MotionGate
 from hsloc.localisation.track_evidence import MOST_FROM_RIVAL, USUAL_EXPLAINED, place_evidence, rival_evidence
 from hsloc.localisation.whole_map_search import join_scans
@@ -222,23 +222,23 @@ class Relocaliser:
         count = max((hypothesis.scans for hypothesis in self._hypotheses), default=1)
         # At the right place the scans before fit as well, unless nothing known fits: the others are no rivals.
         plausible = 0.0 if self._is_poor() else max((p.max_rival_ratio * h.mean for h in known), default=0.0)
-        for pose, covariance, _ in likely_places(self._map_search, self._field, joined, limits):
+        for pose in likely_places(self._map_search, self._field, joined, limits):
             if taken.add(pose):
-                hypothesis, more = self._with_record(pose, covariance, count)
+                hypothesis, more = self._with_record(pose, count)
                 evaluations += more
-                # A place whose record leads back to a hypothesis is its continuation with the odometry left aside.
-                first, n = hypothesis.trail[0], len(hypothesis.trail)
                 if hypothesis.mean < plausible:
                     continue
+                # A place whose record leads back to a hypothesis is its continuation with the odometry left aside.
+                first, n = hypothesis.trail[0], len(hypothesis.trail)
                 if n == 1 or not any(other.was_at(first, n) for other in known):
                     self._hypotheses.append(hypothesis)
         return evaluations
 
-    def _with_record(self, pose: Pose2, covariance: F64, count: int) -> tuple[Hypothesis, int]:
+    def _with_record(self, pose: Pose2, count: int) -> tuple[Hypothesis, int]:
         """A hypothesis for the last scan that is matched backwards in up to `count` remembered scans."""
         history: list[float] = []
         trail: deque[Pose2] = deque(maxlen=RECORDED)
-        at = pose
+        at, covariance = pose, np.empty((3, 3))
         evaluations = 0
         # Where no hypothesis fits, the robot may have been off the map before.
         seen = list(self._seen)[-min(count, _JOINED if self._is_poor() else RECORDED) :]
@@ -247,8 +247,9 @@ class Relocaliser:
             match = self._quick.match(points, self._field, Window(at, *_STEP_WINDOW), self._rng)
             evaluations += match.evaluations
             history.append(match.fitness)
+            if not trail:
+                covariance = match.covariance
             trail.appendleft(match.pose)
-            covariance = match.covariance if len(trail) == 1 else covariance
             at = match.pose @ paired.to(seen[max(k - 1, 0)][2])
         history.reverse()
         total = float(np.mean(history)) * count
@@ -384,10 +385,7 @@ class Relocaliser:
             misses += 1
             if match.fitness >= fits:
                 information = match_information(points, self._field, match.pose)
-                if information is None:
-                    pose, covariance = fuse(pose, covariance, match.pose, match.covariance)
-                else:
-                    pose, covariance = update_with_information(pose, covariance, match.pose, information)
+                pose, covariance = fuse_match(pose, covariance, match, information)
                 misses = 0
             traced.append((count, pose, paired, match.fitness))
             if misses == _TRACE_LOST or len(traced) == most:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.motion import difference, predict_covariance
+from hsloc.localisation.motion import difference, predict_covariance, transition
 from hsloc.model.pose2 import Pose2, compose_poses, wrap_angles
 
 if TYPE_CHECKING:
@@ -62,11 +62,7 @@ def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> F64:
         weighted = np.linalg.solve(variance, off)
         if off @ weighted > _MAX_SQUARED:
             continue
-        # F of the prediction: how an error of the pose here moves the one there.
-        transition = np.eye(3)
-        transition[0, 2] = here.T_map_base.y - predicted.y
-        transition[1, 2] = predicted.x - here.T_map_base.x
-        poses[k] += here.covariance @ transition.T @ weighted
+        poses[k] += here.covariance @ transition(here.T_map_base, motion).T @ weighted
         poses[k, 2] = wrap_angles(poses[k, 2:])[0]
     return poses
 

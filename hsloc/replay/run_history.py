@@ -94,7 +94,7 @@ class RunHistory:
     def _anchor(self, paired: PairedScan, estimate: Estimate) -> None:
         if estimate.status is Status.SEARCHING:
             self._track_ended = True
-        is_match = estimate.status in (Status.MATCHED, Status.RELOCALISED) and estimate.covariance is not None
+        is_match = estimate.status in (Status.MATCHED, Status.RELOCALISED)
         if self._motion_model is not None and is_match and estimate.covariance is not None:
             begins = self._track_ended or estimate.status is Status.RELOCALISED
             self._anchors.append(

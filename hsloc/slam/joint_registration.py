@@ -87,7 +87,8 @@ class Registration:
     @property
     def rms(self) -> float:
         """Root mean square distance of points to the walls of other scans, robustly weighted (m)."""
-        return _rms(self.counts)
+        weights = self.counts[:, 4].sum()
+        return float(np.sqrt(self.counts[:, 3].sum() / weights)) if weights > 0.0 else float("nan")
 
     @property
     def conflict(self) -> float:
@@ -135,11 +136,6 @@ def normal_equations(poses: F64, pairs: I64, terms: PairTerms, weight: float, ed
     add_edges(poses, edges.pairs, edges.measured, edges.information, edges.scale, of_edges)
     add_pairs(poses, pairs, terms, weight, Equations(diagonal, off_diagonal[: len(pairs)], right))
     return diagonal, off_diagonal, right
-
-
-def _rms(counts: F64) -> float:
-    weights = counts[:, 4].sum()
-    return float(np.sqrt(counts[:, 3].sum() / weights)) if weights > 0.0 else float("nan")
 
 
 def moved_scans(step: F64) -> float:

@@ -178,7 +178,7 @@ def estimate_offset(
                 count += 1
                 if count <= most_scans:
                     last_ns = event.stamp_ns
-                    middles[event.stamp_ns] = event.stamp_ns + _half_sweep_ns(event)
+                    middles[event.stamp_ns] = event.stamp_ns + half_sweep_ns(event)
                     yield event
 
     matched = with_laser_odometry(kept(), parameters, rng)
@@ -197,7 +197,7 @@ def estimate_offset(
     return whole
 
 
-def _half_sweep_ns(scan: Scan) -> int:
+def half_sweep_ns(scan: Scan) -> int:
     """From the first beam to the middle of a scan: a lidar that turns shows the heading of then (ns)."""
     half = 0.5 * max(len(scan.ranges) - 1, 0) * scan.time_increment
     return round(half * NANOSECONDS) if abs(half) <= _LONGEST_HALF_S else 0

@@ -54,7 +54,7 @@ def as_json(found: LogCalibration) -> dict[str, Any]:
 
 
 def as_yaml(found: LogCalibration) -> str:
-    """The file that `hsloc.log.read_calibration` reads; what is not determined stands in comments."""
+    """The file that `hsloc.log.read_calibration` reads; what is not determined is in comments."""
     estimate, values = found.estimate, _values(found)
     half = estimate.quantile * estimate.sigmas
     source = ", ".join(path.name for path in found.summary.paths)

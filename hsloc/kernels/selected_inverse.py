@@ -54,7 +54,7 @@ def selected_inverse(start: I64, rows: I64, factor: F64, pivots: F64, lower: F64
 @njit(cache=True, nogil=True)
 def diagonal_blocks(start: I64, rows: I64, lower: F64, diagonal: F64, order: I64, blocks: F64) -> None:
     """Write the 3 x 3 blocks on the diagonal of the inverse to `blocks` (m, 3, 3); `order` (3 m,) is where each
-    row of the matrix stands in that which was factorised."""
+    row of the matrix is in the factorised one."""
     for k in range(len(blocks)):
         for a in range(3):
             blocks[k, a, a] = diagonal[order[3 * k + a]]

@@ -102,7 +102,7 @@ _STEP_WINDOW = (0.25, 0.25, radians(8.0))
 _REFINE_POINTS = 120
 """Points with which a place is refined before its record is made."""
 _OF_SEVERAL = 0.5
-"""Part of the margin where several scans are joined: they tell places apart better than one."""
+"""Part of the margin where several scans are joined: they distinguish places better than one."""
 _JOINED = 6
 """Scans that are joined for a later search: about two metres, over which odometry is good to some centimetres."""
 _NEW_MARGIN = 0.05
@@ -112,7 +112,7 @@ _FITS = 0.8
 _WEIGHED = 12
 """Scans that the winner is weighed by, at most."""
 _WEIGHED_AGAIN = 4
-"""It is weighed again after so many scans, at most: on a large map that takes a second."""
+"""It is weighed again after at most this number of scans: on a large map that takes a second."""
 _OFF_MAP = 0.87
 """Explained fitness by the usual one below which the best place does not fit."""
 _TRACE_LOST = 3

@@ -28,7 +28,7 @@ _CORRELATED_POINTS = 15.0
 scan is in several pairs. Of 100 simulated drives, with noise of 1 to 3 cm in five worlds, the mean normalised squared
 error is 2.7 with it, where 3 is expected."""
 _NOISES = np.geomspace(0.003, 0.1, 60)
-"""Standard deviations (m) of points that are told apart: from a good lidar's on a flat wall to that of rubble."""
+"""Standard deviations (m) of points that are distinguished: from a good lidar's on a flat wall to that of rubble."""
 _SAMPLES = 300
 """Distances at which the density is summed up. Internal: enough for three digits."""
 _UNOBSERVED = 1e-6

@@ -68,9 +68,6 @@ def run(arguments: argparse.Namespace) -> int:
         return EXIT_OK
     if job["state"] != "succeeded":
         return EXIT_FAILED
-    if not arguments.quiet:
-        for warning in job["summary"].get("warnings", ()):
-            print(f"hsloc: warning: {'; '.join(filter(None, (warning['text'], warning['remedy'])))}", file=sys.stderr)
     for limit in job["summary"].get("limits", ()):
         print(f"hsloc: limit not kept: {limit}", file=sys.stderr)
     if job["summary"].get("limits"):

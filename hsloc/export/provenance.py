@@ -30,6 +30,8 @@ def provenance(result: Result) -> Provenance:
     hashes = {" ".join(result.request.names()): result.input_sha256}
     if result.request.map_path is not None:
         hashes |= {path.name: _sha256(path) for path in map_files(result.request.map_path)}
+    if result.request.calibration is not None:
+        hashes[result.request.calibration.name] = _sha256(result.request.calibration)
     return Provenance(command(result.request), dump(result.request.config), versions, hashes)
 
 

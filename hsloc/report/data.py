@@ -139,12 +139,14 @@ class Scans:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReportData:
-    """Everything in the frame of the map: metres, and seconds since the first pose.
+    """Everything in the frame of the map: metres, and seconds since `start_ns`.
 
-    `path` (n, 2) and `seconds` (n,) are the trajectory; `localised` (n,) marks its known poses.
-    `reference` has been moved onto the trajectory where an alignment was asked for.
+    `start_ns` is the stamp of the first pose, without poses that of the first scan. `path` (n, 2) and `seconds` (n,)
+    are the trajectory; `localised` (n,) marks its known poses. `reference` has been moved onto the trajectory where an
+    alignment was asked for.
     """
 
+    start_ns: int
     path: Floats
     seconds: Floats
     localised: NDArray[np.bool_]
@@ -199,7 +201,7 @@ def prepare(parts: ReportParts) -> ReportData:
     trajectory, reference, odometry = parts.trajectory, parts.reference, parts.odometry
     diagnostics, comparison, localised = parts.diagnostics, parts.comparison, parts.localised
     start_ns = int(trajectory.stamps_ns.min()) if len(trajectory) else _first(diagnostics)
-    seconds = _since(trajectory.stamps_ns, start_ns)
+    seconds = since(trajectory.stamps_ns, start_ns)
     scans = None if diagnostics is None or not len(diagnostics) else _scans(diagnostics, trajectory, start_ns)
     if localised is None:
         localised = np.ones(len(trajectory), dtype=bool)
@@ -207,6 +209,7 @@ def prepare(parts: ReportParts) -> ReportData:
             localised &= (seconds < begin) | (seconds >= end)
     T_map_reference = IDENTITY if comparison is None else comparison.T_reference_estimate.inverse()
     return ReportData(
+        start_ns=start_ns,
         path=trajectory.poses[:, :2],
         seconds=seconds,
         localised=localised,
@@ -234,7 +237,7 @@ def _closed(mapping: MappingResult) -> Floats:
 
 def _far(overlay: ScanOverlay, start_ns: int) -> Curve:
     order = np.argsort(overlay.stamps_ns, kind="stable")
-    return Curve(_since(overlay.stamps_ns, start_ns)[order], overlay.far[order])
+    return Curve(since(overlay.stamps_ns, start_ns)[order], overlay.far[order])
 
 
 def status_counts(scans: Scans) -> dict[str, int]:
@@ -271,14 +274,15 @@ def _first(diagnostics: ScanDiagnostics | None) -> int:
     return int(diagnostics.stamps_ns.min()) if diagnostics is not None and len(diagnostics) else 0
 
 
-def _since(stamps_ns: NDArray[np.int64], start_ns: int) -> Floats:
+def since(stamps_ns: NDArray[np.int64], start_ns: int) -> Floats:
+    """Seconds (n,) from `start_ns` to each stamp (n,)."""
     result: Floats = (stamps_ns - start_ns) / NS_PER_S
     return result
 
 
 def _errors(comparison: Comparison, start_ns: int) -> Errors:
     order = np.argsort(comparison.pairs.stamps_ns, kind="stable")
-    seconds = _since(comparison.pairs.stamps_ns, start_ns)[order]
+    seconds = since(comparison.pairs.stamps_ns, start_ns)[order]
     errors = comparison.errors
     return Errors(Curve(seconds, errors.trans_part[order]), Curve(seconds, errors.angle_deg[order]))
 
@@ -286,7 +290,7 @@ def _errors(comparison: Comparison, start_ns: int) -> Errors:
 def _scans(diagnostics: ScanDiagnostics, trajectory: Trajectory, start_ns: int) -> Scans:
     order = np.argsort(diagnostics.stamps_ns, kind="stable")
     stamps = diagnostics.stamps_ns[order]
-    seconds = _since(stamps, start_ns)
+    seconds = since(stamps, start_ns)
     status = tuple(str(diagnostics.status[row]) for row in order)
     sigma = diagnostics.sigma[order]
     xy = interpolate_poses(trajectory, stamps)[:, :2] if len(trajectory) else np.full((len(stamps), 2), np.nan)

@@ -15,7 +15,7 @@ from PIL import Image
 
 from hsloc.model import Status
 from hsloc.report.charts import convergence_charts, run_charts
-from hsloc.report.data import peak_rows, prepare, status_counts
+from hsloc.report.data import peak_rows, prepare, since, status_counts
 from hsloc.report.map_image import picture_of, shown_extent
 from hsloc.report.summary import ResultSummary
 from hsloc.report.table import STATUS_WORDS
@@ -48,7 +48,6 @@ _MOST_CM = 32767
 def view_of(parts: ReportParts, data: ReportData | None = None) -> tuple[dict[str, Any], bytes | None]:
     """The value for view.js, in which `map` lacks its picture, and this picture as PNG; None where nothing is known."""
     data = prepare(parts) if data is None else data
-    start_ns = int(parts.trajectory.stamps_ns.min()) if len(parts.trajectory) else 0
     frame, png = _map(parts.grid)
     extent = shown_extent(data, parts.grid, parts.points)
     summary = None if parts.metrics is None else ResultSummary.of(parts.metrics)
@@ -64,11 +63,11 @@ def view_of(parts: ReportParts, data: ReportData | None = None) -> tuple[dict[st
         "reference": _path(data.reference, data.reference_jumps),
         "points": None if parts.points is None else _columns(x=parts.points[:, 0], y=parts.points[:, 1]),
         "lost": [[_round(begin), _round(end)] for begin, end in data.lost],
-        "scans": _scans(parts, start_ns),
+        "scans": _scans(parts, data.start_ns),
         "marks": [] if scans is None else _marks(scans),
-        "loops": None if parts.mapping is None else _loops(parts.mapping, start_ns),
-        "ellipses": _ellipses(parts, start_ns),
-        "events": _events(parts, data, start_ns),
+        "loops": None if parts.mapping is None else _loops(parts.mapping, data.start_ns),
+        "ellipses": _ellipses(parts, data.start_ns),
+        "events": _events(parts, data),
         "status": [] if scans is None else _status_rows(scans),
         "charts": [_chart(chart) for chart in (*run_charts(data), *convergence_charts(parts.convergence))],
     }
@@ -164,7 +163,7 @@ def _scans(parts: ReportParts, start_ns: int) -> dict[str, Any] | None:
     words = [status.get(stamp, ("", "")) for stamp in overlay.stamps_ns[rows].tolist()]
     poses = overlay.poses[rows]
     return {
-        **_columns(t=(overlay.stamps_ns[rows] - start_ns) / 1e9, x=poses[:, 0], y=poses[:, 1], decimals=3),
+        **_columns(t=since(overlay.stamps_ns[rows], start_ns), x=poses[:, 0], y=poses[:, 1], decimals=3),
         **_columns(theta=poses[:, 2], far=overlay.far[rows], decimals=4),
         "count": [len(cloud) for cloud in clouds],
         "status": [f"{name}: {reason}" if reason and reason not in name else name for name, reason in words],
@@ -192,7 +191,7 @@ def _loops(mapping: MappingResult, start_ns: int) -> dict[str, Any]:
     pairs = [(references[loop.first], references[loop.second]) for loop in loops]
     ends = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     first, second = (mapping.keyscan_poses[ends[:, k]] for k in (0, 1))
-    seconds = (mapping.keyscan_stamps_ns[ends[:, 1]] - start_ns) / 1e9
+    seconds = since(mapping.keyscan_stamps_ns[ends[:, 1]], start_ns)
     return {
         **_columns(t=seconds, x0=first[:, 0], y0=first[:, 1], x1=second[:, 0], y1=second[:, 1], decimals=3),
         "accepted": [bool(loop.accepted) for loop in loops],
@@ -209,12 +208,12 @@ def _ellipses(parts: ReportParts, start_ns: int) -> dict[str, Any] | None:
     rows = rows[:: max(1, -(-len(rows) // MOST_ELLIPSES))]
     if not len(rows):
         return None
-    seconds, poses, c = (trajectory.stamps_ns[rows] - start_ns) / 1e9, trajectory.poses[rows], covariances[rows]
+    seconds, poses, c = since(trajectory.stamps_ns[rows], start_ns), trajectory.poses[rows], covariances[rows]
     columns = _columns(t=seconds, x=poses[:, 0], y=poses[:, 1], decimals=3)
     return columns | _columns(xx=c[:, 0, 0], xy=c[:, 0, 1], yy=c[:, 1, 1], decimals=7)
 
 
-def _events(parts: ReportParts, data: ReportData, start_ns: int) -> list[dict[str, Any]]:
+def _events(parts: ReportParts, data: ReportData) -> list[dict[str, Any]]:
     """What to jump to, in order of time: reasons of the verdict, losses and what ended them, loops, refused scans."""
     found: list[tuple[float, str, str]] = []
     if parts.metrics is not None:
@@ -226,7 +225,7 @@ def _events(parts: ReportParts, data: ReportData, start_ns: int) -> list[dict[st
     for begin, end in data.lost:
         found += [(begin, "loss", f"the pose is not known until {end:.1f} s"), (end, "loss", "the pose is known again")]
     if parts.mapping is not None:
-        loops = _loops(parts.mapping, start_ns)
+        loops = _loops(parts.mapping, data.start_ns)
         found += [(t, "loop", "a loop is closed") for t, ok in zip(loops["t"], loops["accepted"], strict=True) if ok]
     if data.scans is not None:
         rows = np.flatnonzero(data.scans.where(Status.REJECTED))

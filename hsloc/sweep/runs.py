@@ -199,7 +199,7 @@ def finished(item: SweepRun, folder: Path, key: str) -> Outcome | None:
 
 
 def run_key(request: RunRequest, hashes: dict[Path, str] | None = None) -> str:
-    """Hash of all that decides a run: version, options, and the bytes of log and map.
+    """Hash of all that decides a run: version, options, and the bytes of its files.
 
     `hashes` remembers those of files between calls. Raises HslocError where a file cannot be read.
     """
@@ -212,7 +212,8 @@ def run_key(request: RunRequest, hashes: dict[Path, str] | None = None) -> str:
         ]
     if request.resume is not None:
         values["resume"] = [request.resume.name, _digest(state_file(request.resume), hashes)]
-    for name, path in (("relations", request.relations), ("reference", request.reference)):
+    for name in ("relations", "reference", "calibration"):
+        path: str | Path | None = getattr(request, name)
         if path is not None and Path(path).is_file():
             values[name] = [Path(path).name, _digest(Path(path), hashes)]
     values["input"] = [_log_digest(path, hashes) for path in request.logs]

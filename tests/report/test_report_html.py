@@ -239,6 +239,21 @@ def test_scans_lie_where_they_were_taken(run: dict[str, Any]) -> None:
     assert (far["t"], far["v"]) == ([2.0, 10.0], [2.0, None])  # the line breaks where the pose was lost
 
 
+def test_without_a_pose_times_begin_with_the_first_scan(run: dict[str, Any]) -> None:
+    diagnostics = run["diagnostics"]
+    overlay = ScanOverlay(
+        stamps_ns=diagnostics.stamps_ns[[0, 20]],
+        poses=np.zeros((2, 3)),
+        far=np.zeros(2),
+        rows=np.array([0, 1]),
+        points=(np.ones((1, 2)),) * 2,
+        distances=(np.zeros(1),) * 2,
+    )
+    view, _ = view_of(ReportParts(title="", trajectory=NOTHING, diagnostics=diagnostics, overlay=overlay))
+    assert view["scans"]["t"] == pytest.approx((diagnostics.stamps_ns[[0, 20]] - diagnostics.stamps_ns[0]) / 1e9)
+    assert view["status"][0]["runs"][0][0] == 0.0
+
+
 def test_where_it_cannot_be_written(run: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot be written"):
         write_report_html(tmp_path / "no" / "report.html", ReportParts(title="a", trajectory=run["trajectory"]))

@@ -94,6 +94,7 @@ def test_the_command(make_live: Callable[..., Live], log: Path, tmp_path: Path) 
     assert "succeeded" in done.stdout
     assert (tmp_path / "got" / "trajectory.tum").read_text().startswith("8 ")
     assert "hsloc: warning: the stamps are 3.0 s apart; check the clocks\n" in done.stderr
+    assert done.stderr.count("hsloc: warning:") == 1
     assert "verdict: check\n" in done.stdout
     assert " ".join(done.stdout.split()).endswith("APE rmse 1.23 cm 0.45°")
     log.write_bytes(b"bad-input")

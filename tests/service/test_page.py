@@ -91,6 +91,12 @@ def test_upload_watch_look_download(
     assert page.url == first
     time = first.partition("&t=")[2]  # a link holds the time that was looked at
     page.wait_for_function("(t) => document.querySelector('.rv-now')?.textContent.startsWith(`${t} s`)", arg=time)
+    pictures = []
+    page.on("download", lambda one: pictures.append(one.suggested_filename))
+    with page.expect_download():
+        page.click("#view [data-do=picture]")
+    drawn(page)
+    assert len(pictures) == 1  # those of the results that were shown before are gone
     page.click("text=← all jobs")
     page.wait_for_function("() => document.querySelectorAll('#jobs tbody tr').length === 2")
     compare_two(page)

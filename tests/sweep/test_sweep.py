@@ -99,17 +99,21 @@ def test_whatever_decides_a_run_is_in_its_key(changes: dict[str, Any]) -> None:
     assert run_key(replace(item.request, **changes)) != run_key(item.request)
 
 
-def test_the_bytes_of_log_and_map_are_in_the_key(tmp_path: Path) -> None:
+def test_the_bytes_of_all_files_are_in_the_key(tmp_path: Path) -> None:
     log, image, yaml = tmp_path / "run.mcap", tmp_path / "map.pgm", tmp_path / "map.yaml"
     log.write_bytes(b"one")
     image.write_bytes(b"P5")
     yaml.write_text("image: map.pgm\n")
-    (item,) = plan([log], DEFAULT, map=yaml)
+    others: dict[str, Any] = {name: tmp_path / name for name in ("relations", "reference", "calibration")}
+    for path in others.values():
+        path.write_text("lidars: {/scan: {x: 0.1}}\n")
+    (item,) = plan([log], DEFAULT, map=yaml, **others)
     keys = [run_key(item.request)]
-    for path in (log, image, yaml):
+    files = (log, image, yaml, *others.values())
+    for path in files:
         path.write_bytes(path.read_bytes() + b"\n")
         keys.append(run_key(item.request))
-    assert len(set(keys)) == 4
+    assert len(set(keys)) == len(files) + 1
 
 
 def test_what_goes_wrong_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,7 +43,7 @@ globalThis.listenToView = (view) => {
       setTimeout(() => URL.revokeObjectURL(link.href), 10000);
     });
   }
-  const over = view.$over, place = (event) => [event.offsetX * view.ratio, event.offsetY * view.ratio];
+  const { signal } = view.listening, over = view.$over, place = (event) => [event.offsetX * view.ratio, event.offsetY * view.ratio];
   over.addEventListener("wheel", (event) => {
     // An untouched map lets the page scroll by.
     if (!event.ctrlKey && document.activeElement !== over) return;
@@ -77,11 +77,11 @@ globalThis.listenToView = (view) => {
   const measure = () => { view.measure = view.measure ? null : []; over.classList.toggle("rv-measuring", Boolean(view.measure)); view.drawOver(); };
   const actions = { in: () => view.zoom(1.5), out: () => view.zoom(1 / 1.5), all: () => view.all(), measure, picture: () => save(),
     play: () => view.play(), less: () => view.step(-1), more: () => view.step(1), back: () => view.jump(false), next: () => view.jump(true) };
-  view.root.addEventListener("click", (event) => actions[event.target.closest?.("button[data-do]")?.dataset.do]?.());
+  view.root.addEventListener("click", (event) => actions[event.target.closest?.("button[data-do]")?.dataset.do]?.(), { signal });
   view.root.addEventListener("change", (event) => {
     if (event.target.dataset.do === "speed") view.speed = Number(event.target.value);
     if (event.target.dataset.do === "colour") { view.colourBy = event.target.value; view.paths = null; view.draw(); }
-  });
+  }, { signal });
   view.$time.addEventListener("input", () => view.seek(Number(view.$time.value)));
   const step = 60, keys = { ArrowLeft: () => view.move(step, 0), ArrowRight: () => view.move(-step, 0), ArrowUp: () => view.move(0, step),
     ArrowDown: () => view.move(0, -step), "+": () => view.zoom(1.25), "=": () => view.zoom(1.25), "-": () => view.zoom(0.8), 0: () => view.all(),

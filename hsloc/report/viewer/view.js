@@ -37,11 +37,12 @@
       this.build();
       this.charts = globalThis.ResultCharts(this.$charts, data, (t) => this.seek(t));
       this.dark = matchMedia("(prefers-color-scheme: dark)");
-      this.onScheme = () => { this.colours = null; this.charts.draw(); this.draw(); };
-      this.dark.addEventListener("change", this.onScheme);
+      this.listening = new AbortController();
+      const { signal } = this.listening;
+      this.dark.addEventListener("change", () => { this.colours = null; this.charts.draw(); this.draw(); }, { signal });
       this.observer = new ResizeObserver(() => this.resize());
       this.observer.observe(this.$frame);
-      addEventListener("beforeprint", this.onPrint = () => this.all());
+      addEventListener("beforeprint", () => this.all(), { signal });
       globalThis.listenToView(this);
       this.resize();
       this.all();
@@ -52,8 +53,7 @@
     end() {
       this.stop();
       this.observer.disconnect();
-      this.dark.removeEventListener("change", this.onScheme);
-      removeEventListener("beforeprint", this.onPrint);
+      this.listening.abort();
       this.charts.end();
       this.root.replaceChildren();
     }

@@ -29,7 +29,7 @@ _MAX_SQUARED = 16.3
 """Squared difference by its covariance, prediction to smoothed pose, up to which it was noise: the 99.9 % quantile
 of chi squared with 3 degrees of freedom. Beyond it a wheel slipped."""
 _METRES_PER_RADIAN = 0.5
-"""Metres that a radian of rotation counts for in the share of the motion: about half the track width of an indoor robot, doubled."""
+"""Metres that a radian counts for in the share of the motion: about the track width of an indoor robot."""
 _NO_NOISE = 1e-10 * np.eye(3)
 
 

@@ -1,7 +1,7 @@
 """Where wheels slipped: stretches over which the scans contradict the odometry.
 
 A slip of half a metre over a second is shared out over ten steps, each of which passes for noise; where few points fix
-the position along a corridor the solution follows the odometry. Over the whole stretch the two can be distinguished: the
+the position along a corridor the solution follows the odometry. Over the whole stretch the two are distinguished: the
 motion by the scans alone, and that by the odometry alone, with the covariances of both (an innovation test). Where they
 contradict each other, the odometry loses its weight.
 """

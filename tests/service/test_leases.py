@@ -18,6 +18,7 @@ from hsloc_service.errors import ServiceError
 from hsloc_service.execution.job_process import parse_line
 from hsloc_service.jobs.leases import Leases
 from hsloc_service.jobs.repository import ORDERS, JobFilter, Jobs
+from hsloc_service.jobs.workers import Presence
 from hsloc_service.results.store import Asset
 from hsloc_service.storage import Storage
 from hsloc_service.uploads.repository import Files
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from fastapi.testclient import TestClient
+    from postgresql import Server
 
 OTHER = Principal("other", ANYBODY.scopes)
 
@@ -239,6 +241,26 @@ def test_a_success_whose_answer_was_lost_may_be_written_again(parts: Parts) -> N
     assert leases.succeed(claim, f"{claim.job_id}.1", ASSET, {})
     assert leases.succeed(claim, f"{claim.job_id}.1", ASSET, {})
     assert not leases.succeed(claim, f"{claim.job_id}.2", ASSET, {})
+
+
+def test_a_worker_that_stops_while_the_database_is_away_gives_its_job_back(tmp_path: Path, postgresql: Server) -> None:
+    parts = Parts(tmp_path, postgresql.new_database())
+    job = parts.submit()
+    leases, presence = parts.leases(), Presence(parts.database, "folder:a", "worker", 1, 0.5)
+    presence.beat()
+    claim = leases.claim("folder:a")
+    assert claim is not None
+    postgresql.stop("immediate")
+    presence.beat()
+    with ThreadPoolExecutor(1) as pool:
+        released = pool.submit(leases.release, claim, "the server was stopped", counts=False)
+        time.sleep(0.3)
+        assert not released.done()
+        postgresql.start()
+        released.result(20.0)
+    assert parts.jobs.get(ANYBODY, job).state == "queued"
+    parts.database.close()
+    parts.storage.close()
 
 
 def test_a_job_with_a_tag_waits_for_a_worker_that_has_it(parts: Parts) -> None:

@@ -169,10 +169,14 @@ class Leases:
 
     def release(self, claim: Claim, reason: str, counts: bool = True) -> None:
         """Put a job back into the queue: its process or its server was ended from outside."""
-        with self.database.write() as session:
-            job = _held(session, claim)
-            if job is not None:
-                self._again(session, job, reason, counts)
+
+        def release() -> None:
+            with self.database.write() as session:
+                job = _held(session, claim)
+                if job is not None:
+                    self._again(session, job, reason, counts)
+
+        self._patiently(release)
 
     def recover(self, owner: str | None = None, held: Collection[str] = ()) -> list[str]:
         """Requeue the jobs whose lease has ended, except those in `held`, which the caller runs itself; their ids.

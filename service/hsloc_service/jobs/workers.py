@@ -83,7 +83,13 @@ class Presence:
             log("presence.error", error=str(error.orig))
 
     def beat(self) -> None:
-        """Write the row once, and forget those that were not there for a day."""
+        """Write the row once, and forget those that were not there for a day; a database that is away is logged."""
+        try:
+            self._write()
+        except DBAPIError as error:
+            log("presence.error", error=str(error.orig))
+
+    def _write(self) -> None:
         with self.database.write() as session:
             now = self.database.now(session)
             row = session.get(WorkerRow, self.owner)
@@ -96,7 +102,4 @@ class Presence:
 
     def _run(self) -> None:
         while not self._stop.wait(self.interval_s):
-            try:
-                self.beat()
-            except DBAPIError as error:
-                log("presence.error", error=str(error.orig))
+            self.beat()

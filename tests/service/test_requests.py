@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from fastapi.testclient import TestClient
     from live_service import Live
+    from postgresql import Server
 
 OFFICE = RECORDINGS / "office.mcap"
 REAL = Settings().worker_command
@@ -188,6 +189,16 @@ def test_what_contradicts_itself_is_refused(client: TestClient) -> None:
     assert "leave out one" in answer.json()["message"]
 
 
+def test_a_text_that_the_database_does_not_take_is_refused(
+    make_client: Callable[..., TestClient], postgresql: Server
+) -> None:
+    client = make_client(database_url=postgresql.new_database())
+    request = {"log": upload(client), "webhook": "http://receiver/\0"}
+    for answer in (client.get("/v1/jobs", params={"search": "a\0b"}), client.post("/v1/jobs", json=request)):
+        assert (answer.status_code, answer.json()["code"]) == (422, "invalid")
+        assert answer.json()["message"] == "a text holds a character that the database does not take"
+
+
 def test_what_belongs_to_others_is_not_there(make_client: Callable[..., TestClient]) -> None:
     client = make_client(require_token=True)
     tokens = Tokens(client.app.state.context.database)  # type: ignore[attr-defined]
@@ -239,7 +250,10 @@ def test_the_folder_of_an_attempt_has_what_was_asked_for(client: TestClient) -> 
     logs = [upload(client, b"slow 30", "run.mcap"), upload(client, b"part two", "run.mcap")]
     relations = upload(client, b"1 2 0 0 0 0 0 0", "../a relation")
     job = client.post("/v1/jobs", json={"logs": logs, "relations": relations, "resume": drawn}).json()["id"]
-    wait(client, job, states=("running",))
+    deadline = time.monotonic() + 20.0
+    while ((running := client.get(f"/v1/jobs/{job}").json())["progress"] or {}).get("phase") != "replay":
+        assert time.monotonic() < deadline, running  # the folder is made after the job was claimed
+        time.sleep(0.03)
     storage = client.app.state.context.storage  # type: ignore[attr-defined]
     folder = storage.work / f"{job}.1"
     found = json.loads((folder / "job.json").read_text())

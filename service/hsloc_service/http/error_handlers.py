@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from fastapi import Request, Response
 from fastapi.exceptions import RequestValidationError
-from sqlalchemy.exc import DatabaseError, InterfaceError, OperationalError
+from sqlalchemy.exc import DatabaseError, DataError, InterfaceError, OperationalError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match
@@ -64,6 +64,12 @@ def add_error_handlers(app: FastAPI, storage: Storage, routes: Sequence[BaseRout
     async def damaged(_request: Request, error: DatabaseError) -> Response:
         log("database.damaged", logging.ERROR, error=str(error.orig), remedy="restore a backup: hsloc serve --backup")
         return _answer(500, "database", "the server's database is damaged; report it", {"connection": "close"})
+
+    @app.exception_handler(DataError)
+    async def untaken(request: Request, error: DataError) -> Response:
+        log("database.refused", error=str(error.orig))
+        message = "a text holds a character that the database does not take"
+        return _answer(422, "invalid", message, _closing(request, {}))
 
     @app.exception_handler(OperationalError)
     @app.exception_handler(InterfaceError)

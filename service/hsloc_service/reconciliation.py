@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 from sqlalchemy import select, update
 
 from hsloc_service.db.tables import FileRow, JobRow, UploadDeletionRow
-from hsloc_service.errors import StoreError
 from hsloc_service.logs import log
 from hsloc_service.storage import remove_tree
 
@@ -36,8 +35,7 @@ def reconcile(database: Database, storage: Storage, deletions: DeletionQueue) ->
             with suppress(OSError):
                 storage.upload_path(file_id).chmod(0o600)
     _restore(database, storage)
-    with suppress(StoreError):  # then later
-        deletions.clear_uploads()
+    deletions.clear_uploads()
     for path in storage.work.iterdir():
         log("sweep", kind="work", name=path.name)
         with suppress(OSError):

@@ -14,6 +14,7 @@ from paths import ROOT
 from ruamel.yaml import YAML
 
 from hsloc.cli.main import build_parser, main
+from hsloc_service.errors import ServiceError
 from hsloc_service.execution.input_cache import InputCache
 from hsloc_service.http.app import create_app
 from hsloc_service.jobs.leases import Claim
@@ -177,6 +178,13 @@ def test_parts_that_nothing_is_made_of_are_swept(servers: list[TestClient]) -> N
         (staged / "part").write_bytes(content)
         parts.add(ident, 0, staged, 9, last=True)
     assert b"".join(parts.blocks(ident)) == b"right bit"
+    # A block that came too late is refused, and its object is removed.
+    names, late = set(store.names()), context.storage.work / "late"
+    late.mkdir()
+    (late / "part").write_bytes(b"late")
+    with pytest.raises(ServiceError, match="another request wrote"):
+        parts.add(ident, 5, late, 4, last=True)
+    assert set(store.names()) == names
     assert parts.sweep() == 1
     assert f"{ident}.1" in store.names()
     assert b"".join(parts.blocks(file)) == b"one"
@@ -186,8 +194,7 @@ def test_while_the_store_is_away_uploads_are_put_off_and_nothing_is_lost(
     servers: list[TestClient], fleet: Fleet
 ) -> None:
     one, other = servers
-    for client in servers:
-        upload(client)
+    deleted, _ = (upload(client) for client in servers)
     headers = {"Tus-Resumable": "1.0.0", "Upload-Length": "9"}
     place = one.post("/v1/tus", headers=headers).headers["location"]
     assert one.patch(place, headers={**PATCH, "Upload-Offset": "0"}, content=b"slow").status_code == 204
@@ -196,8 +203,12 @@ def test_while_the_store_is_away_uploads_are_put_off_and_nothing_is_lost(
     answer = one.patch(place, headers={**PATCH, "Upload-Offset": "4"}, content=b" 0.1 ")
     assert (answer.status_code, answer.json()["code"], answer.headers["retry-after"]) == (503, "store", "5")
     assert not store.exists()
+    assert one.delete(f"/v1/files/{deleted}").status_code == 204
+    context: Any = one.app.state.context  # type: ignore[attr-defined]
+    assert context.deletions.clear_uploads() == 0
     assert other.head(place, headers={"Tus-Resumable": "1.0.0"}).headers["upload-offset"] == "4"
     away.rename(store)
+    assert context.deletions.clear_uploads() == 1
     assert other.patch(place, headers={**PATCH, "Upload-Offset": "4"}, content=b" 0.1 ").status_code == 204
     file = one.get(f"/v1/files/{place.rsplit('/', 1)[1]}").json()
     assert (file["state"], file["sha256"]) == ("complete", hashlib.sha256(b"slow 0.1 ").hexdigest())
@@ -210,6 +221,10 @@ def test_copies_of_inputs_are_bounded(servers: list[TestClient], tmp_path: Path)
     ids = [upload(one, bytes([k]) * 1000) for k in range(3)]
     storage = Storage(tmp_path / "cache")
     cache = InputCache(storage, context.files.parts, 2500)
+    killed = storage.cache / "inputs" / ".unfinished"  # of a worker of an older version that was killed
+    killed.parent.mkdir()
+    killed.write_bytes(bytes([9]) * 900)
+    os.utime(killed, (0, 0))
 
     class Once:
         def retry(self, what: str, work: Callable[[], None], timeout_s: float) -> None:

@@ -74,7 +74,8 @@ class InputCache:
             os.utime(path)
             return
         self._folder.mkdir(mode=0o700, exist_ok=True)
-        copy, digest = self._folder / f".{uuid.uuid4().hex}", hashlib.sha256()
+        # Where a worker that starts removes what one that was killed has left.
+        copy, digest = self._storage.work / f"input-{uuid.uuid4().hex}", hashlib.sha256()
         try:
             with copy.open("wb") as file:
                 for block in self._parts.blocks(file_id):
@@ -96,7 +97,7 @@ class InputCache:
         for _, size, name in found:
             if total <= self._max_bytes:
                 return
-            if name not in self._used and not name.startswith("."):
+            if name not in self._used:
                 with suppress(OSError):
                     (self._folder / name).unlink()
                     total -= size

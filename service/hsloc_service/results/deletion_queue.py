@@ -38,17 +38,21 @@ class DeletionQueue:
     parts: UploadParts | None = None
 
     def clear_uploads(self) -> int:
-        """Remove the bytes of deleted uploads; how many there were. Raises StoreError."""
+        """Remove the bytes of deleted uploads that can be reached; how many. Blocks as `clear` does."""
         count = 0
         while True:
             with self.database.read() as session:
                 found = list(session.scalars(select(UploadDeletionRow.id).limit(BATCH)))
             if not found:
                 return count
-            for file_id in found:
-                self.storage.upload_path(file_id).unlink(missing_ok=True)
-                if self.parts is not None:
-                    self.parts.remove(file_id)
+            try:
+                for file_id in found:
+                    self.storage.upload_path(file_id).unlink(missing_ok=True)
+                    if self.parts is not None:
+                        self.parts.remove(file_id)
+            except StoreError as error:
+                log("store.error", what="remove upload", name=file_id, error=str(error))
+                return count  # the others would fail as well; they are tried in the next round
             with self.database.write() as session:
                 session.execute(delete(UploadDeletionRow).where(UploadDeletionRow.id.in_(found)))
             count += len(found)

@@ -11,7 +11,7 @@ import os
 import secrets
 import shutil
 import uuid
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,7 +19,7 @@ from sqlalchemy import delete, select
 
 from hsloc_service.call_timeout import MIN_BYTES_PER_S, call_within
 from hsloc_service.db.tables import FileRow, UploadPartRow
-from hsloc_service.errors import ServiceError, not_found
+from hsloc_service.errors import ServiceError, StoreError, not_found
 from hsloc_service.results.store import BLOCK, Asset
 
 if TYPE_CHECKING:
@@ -56,17 +56,25 @@ class UploadParts:
         name = f"{file_id}.{number}"
         asset = Asset(ASSET, size, "", "application/octet-stream")
         call_within(self.limit_s(size), lambda: self.store.publish(staged, name, [asset]))
+        try:
+            self._record(UploadPartRow(file_id=file_id, start=start, size=size, number=number), last)
+        except ServiceError:
+            with suppress(StoreError):  # then `sweep` removes it, if the upload is completed
+                self._remove(name)
+            raise
+
+    def _record(self, part: UploadPartRow, last: bool) -> None:
         with self.database.write() as session:
-            row = session.get(FileRow, file_id, with_for_update=True)
+            row = session.get(FileRow, part.file_id, with_for_update=True)
             if row is None:
-                raise not_found("file", file_id)
-            if row.state != "receiving" or row.received != start:
+                raise not_found("file", part.file_id)
+            if row.state != "receiving" or row.received != part.start:
                 raise ServiceError(409, "offset", f"the offset is {row.received}: another request wrote to this upload")
-            after = (UploadPartRow.file_id == file_id, UploadPartRow.start >= start)
+            after = (UploadPartRow.file_id == part.file_id, UploadPartRow.start >= part.start)
             session.execute(delete(UploadPartRow).where(*after))  # of a last block whose upload was not completed
-            session.add(UploadPartRow(file_id=file_id, start=start, size=size, number=number))
+            session.add(part)
             if not last:
-                row.received = start + size
+                row.received = part.start + part.size
 
     def of(self, file_id: str) -> list[Part]:
         """The parts of an upload in their order."""
@@ -97,7 +105,10 @@ class UploadParts:
             session.execute(delete(UploadPartRow).where(UploadPartRow.file_id == file_id))
 
     def sweep(self) -> int:
-        """Remove objects that no complete upload is made of, but for those of uploads that are still received."""
+        """Remove the objects of complete uploads that these are not made of; how many.
+
+        Objects of uploads that are still received, or that the database does not know (any more), stay.
+        """
         names = call_within(self.timeout_s, self.store.names)  # before the rows: what a row names was stored earlier
         with self.database.read() as session:
             complete = set(session.scalars(select(FileRow.id).where(FileRow.state == "complete")))

@@ -111,6 +111,27 @@ def compare_two(page: Any) -> None:
     assert inked(page, "#comparison .rv-base") > 5
     rows = page.locator("#comparison table tr").all_text_contents()
     assert any(re.fullmatch(r"APE rmse(\d+\.\d+ cm / \d+\.\d+°){2}", row) for row in rows)  # the same run: no change
+    leave_before_it_is_compared(page)
+
+
+def leave_before_it_is_compared(page: Any) -> None:
+    """What is compared is not built when the page shows something else by then."""
+    page.evaluate("""() => { globalThis.built = 0; const made = globalThis.ResultComparison;
+      globalThis.ResultComparison = class extends made { constructor(...all) { super(...all); built += 1; } }; }""")
+    held: list[Any] = []
+    page.route("**/viewer.json", lambda route: route.continue_() if held else held.append(route))
+    address = page.url
+    page.evaluate("location.hash = 'job=../info'")  # no id of a job: the page begins with the table
+    page.wait_for_selector("#home:not([hidden])")
+    with page.expect_request("**/viewer.json"):
+        page.evaluate("(address) => { location.href = address; }", address)
+    page.evaluate("location.hash = ''")
+    page.wait_for_selector("#home:not([hidden])")
+    with page.expect_response("**/viewer.json"):
+        held[0].continue_()
+    page.wait_for_timeout(300)
+    assert page.evaluate("built") == 0
+    page.unroute("**/viewer.json")
 
 
 def drawn(page: Any, selector: str = MAP) -> str:

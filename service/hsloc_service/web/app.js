@@ -9,6 +9,7 @@ import { build } from "./options.js";
 import * as result from "./result.js";
 
 const EVERY_MS = 3000;
+const ID = /^[0-9a-f-]{36}$/; // of a job: what is in the address becomes part of a request's path
 let comparison = null;
 
 // --- token -----------------------------------------------------------------------------------------------------------
@@ -36,27 +37,27 @@ async function about() {
 const useAgain = async (file) => { location.hash = ""; await form.use(file); $("stored").focus(); };
 
 function route(event) {
-  const [, name, value] = /^#(\w+)=?(.*)$/.exec(location.hash) ?? [];
-  const part = ["job", "compare", "files"].includes(name) ? name : "home";
+  const [, name, value = ""] = /^#(\w+)=?(.*)$/.exec(location.hash) ?? [];
+  const [list, time] = value.split("&t="), ids = list.split(",").filter(Boolean);
+  const ofJobs = (name === "job" && ids.length === 1) || (name === "compare" && ids.length > 0);
+  const part = name === "files" || (ofJobs && ids.every((id) => ID.test(id))) ? name : "home";
   for (const each of ["home", "job", "compare", "files"]) $(each).hidden = each !== part;
   document.title = "hsloc: where was the robot?";
   result.leave();
   comparison?.end();
   comparison = null;
   if (event) { notice(""); scrollTo(0, 0); }
-  if (part === "job") {
-    const [id, time] = value.split("&t=");
-    result.show(id, Boolean(event), Number(time) || 0);
-  }
-  else if (part === "compare") guarded(() => compare(value.split(",").filter(Boolean)));
+  if (part === "job") result.show(ids[0], Boolean(event), Number(time) || 0);
+  else if (part === "compare") guarded(() => compare(ids));
   else if (part === "files") guarded(() => files.show(useAgain));
   else guarded(jobs.refresh);
 }
 
 async function compare(ids) {
-  const runs = [];
+  const runs = [], address = location.hash;
   for (const id of ids.slice(0, 12)) {
     const job = await get(`/v1/jobs/${id}`), loaded = job.state === "succeeded" ? await result.load(job) : null;
+    if (location.hash !== address) return; // something else is shown by now
     if (loaded) runs.push({ name: `${job.log}, seed ${job.request.seed}`, href: `#job=${id}`, ...loaded });
     else notice(`${job.log}: ${job.state === "succeeded" ? "made by an earlier version; run it again to compare it" : "it has no result to compare"}`);
   }

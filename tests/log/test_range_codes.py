@@ -75,18 +75,29 @@ def test_no_rectangular_room_makes_a_code(data: st.DataObject) -> None:
     assert not learned(scans).is_known
 
 
-def test_a_code_is_read_as_no_return_and_named(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    beams = np.full(360, 3.0, dtype=np.float32)
-    beams[100:180] = 9.5
+def write_log(path: Path, coded: int) -> Path:
+    """Five scans, of which the first ones show readings of 9.5 m as no wall does."""
     with LogWriter(path) as log:
         for k in range(5):
+            beams = np.full(360, 3.0, dtype=np.float32)
+            if k < coded:
+                beams[100:180] = 9.5
             log.odometry(START + k, Pose2())
             scan = make_scan(START + k)
             log.scan(Scan(START + k, beams, 0.0, pi / 180.0, scan.range_min, 12.0, frame_id="laser"))
-    opened = open_log(path, ReadOptions())
+    return path
+
+
+def test_a_code_is_read_as_no_return_and_named(tmp_path: Path) -> None:
+    opened = open_log(write_log(tmp_path / "run.mcap", coded=5), ReadOptions())
     assert "scan_no_return_code" in [warning.code for warning in opened.summary.warnings]
     for _ in range(2):
         (first, *_rest) = [event for event in opened.events() if isinstance(event, Scan)]
         assert np.isposinf(first.ranges[100:180]).all()
         assert np.isfinite(first.ranges[:100]).all()
+
+
+def test_scans_that_are_read_twice_prove_a_code_once(tmp_path: Path) -> None:
+    opened = open_log(write_log(tmp_path / "run.mcap", coded=2), ReadOptions())
+    assert opened.summary.warnings == open_log(write_log(tmp_path / "plain.mcap", coded=0)).summary.warnings
+    assert all(np.isfinite(event.ranges).all() for event in opened.events() if isinstance(event, Scan))

@@ -20,6 +20,7 @@ from hsloc.log.summary import Losses, ReadOptions
 from hsloc.log.text.carmen import beam_angles
 from hsloc.log.text.line_format import stamp_ns
 from hsloc.model import Odometry, Pose2, Scan, Truth
+from hsloc.model.calibration import Calibration, LidarCalibration
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -89,6 +90,21 @@ def test_the_laser_pose_may_be_given(tmp_path: Path) -> None:
     assert isinstance(scan, Scan)
     assert scan.T_base_laser == Pose2(0.1, 0, 0)
     assert log.summary.warnings == ()
+
+
+def test_the_calibration_of_another_lidar_does_not_count(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.clf", [odom("1"), flaser("1", [1.0] * 181)])
+    other, own = LidarCalibration(Pose2(1, 0, 0), 2.0), LidarCalibration(Pose2(0.1, 0, 0), 0.5)
+    both = open_log(path, ReadOptions(calibration=Calibration(lidars=(("/scan", other), ("/FLASER", own)))))
+    _, scan = both.events()
+    assert isinstance(scan, Scan)
+    assert (scan.T_base_laser, scan.stamp_ns) == (Pose2(0.1, 0, 0), 3 * SECOND // 2)
+    assert both.summary.extrinsics == "calibration"
+    alone = open_log(path, ReadOptions(calibration=Calibration(lidars=(("/scan", other),)), time_offset="FLASER=0.25"))
+    _, scan = alone.events()
+    assert isinstance(scan, Scan)
+    assert (scan.T_base_laser, scan.stamp_ns) == (Pose2(), 5 * SECOND // 4)
+    assert alone.summary.extrinsics == "identity"
 
 
 def test_laser_lines_give_odometry_only_where_nothing_else_does(tmp_path: Path) -> None:

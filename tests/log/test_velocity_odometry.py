@@ -14,7 +14,10 @@ from mcap.records import Channel, Schema
 from hsloc.errors import ConfigError, TopicError
 from hsloc.log import LogWriter, ReadOptions, open_log
 from hsloc.log.messages import definitions
-from hsloc.log.session.velocity_odometry import wheels_of
+from hsloc.log.messages.velocities import VelocityMessage
+from hsloc.log.session.ordering import KIND_ODOMETRY, TopicClock
+from hsloc.log.session.velocity_odometry import VelocityFeed, wheels_of
+from hsloc.log.summary import Losses
 from hsloc.model import Odometry
 
 if TYPE_CHECKING:
@@ -95,6 +98,25 @@ def assert_circle(path: Path, options: ReadOptions) -> None:
 def test_velocities_are_summed_up(tmp_path: Path, typename: str, text: bool) -> None:
     path = write_log(tmp_path / "run.mcap", "/velocity", typename, text=text)
     assert_circle(path, ReadOptions(odom_topic="/velocity"))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "metres"),
+    [
+        ((1.0, 1.1, 1.05, 1.15), 0.15),  # one message is late
+        ((5.0, 5.1, 1.0, 1.1), 0.2),  # the clock was set back
+    ],
+)
+def test_time_that_runs_backwards_is_counted_once(seconds: tuple[float, ...], metres: float) -> None:
+    losses = Losses()
+    feed = VelocityFeed(TopicClock("/velocity", KIND_ODOMETRY, losses), losses, definitions.TWIST_STAMPED)
+    poses = []
+    for second in seconds:
+        stamp = round(second * SECOND)
+        ((_, event),) = feed.events(VelocityMessage(stamp, "odom", "base_link", 1.0, 0.0, 0.0), stamp)
+        assert isinstance(event, Odometry)
+        poses.append(event.T_odom_base.x)
+    assert poses[-1] == pytest.approx(metres)
 
 
 def test_measured_velocities_are_used_where_there_is_no_odometry_and_named(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from hsloc.log.messages import definitions
 from hsloc.log.messages.point_cloud import slice_of
+from hsloc.log.range_codes import NoReturnCode
 from hsloc.log.session.ordering import Arrivals
 from hsloc.log.session.scan_geometry import ScanFixes, ScanSurvey, TurnAssembler
 from hsloc.log.session.transform_topics import is_map_frame
@@ -73,7 +74,9 @@ class ScanFeed:
         """
         self._fixes = ScanFixes() if fixes is None else fixes
         self._survey = ScanSurvey() if survey is None else survey
-        self._code = replace(self._survey.no_return)
+        # A code that is not proved yet starts anew: the scans of the survey come again.
+        code = self._survey.no_return
+        self._code = replace(code) if code.is_known else NoReturnCode()
         self._turns = TurnAssembler(self._survey) if self._survey.segments > 1 else None
         self.topic = clock.topic
         self.clocks = (clock,)

@@ -36,9 +36,10 @@ class _Sum:
         self._last_ns: int | None = None
 
     def _seconds(self, stamp: int) -> float:
-        """Since the message before; 0 where that is not known, or too long ago."""
+        """Since the latest stamp; 0 where that is not known, too long ago, or still to come."""
         seconds = 0.0 if self._last_ns is None else (stamp - self._last_ns) / 1e9
-        self._last_ns = stamp
+        if self._last_ns is None or not -_LONGEST_S <= seconds < 0.0:  # a clock that was set back starts anew
+            self._last_ns = stamp
         return seconds if 0.0 < seconds <= _LONGEST_S else 0.0
 
     def _moved(self, stamp: int, forwards: float, left: float, turn: float) -> tuple[Stamped, ...]:

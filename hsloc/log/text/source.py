@@ -15,10 +15,11 @@ from hsloc.log.summary import LogSummary, Losses, ReadOptions, TopicStatistics, 
 from hsloc.log.text.carmen import Carmen
 from hsloc.log.text.wean import Wean
 from hsloc.model import IDENTITY, Odometry, Scan
+from hsloc.model.calibration import LidarCalibration
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
     from pathlib import Path
 
     from hsloc.log.text.line_format import Line, LineFormat
@@ -90,12 +91,6 @@ class TextSource:
         self._options = options
         self._rule = RangeRule()
         self._code = NoReturnCode()
-        # Laser lines, which may have several keywords, are of one clock.
-        offsets = options.offsets_s()
-        self._scan_offset_ns = round(1e9 * sum(value for name, value in offsets.items() if name != "ODOM"))
-        calibration = options.calibration
-        known = [] if calibration is None else [lidar for topic, lidar in calibration.lidars if topic != "ODOM"]
-        self._given_mounting = options.laser_pose or (known[0].T_base_laser if known else None)
         self._laser_lines_count = False
         self.losses_at_opening = Losses()
         self.summary = self._survey()
@@ -171,7 +166,17 @@ class TextSource:
         others = [keyword for keyword in kinds["odometry"] if keyword not in kinds["scan"]]
         self._laser_lines_count = bool(of_lasers) and (self._format.laser_odometry or not others)
         kinds["odometry"] = dict.fromkeys(of_lasers if self._laser_lines_count else others)
+        self._calibrate(kinds["scan"])
         return self._summary(topics, kinds, first_ns or 0, latest, first_scan, scan_keyword)
+
+    def _calibrate(self, scan_keywords: Collection[str]) -> None:
+        """Mounting and offset of the laser: its lines, which may have several keywords, are of one laser and clock."""
+        calibration, offsets = self._options.calibration, replace(self._options, calibration=None).offsets_s()
+        lidars = () if calibration is None else calibration.lidars
+        lidar = next((each for topic, each in lidars if topic.lstrip("/") in scan_keywords), LidarCalibration())
+        self._given_mounting = self._options.laser_pose or lidar.T_base_laser
+        offset_s = lidar.time_offset_s + sum(value for name, value in offsets.items() if name != "ODOM")
+        self._scan_offset_ns = round(1e9 * offset_s)
 
     def _summary(
         self,

@@ -106,14 +106,17 @@ class NoReturnCode:
         """Take in a scan's readings (m), the angle between beams (rad) and the limits of valid readings (m)."""
         with np.errstate(invalid="ignore"):
             valid = (ranges >= limits[0]) & (ranges <= limits[1])
-        if valid.sum() < _MIN_BEAMS:
+        readings = ranges[valid]
+        if len(readings) < _MIN_BEAMS:
             return
-        top = float(ranges[valid].max())
-        self.readings += int(valid.sum())
-        self.beyond += int((ranges[valid] > self.high + _STEP).sum()) if self.scans else 0
+        top = float(readings.max())
+        self.readings += len(readings)
+        self.beyond += int(np.count_nonzero(readings > self.high + _STEP)) if self.scans else 0
         if top < CLIP_MIN or (self.scans and top < self.low * (1.0 - _BAND)):
             return
         even = valid & (ranges >= top * (1.0 - _BAND) - _STEP)
+        if np.count_nonzero(even) < _MIN_BEAMS:
+            return
         edges = np.flatnonzero(np.diff(np.concatenate(([False], even, [False]))))
         begins, ends = edges[::2], edges[1::2]
         longest = int(np.argmax(ends - begins))
@@ -125,7 +128,7 @@ class NoReturnCode:
         if self.scans and abs(high - self.high) <= _BAND * high + _STEP:
             self.low, self.high, self.scans = min(low, self.low), max(high, self.high), self.scans + 1
         elif high > self.high:
-            self.low, self.high, self.scans, self.beyond, self.readings = low, high, 1, 0, int(valid.sum())
+            self.low, self.high, self.scans, self.beyond, self.readings = low, high, 1, 0, len(readings)
 
     def apply(self, ranges: NDArray[np.float32]) -> NDArray[np.float32]:
         """The readings (m), +inf in place of the code."""

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Payload = memoryview | bytes
+    Echoes = Sequence[Sequence[float] | NDArray[np.float32]]
+    """A value for each echo of each beam."""
 
 NANOSECONDS = 1_000_000_000
 LITTLE_ENDIAN, BIG_ENDIAN = b"\x00\x01", b"\x00\x00"
@@ -60,8 +62,8 @@ class ScanMessage(NamedTuple):
     T_frame_laser: Transform3 | None = None
     """The laser's pose in `frame_id`, which Foxglove's message has and ROS's has not."""
     angle_max: float = nan
-    strongest: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
-    """Ranges and intensities of the strongest echo of each beam, of a lidar that tells several."""
+    echoes: tuple[Echoes, Echoes] | None = None
+    """Ranges and intensities of all echoes of each beam, of a lidar that reports several with their intensities."""
 
 
 class OdometryMessage(NamedTuple):
@@ -201,7 +203,7 @@ def laser_scan(data: Payload) -> ScanMessage:
 
 
 def multi_echo_laser_scan(data: Payload) -> ScanMessage:
-    """sensor_msgs/MultiEchoLaserScan from CDR: of each beam the first echo and the strongest, NaN where it has none."""
+    """sensor_msgs/MultiEchoLaserScan from CDR: the first echo of each beam, NaN where it has none, and all of them."""
     alignment(data)
     stamp, frame, at = header(data, 4)
     at = aligned(at, 4)
@@ -211,9 +213,10 @@ def multi_echo_laser_scan(data: Payload) -> ScanMessage:
     echoes, at = _echoes(data, at + _SCAN.size, count)
     (count,) = _SIZE.unpack_from(data, at)
     strengths = _echoes(data, at + 4, count)[0] if count else []
-    ranges, intensities, strongest = chosen_echoes(echoes, strengths)
-    values = (increment, time_increment, range_min, range_max, ranges, intensities, scan_time)
-    return ScanMessage(stamp, frame, angle_min, *values, angle_max=angle_max, strongest=strongest)
+    limits = (increment, time_increment, range_min, range_max)
+    found = first_echoes(echoes), first_echoes(strengths) if strengths else None
+    scan = ScanMessage(stamp, frame, angle_min, *limits, *found, scan_time, angle_max=angle_max)
+    return scan._replace(echoes=(echoes, strengths)) if len(strengths) == len(echoes) else scan
 
 
 def _echoes(data: Payload, at: int, count: int) -> tuple[list[tuple[float, ...]], int]:
@@ -229,26 +232,22 @@ def _echoes(data: Payload, at: int, count: int) -> tuple[list[tuple[float, ...]]
     return echoes, at
 
 
-def chosen_echoes(
-    ranges: Sequence[Sequence[float]], intensities: Sequence[Sequence[float]]
-) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, tuple[NDArray[np.float32], NDArray[np.float32]] | None]:
-    """Ranges and intensities of the first echo of each beam, and both of the strongest one if intensities are there."""
-    first = np.array([echoes[0] if len(echoes) else nan for echoes in ranges], dtype=np.float32)
-    if len(intensities) != len(ranges):
-        strengths = np.array([echoes[0] if len(echoes) else nan for echoes in intensities], dtype=np.float32)
-        return first, strengths if len(strengths) else None, None
-    best = np.full((2, len(ranges)), np.nan, dtype=np.float32)
-    strengths = np.full(len(ranges), np.nan, dtype=np.float32)
+def first_echoes(values: Echoes) -> NDArray[np.float32]:
+    """The value of the first echo of each beam (n,), NaN where it has none."""
+    return np.array([echoes[0] if len(echoes) else nan for echoes in values], dtype=np.float32)
+
+
+def strongest_echoes(ranges: Echoes, intensities: Echoes) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Range and intensity of the strongest echo of each beam, both (n,); the first range where it has no intensity."""
+    best = np.full((2, len(ranges)), nan, dtype=np.float32)
     for beam, (echoes, strength) in enumerate(zip(ranges, intensities, strict=True)):
-        if len(strength):
-            strengths[beam] = strength[0]
         count = min(len(echoes), len(strength))
         if count:
             k = max(range(count), key=strength.__getitem__)
             best[:, beam] = echoes[k], strength[k]
         elif len(echoes):
             best[0, beam] = echoes[0]
-    return first, strengths if len(strengths) else None, (best[0], best[1])
+    return best[0], best[1]
 
 
 @lru_cache(maxsize=64)

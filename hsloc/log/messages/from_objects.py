@@ -14,7 +14,7 @@ from hsloc.log.messages.decode import (
     OdometryMessage,
     PoseMessage,
     ScanMessage,
-    chosen_echoes,
+    first_echoes,
     make_grid,
     plane_covariance,
 )
@@ -45,12 +45,10 @@ def object_laser_scan(message: Any) -> ScanMessage:
 
 
 def object_multi_echo_laser_scan(message: Any) -> ScanMessage:
-    """From a message object: of each beam the first echo and the strongest."""
-    ranges, intensities, strongest = chosen_echoes(
-        [beam.echoes for beam in message.ranges], [beam.echoes for beam in message.intensities]
-    )
-    none = np.zeros(0, dtype=np.float32)
-    return _object_scan(message, ranges, none if intensities is None else intensities)._replace(strongest=strongest)
+    """From a message object: the first echo of each beam, and all of them."""
+    echoes, strengths = ([beam.echoes for beam in beams] for beams in (message.ranges, message.intensities))
+    scan = _object_scan(message, first_echoes(echoes), first_echoes(strengths))
+    return scan._replace(echoes=(echoes, strengths)) if len(strengths) == len(echoes) else scan
 
 
 def _object_scan(message: Any, ranges: NDArray[np.float32], intensities: NDArray[np.float32]) -> ScanMessage:

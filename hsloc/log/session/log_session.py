@@ -174,8 +174,10 @@ class LogSession:
         if kind == definitions.POINT_CLOUD2:
             return ScanSurvey()
         first = [message for _, message in islice(self.messages(topic, kind), _SCANS_AT_OPENING)]
-        interval = survey(first).interval_s
-        found = survey(self.fixes.apply(message, interval) for message in first)
+        found = survey(first)
+        if self.fixes != ScanFixes():
+            interval = found.interval_s
+            found = survey(self.fixes.apply(message, interval) for message in first)
         self._warnings += [RunWarning(p.code, f"{topic}: {p.text}", p.remedy) for p in found.problems]
         if found.segments > 1:
             self._warnings.append(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hsloc.errors import ConfigError
+from hsloc.log.messages.decode import strongest_echoes
 from hsloc.log.range_codes import NoReturnCode
 from hsloc.warnings import WarningCode
 
@@ -110,14 +111,16 @@ class ScanFixes:
             step = abs(increment) / _TURN * interval_s if interval_s is not None else step
         elif isinstance(self.time_increment, float):
             step = self.time_increment
-        if self.strongest and message.strongest is not None:
-            message = message._replace(ranges=message.strongest[0], intensities=message.strongest[1])
+        if self.strongest and message.echoes is not None:
+            ranges, intensities = strongest_echoes(*message.echoes)
+            message = message._replace(ranges=ranges, intensities=intensities)
         return message._replace(
             angle_min=low,
             angle_increment=increment,
             angle_max=high,
             time_increment=step,
             range_max=message.range_max if self.range_max is None else self.range_max,
+            echoes=None,
         )
 
 

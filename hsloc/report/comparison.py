@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from hsloc.atomic_write import write_text_atomically
 from hsloc.errors import EvaluationError
-from hsloc.report.html import fill, resource, script_json, viewer_script
+from hsloc.report.html import write_page
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -93,13 +92,8 @@ def change(first: Sequence[float | None], numbers: Sequence[float | None]) -> st
 def write_comparison(path: Path, runs: Sequence[ComparedRun]) -> None:
     """Write the comparison as one HTML file that loads nothing. Raises OutputError where it cannot be written."""
     shown = [{"name": run.name, "data": _thinned(run.view) if k else run.view} for k, run in enumerate(runs)]
-    fragments = {
-        "title": escape(f"Comparison of {', '.join(run.name for run in runs)}"),
-        "data": script_json({"runs": shown}),
-        "style": resource("viewer/view.css") + resource("templates/report.css"),
-        "script": viewer_script() + resource("viewer/compare.js") + resource("templates/compare.js"),
-    }
-    write_text_atomically(path, fill(resource("templates/compare.html"), fragments))
+    title = escape(f"Comparison of {', '.join(run.name for run in runs)}")
+    write_page(path, "compare", {"title": title}, {"runs": shown}, "compare.js")
 
 
 def _thinned(view: dict[str, Any]) -> dict[str, Any]:

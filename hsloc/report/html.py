@@ -48,11 +48,21 @@ def write_report_html(path: str | Path, parts: ReportParts) -> None:
         "statistics": "" if metrics is None else _statistics(metrics),
         "provenance": _provenance(parts.provenance),
         "metrics": "" if metrics is None else escape(format_json(metrics.to_json())),
-        "data": script_json(view),
-        "style": resource("viewer/view.css") + resource("templates/report.css"),
-        "script": viewer_script() + resource("templates/report.js"),
     }
-    write_text_atomically(Path(path), fill(resource("templates/report.html"), fragments))
+    write_page(Path(path), "report", fragments, view)
+
+
+def write_page(path: Path, name: str, fragments: Mapping[str, str], data: Mapping[str, object], *more: str) -> None:
+    """Write templates/<name>.html, filled, with `data` and the scripts that draw it, as one file that loads nothing."""
+    scripts = [*(f"viewer/{each}" for each in (*VIEWER_SCRIPTS, *more)), f"templates/{name}.js"]
+    page = {
+        "title": fragments["title"],
+        "style": _resource("viewer/view.css") + _resource("templates/report.css"),
+        "body": _fill(_resource(f"templates/{name}.html"), fragments),
+        "data": _script_json(data),
+        "script": "".join(map(_resource, scripts)),
+    }
+    write_text_atomically(path, _fill(_resource("templates/page.html"), page))
 
 
 def _head(summary: ResultSummary) -> str:
@@ -176,22 +186,17 @@ def _provenance(provenance: Provenance) -> str:
     return f"<section><h2>To repeat this run</h2>{''.join(parts)}</section>" if parts else ""
 
 
-def script_json(values: Mapping[str, object]) -> str:
+def _script_json(values: Mapping[str, object]) -> str:
     """JSON that cannot end the <script> element around it."""
     text = json.dumps(values, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def viewer_script() -> str:
-    """The code that draws a view, which the service's page loads as files."""
-    return "".join(resource(f"viewer/{name}") for name in VIEWER_SCRIPTS)
-
-
-def resource(name: str) -> str:
+def _resource(name: str) -> str:
     """The text of a file beside this module."""
     return files("hsloc.report").joinpath(*name.split("/")).read_text(encoding="utf-8")
 
 
-def fill(template: str, fragments: Mapping[str, str]) -> str:
+def _fill(template: str, fragments: Mapping[str, str]) -> str:
     """Put each fragment in the place of its {{name}}, in one pass: what a fragment holds is never a place."""
     return re.sub(r"\{\{(\w+)\}\}", lambda found: fragments[found[1]], template)

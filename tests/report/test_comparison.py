@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from report_parts import view_in
 
 from hsloc.cli.main import main
 from hsloc.evaluation.error_metrics import ErrorMetrics
@@ -59,8 +59,7 @@ def test_the_page_is_whole_and_loads_nothing(results: Path, tmp_path: Path) -> N
     assert (tmp_path / "c.html").read_bytes() == first
     text = first.decode()
     assert not re.search(r"https?:|[\"'(]//[^ ]|@import|url\(|fetch\(", re.sub(r"base64,[^\"]+", "", text))
-    (source,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, flags=re.S)
-    one, two = json.loads(source)["runs"]
+    one, two = view_in(text)["runs"]
     assert one["data"]["map"]["image"].startswith("data:image/png")
     assert "map" not in two["data"]
     assert two["data"]["trajectory"]["x"][0] == pytest.approx(one["data"]["trajectory"]["x"][0] + 0.01, abs=2e-3)

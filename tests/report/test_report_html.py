@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 from evaluation_paths import diagnostics_of
 from PIL import Image
+from report_parts import NOTHING, parts, view_in
 
 from hsloc.analysis import ScanOverlay
 from hsloc.errors import OutputError
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
 from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.report.charts import run_charts
-from hsloc.report.data import Provenance, ReportParts, prepare
+from hsloc.report.data import Provenance, ReportParts
 from hsloc.report.html import write_report_html
 from hsloc.report.view import MOST_MARKS, MOST_POSES, runs, view_of
 from hsloc.warnings import RunWarning
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 NASTY = "<script>alert('x')</script> & \"quoted\" {{data}} {{nothing}} ]]> <b>"
 VOID = {"meta", "input", "br", "link"}
-NOTHING = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
 
 
 class Page(HTMLParser):
@@ -64,10 +64,6 @@ class Page(HTMLParser):
 
     def within(self, tag: str) -> str:
         return "".join(data for name, data in self.text if name == tag)
-
-
-def parts(trajectory: Trajectory, **others: Any) -> Any:
-    return prepare(ReportParts(title="", trajectory=trajectory, **others))
 
 
 def write(tmp_path: Path, **arguments: Any) -> tuple[str, Page]:
@@ -122,11 +118,6 @@ def test_text_is_text(run: dict[str, Any], tmp_path: Path) -> None:
     assert page.all("b") == []
 
 
-def view_in(text: str) -> Any:
-    (source,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, flags=re.S)
-    return json.loads(source)
-
-
 def test_the_view_holds_what_the_run_holds(run: dict[str, Any], tmp_path: Path) -> None:
     view = view_in(write(tmp_path, **run)[0])
     charts = {chart["name"]: chart for chart in view["charts"]}
@@ -160,8 +151,7 @@ def test_the_view_holds_what_the_run_holds(run: dict[str, Any], tmp_path: Path) 
 )
 def test_any_part_may_be_missing(run: Any, tmp_path: Path, kept: Any) -> None:
     write(tmp_path, trajectory=run["trajectory"], **{name: run[name] for name in kept})
-    nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
-    write(tmp_path, trajectory=nothing, **{name: run[name] for name in kept})
+    write(tmp_path, trajectory=NOTHING, **{name: run[name] for name in kept})
     still = Trajectory(run["trajectory"].stamps_ns, run["trajectory"].poses * 0.0)
     write(tmp_path, trajectory=still, **{name: run[name] for name in kept})
 
@@ -252,6 +242,14 @@ def test_without_a_pose_times_begin_with_the_first_scan(run: dict[str, Any]) -> 
     view, _ = view_of(ReportParts(title="", trajectory=NOTHING, diagnostics=diagnostics, overlay=overlay))
     assert view["scans"]["t"] == pytest.approx((diagnostics.stamps_ns[[0, 20]] - diagnostics.stamps_ns[0]) / 1e9)
     assert view["status"][0]["runs"][0][0] == 0.0
+
+
+def test_a_view_is_drawn_once_and_stays_as_it_is(run: dict[str, Any], tmp_path: Path) -> None:
+    shown = ReportParts(title="office.mcap", **run)
+    view = view_of(shown)
+    write_report_html(tmp_path / "given.html", shown, view)
+    assert "image" not in view.values["map"]
+    assert (tmp_path / "given.html").read_text(encoding="utf-8") == write(tmp_path, **run)[0]
 
 
 def test_where_it_cannot_be_written(run: dict[str, Any], tmp_path: Path) -> None:

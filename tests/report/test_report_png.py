@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from evaluation_paths import diagnostics_of, office
 from PIL import Image
+from report_parts import NOTHING, parts
 
 from hsloc.errors import OutputError
 from hsloc.evaluation import PoseStatistics, RelationsResult, Statistics
@@ -18,7 +19,7 @@ from hsloc.evaluation.metrics import compare
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
 from hsloc.model.pose2 import compose_poses
 from hsloc.report.charts import run_charts
-from hsloc.report.data import Curve, ReportParts, jumps_of, prepare, reason_counts, status_counts, with_gaps
+from hsloc.report.data import Curve, ReportParts, jumps_of, reason_counts, status_counts, with_gaps
 from hsloc.report.map_image import darkest_of_blocks, grey_levels, line_width, shown_extent
 from hsloc.report.png import draw_report
 from hsloc.report.png_panels import format_round_length, round_length
@@ -27,12 +28,6 @@ from hsloc.run_metrics import MapMetrics, ResidualMetrics
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-NOTHING = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
-
-
-def parts(trajectory: Trajectory, **others: Any) -> Any:
-    return prepare(ReportParts(title="", trajectory=trajectory, **others))
 
 
 def pixels(path: Any) -> Any:

@@ -24,6 +24,7 @@ from hsloc.maps import save_map
 from hsloc.report.data import ReportParts
 from hsloc.report.html import write_report_html
 from hsloc.report.png import draw_report
+from hsloc.report.view import view_of
 from hsloc.slam.map_state import STATE_FILE, write_state
 from hsloc.trajectory_io.tum import format_stamp
 
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
     from hsloc.localisation.states import StateRows
     from hsloc.replay.run import Result
+    from hsloc.report.view import ReportView
     from hsloc.run_metrics import RunMetrics, RunTimings
 
 STATES_HEADER = ("t", "state", "probability", "sigma_x", "sigma_y", "sigma_theta", "fitness", "reason")
@@ -45,11 +47,11 @@ _OF_RESULTS = (("metrics.json", "config.yaml"), ("results.json", "report.md"))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WrittenResults:
-    """What was written: the analysis of the run, its wall times, and what the reports show."""
+    """What was written: the analysis of the run, its wall times, and what report.html draws."""
 
     analysis: Analysis
     timings: RunTimings
-    parts: ReportParts
+    view: ReportView
 
     @property
     def metrics(self) -> RunMetrics:
@@ -114,11 +116,12 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
     write_json(folder / "metrics.json", analysis.metrics.to_json())
     (folder / "config.yaml").write_text(config_text(result), encoding="utf-8")
     draw_report(folder / "report.png", parts)
-    write_report_html(folder / "report.html", parts)
+    view = view_of(parts)
+    write_report_html(folder / "report.html", parts, view)
     seconds["reports"] = time.perf_counter() - begin
     timings = run_timings(result, seconds)
     write_json(folder / "timings.json", timings.to_json())
-    return WrittenResults(analysis, timings, parts)
+    return WrittenResults(analysis, timings, view)
 
 
 def report_parts(result: Result, analysis: Analysis) -> ReportParts:

@@ -58,9 +58,8 @@ def merge_maps(paths: Sequence[Path], seed: int = 0, progress: Callable[[float],
         before = len(merged.poses)
         first = Pose2.from_array(result.keyscan_poses[before])
         placed.append(first @ Pose2.from_array(state.poses[0]).inverse())
-        reference = result.submap_references
-        ends = [(reference[loop.first], reference[loop.second]) for loop in result.loops if loop.accepted]
-        joints.append(sum(bool(a < before <= b) for a, b in ends))
+        ends = zip(result.loops, result.loop_ends().tolist(), strict=True)
+        joints.append(sum(loop.accepted and a < before <= b for loop, (a, b) in ends))
         assert result.state is not None
         merged = replace(result.state, name=f"{merged.name} and {state.name}")
     assert result is not None

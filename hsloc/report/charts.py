@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.model import Status
-from hsloc.report.data import LOG_ABOVE, Curve
+from hsloc.report.data import Curve
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
     Spans = tuple[tuple[float, float], ...]
+
+
+LOG_ABOVE = 25.0
+"""A curve whose highest value is this many times its median is drawn on a logarithmic scale."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +45,7 @@ class Chart:
 
     @property
     def is_logarithmic(self) -> bool:
-        """Whether the highest value is so many times the median that only powers of ten show both."""
+        """Whether the highest value is so far above the median that only powers of ten show both."""
         known = self.curve.values[np.isfinite(self.curve.values)]
         if self.top is not None or not len(known):
             return False
@@ -56,10 +60,9 @@ def run_charts(data: ReportData) -> list[Chart]:
     """
     charts = []
     if data.errors is not None:
-        metres, angle = data.errors.translation_m, data.errors.rotation_deg
-        in_cm = Curve(metres.seconds, metres.values * 100.0)
+        in_cm = _scaled(data.errors.translation_m, 100.0)
         charts.append(Chart("error_cm", "Translation error", "cm", in_cm, _ERROR))
-        charts.append(Chart("error_deg", "Rotation error", "deg", angle, _ERROR))
+        charts.append(Chart("error_deg", "Rotation error", "deg", data.errors.rotation_deg, _ERROR))
     if data.far is not None:
         charts.append(Chart("far_cm", "Scan to map, 90 % of points", "cm", _scaled(data.far, 100.0), _FAR))
     scans = data.scans
@@ -100,8 +103,8 @@ def convergence_charts(convergence: Mapping[str, tuple[Floats, Floats]]) -> list
             f"Convergence: {name}",
             "median best fitness over evaluations",
             Curve(np.asarray(evaluations, dtype=np.float64), np.asarray(fitness, dtype=np.float64)),
-            "Best fitness after so many tried poses, in searches of some scans of this run from a shifted start. Where "
-            "the curve is flat, a larger budget does not help.",
+            "Best fitness after this number of evaluations, in searches of some scans of this run from a shifted "
+            "start. Where the curve is flat, a larger budget does not help.",
             top=1.0,
             over_time=False,
         )
@@ -122,5 +125,4 @@ def _without_gaps(chart: Chart, lost: Spans) -> Chart:
         if not ((seconds >= begin) & (seconds < until)).any():
             row = int(np.searchsorted(seconds, begin))
             seconds, values = np.insert(seconds, row, begin), np.insert(values, row, np.nan)
-    kept = Curve(seconds, values)
-    return Chart(chart.name, chart.title, chart.unit, kept, chart.explanation, chart.top, chart.marks, chart.over_time)
+    return replace(chart, curve=Curve(seconds, values))

@@ -27,10 +27,6 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 
-LOG_ABOVE = 25.0
-"""A curve whose highest value is this many times its median is drawn on a logarithmic scale."""
-
-
 @dataclass(frozen=True, slots=True)
 class Provenance:
     """What it takes to repeat the run: the command as typed, the effective configuration as text, the versions
@@ -156,17 +152,17 @@ class ReportData:
     reference: Floats | None
     errors: Errors | None
     scans: Scans | None
-    lost: tuple[tuple[float, float], ...] = ()
+    lost: tuple[tuple[float, float], ...]
     """Spans (begin, end) in which the pose was not known [s]."""
-    jumps: NDArray[np.bool_] | None = None
+    jumps: NDArray[np.bool_]
     """Poses (n,) to which no line leads from the one before: the estimate jumped, or nothing was recorded between."""
-    reference_jumps: NDArray[np.bool_] | None = None
+    reference_jumps: NDArray[np.bool_] | None
     """The same of the reference."""
-    far: Curve | None = None
+    far: Curve | None
     """Distance to the map that nine of ten points of each scan stay below [m]."""
-    loops: Floats | None = None
+    loops: Floats | None
     """Both ends (k, 2, 2) of the loops that were closed [m]."""
-    is_built: bool = False
+    is_built: bool
     """Whether the map was built by the run."""
 
 
@@ -230,9 +226,8 @@ def prepare(parts: ReportParts) -> ReportData:
 
 def _closed(mapping: MappingResult) -> Floats:
     """Positions (k, 2, 2) of the submaps that accepted loops join."""
-    references = mapping.submap_references
-    pairs = [(references[loop.first], references[loop.second]) for loop in mapping.loops if loop.accepted]
-    return mapping.keyscan_poses[np.array(pairs, dtype=np.int64).reshape(-1, 2), :2]
+    accepted = np.array([loop.accepted for loop in mapping.loops], dtype=bool)
+    return mapping.keyscan_poses[mapping.loop_ends()[accepted], :2]
 
 
 def _far(overlay: ScanOverlay, start_ns: int) -> Curve:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from hsloc.evaluation.error_metrics import ErrorMetrics
     from hsloc.report.data import Provenance, ReportData, ReportParts
+    from hsloc.report.view import ReportView
     from hsloc.run_metrics import LaserMetrics, RunMetrics
 
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "sse", "count")
@@ -29,16 +30,16 @@ VIEWER_SCRIPTS = ("input.js", "charts.js", "view.js")
 """Files of hsloc/report/viewer, in the order in which they are needed."""
 
 
-def write_report_html(path: str | Path, parts: ReportParts) -> None:
+def write_report_html(path: str | Path, parts: ReportParts, view: ReportView | None = None) -> None:
     """Write the report of a run as one self-contained HTML file: the same run gives the same bytes.
 
-    All text is escaped. Raises `OutputError` where it cannot be written.
+    `view` is what `view_of(parts)` gave, where it is known already. All text is escaped. Raises `OutputError` where
+    the file cannot be written.
     """
     data, metrics = prepare(parts), parts.metrics
     summary = None if metrics is None else ResultSummary.of(metrics)
-    view, png = view_of(parts, data)
-    if png is not None:
-        view["map"]["image"] = data_url(png)
+    view = view_of(parts, data) if view is None else view
+    values = view.values if view.map_png is None else view.with_picture(data_url(view.map_png))
     fragments = {
         "title": escape(parts.title),
         "head": "" if summary is None else _head(summary),
@@ -49,7 +50,7 @@ def write_report_html(path: str | Path, parts: ReportParts) -> None:
         "provenance": _provenance(parts.provenance),
         "metrics": "" if metrics is None else escape(format_json(metrics.to_json())),
     }
-    write_page(Path(path), "report", fragments, view)
+    write_page(Path(path), "report", fragments, values)
 
 
 def write_page(path: Path, name: str, fragments: Mapping[str, str], data: Mapping[str, object], *more: str) -> None:
@@ -66,7 +67,7 @@ def write_page(path: Path, name: str, fragments: Mapping[str, str], data: Mappin
 
 
 def _head(summary: ResultSummary) -> str:
-    """Verdict, headline, facts, the figures that matter most, and what speaks against the result."""
+    """Verdict, headline, facts, the figures that matter most, and the reasons for the verdict."""
     key_figures = "".join(
         f'<div class="key-figure"><dt>{escape(row.label)}</dt><dd>{escape(" / ".join(row.values))}</dd>'
         f'<dd class="muted">{escape(row.explanation)}</dd></div>'

@@ -6,7 +6,7 @@ readers. Width, dash and mark distinguish the lines as well, so that the report 
 
 from __future__ import annotations
 
-BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
+BLUE, VERMILLION, GREEN, PURPLE, ORANGE = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00"
 
 INK, MUTED, RULE, PAPER = "#1f2328", "#656d76", "#d8dee4", "#ffffff"
 WALL, FREE, UNKNOWN = "#30363d", "#ffffff", "#eceff2"

@@ -1,6 +1,6 @@
 """What report.html and the web page draw of a run: map, paths, scans, loops, events and curves, as one JSON value.
 
-hsloc/report/templates/view.js draws it. Lengths are in metres and times in seconds since the first pose; columns have a
+hsloc/report/viewer/view.js draws it. Lengths are in metres and times in seconds since the first pose; columns have a
 bounded length, however long the run was.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from base64 import b64encode
 from io import BytesIO
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -45,13 +45,25 @@ _MOST_CM = 32767
 """Largest coordinate of a scan's point: 327 m."""
 
 
-def view_of(parts: ReportParts, data: ReportData | None = None) -> tuple[dict[str, Any], bytes | None]:
+class ReportView(NamedTuple):
     """The value for view.js, in which `map` lacks its picture, and this picture as PNG; None where nothing is known."""
+
+    values: dict[str, Any]
+    map_png: bytes | None
+
+    def with_picture(self, address: str) -> dict[str, Any]:
+        """The value with the address of the map's picture, where there is one."""
+        return {**self.values, "map": {**self.values["map"], "image": address}} if self.map_png else self.values
+
+
+def view_of(parts: ReportParts, data: ReportData | None = None) -> ReportView:
+    """What the reports draw of a run; `data` is what `prepare(parts)` gave, where it is known already."""
     data = prepare(parts) if data is None else data
     frame, png = _map(parts.grid)
     extent = shown_extent(data, parts.grid, parts.points)
     summary = None if parts.metrics is None else ResultSummary.of(parts.metrics)
     scans = data.scans
+    loops = None if parts.mapping is None else _loops(parts.mapping, data.start_ns)
     values = {
         "title": parts.title,
         "summary": None if summary is None else summary.to_json(),
@@ -65,13 +77,13 @@ def view_of(parts: ReportParts, data: ReportData | None = None) -> tuple[dict[st
         "lost": [[_round(begin), _round(end)] for begin, end in data.lost],
         "scans": _scans(parts, data.start_ns),
         "marks": [] if scans is None else _marks(scans),
-        "loops": None if parts.mapping is None else _loops(parts.mapping, data.start_ns),
+        "loops": loops,
         "ellipses": _ellipses(parts, data.start_ns),
-        "events": _events(parts, data),
+        "events": _events(parts, data, loops),
         "status": [] if scans is None else _status_rows(scans),
         "charts": [_chart(chart) for chart in (*run_charts(data), *convergence_charts(parts.convergence))],
     }
-    return values, png
+    return ReportView(values, png)
 
 
 def _end(data: ReportData) -> float:
@@ -97,9 +109,14 @@ def _map(grid: OccupancyGrid | None) -> tuple[dict[str, Any] | None, bytes | Non
     return frame, stream.getvalue()
 
 
+def _every(n: int, most: int) -> slice:
+    """At most `most` of n rows: every k-th."""
+    return slice(None, None, max(-(-n // most), 1))
+
+
 def _thinned(jumps: NDArray[np.bool_] | None, n: int, most: int) -> Rows:
     """At most about `most` of n rows: every k-th, the ends, and both sides of each jump."""
-    rows = np.arange(0, n, max(-(-n // most), 1))
+    rows = np.arange(n)[_every(n, most)]
     extra = np.zeros(0, dtype=np.intp) if jumps is None else np.flatnonzero(jumps)[:most]
     return np.union1d(rows, np.concatenate((extra, extra - 1, [n - 1]))) if n else rows
 
@@ -107,9 +124,9 @@ def _thinned(jumps: NDArray[np.bool_] | None, n: int, most: int) -> Rows:
 def _trajectory(parts: ReportParts, data: ReportData) -> dict[str, Any]:
     poses, n = parts.trajectory.poses, len(parts.trajectory)
     order = np.argsort(data.seconds, kind="stable")
-    jumps = np.zeros(n, dtype=bool) if data.jumps is None else data.jumps
     # The path is in the order of the log; its jumps are at rows of that order.
-    rows = _thinned(jumps, n, MOST_POSES) if (order == np.arange(n)).all() else order[_thinned(None, n, MOST_POSES)]
+    in_order = (order == np.arange(n)).all()
+    rows = _thinned(data.jumps, n, MOST_POSES) if in_order else order[_thinned(None, n, MOST_POSES)]
     states = parts.states or tuple("localised" if known else "lost" for known in data.localised)
     names = list(dict.fromkeys(states))
     codes = {name: code for code, name in enumerate(names)}
@@ -117,7 +134,7 @@ def _trajectory(parts: ReportParts, data: ReportData) -> dict[str, Any]:
         t=data.seconds[rows], x=poses[rows, 0], y=poses[rows, 1], theta=poses[rows, 2], decimals=3
     )
     result |= {"states": [str(name) for name in names], "state": [codes[states[row]] for row in rows]}
-    result["breaks"] = np.flatnonzero(jumps[rows]).tolist()
+    result["breaks"] = np.flatnonzero(data.jumps[rows]).tolist()
     if parts.covariances is not None and np.isfinite(parts.covariances).any():
         result["sigma"] = _numbers(np.sqrt(parts.covariances[rows, 0, 0] + parts.covariances[rows, 1, 1]), 4)
     if data.errors is not None:
@@ -177,7 +194,7 @@ def _marks(scans: Scans) -> list[dict[str, Any]]:
     found = []
     for status in (Status.NO_RETURNS, Status.REJECTED, Status.RELOCALISED):
         rows = np.flatnonzero(scans.where(status) & np.isfinite(scans.xy).all(axis=1))
-        rows = rows[:: max(1, -(-len(rows) // MOST_MARKS))]
+        rows = rows[_every(len(rows), MOST_MARKS)]
         marks = _columns(t=scans.seconds[rows], x=scans.xy[rows, 0], y=scans.xy[rows, 1], decimals=3)
         if len(rows):
             reasons = [scans.reason[row] for row in rows]
@@ -187,9 +204,7 @@ def _marks(scans: Scans) -> list[dict[str, Any]]:
 
 def _loops(mapping: MappingResult, start_ns: int) -> dict[str, Any]:
     """Both ends of all loops that were searched for, when the second was seen, and why the others were refused."""
-    references, loops = mapping.submap_references, mapping.loops
-    pairs = [(references[loop.first], references[loop.second]) for loop in loops]
-    ends = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    loops, ends = mapping.loops, mapping.loop_ends()
     first, second = (mapping.keyscan_poses[ends[:, k]] for k in (0, 1))
     seconds = since(mapping.keyscan_stamps_ns[ends[:, 1]], start_ns)
     return {
@@ -205,7 +220,7 @@ def _ellipses(parts: ReportParts, start_ns: int) -> dict[str, Any] | None:
     if covariances is None:
         return None
     rows = np.flatnonzero(np.isfinite(covariances[:, :2, :2]).all(axis=(1, 2)))
-    rows = rows[:: max(1, -(-len(rows) // MOST_ELLIPSES))]
+    rows = rows[_every(len(rows), MOST_ELLIPSES)]
     if not len(rows):
         return None
     seconds, poses, c = since(trajectory.stamps_ns[rows], start_ns), trajectory.poses[rows], covariances[rows]
@@ -213,7 +228,7 @@ def _ellipses(parts: ReportParts, start_ns: int) -> dict[str, Any] | None:
     return columns | _columns(xx=c[:, 0, 0], xy=c[:, 0, 1], yy=c[:, 1, 1], decimals=7)
 
 
-def _events(parts: ReportParts, data: ReportData) -> list[dict[str, Any]]:
+def _events(parts: ReportParts, data: ReportData, loops: dict[str, Any] | None) -> list[dict[str, Any]]:
     """What to jump to, in order of time: reasons of the verdict, losses and what ended them, loops, refused scans."""
     found: list[tuple[float, str, str]] = []
     if parts.metrics is not None:
@@ -224,12 +239,11 @@ def _events(parts: ReportParts, data: ReportData) -> list[dict[str, Any]]:
         ]
     for begin, end in data.lost:
         found += [(begin, "loss", f"the pose is not known until {end:.1f} s"), (end, "loss", "the pose is known again")]
-    if parts.mapping is not None:
-        loops = _loops(parts.mapping, data.start_ns)
+    if loops is not None:
         found += [(t, "loop", "a loop is closed") for t, ok in zip(loops["t"], loops["accepted"], strict=True) if ok]
     if data.scans is not None:
         rows = np.flatnonzero(data.scans.where(Status.REJECTED))
-        rows = rows[:: max(1, -(-len(rows) // MOST_MARKS))]
+        rows = rows[_every(len(rows), MOST_MARKS)]
         found += [(float(data.scans.seconds[row]), "rejected", data.scans.reason[row]) for row in rows]
     return [{"t": _round(t), "kind": kind, "text": text} for t, kind, text in sorted(found)]
 
@@ -240,7 +254,7 @@ def _status_rows(scans: Scans) -> list[dict[str, Any]]:
     rows = []
     for name, count in status_counts(scans).items():
         spans = runs(scans.seconds[scans.where(name)], 2.0 * spacing)
-        spans = spans[:: max(1, -(-len(spans) // MOST_MARKS))]
+        spans = spans[_every(len(spans), MOST_MARKS)]
         times = [[_round(begin), _round(end + spacing)] for begin, end in spans]
         rows.append({"status": name, "label": STATUS_WORDS.get(name, name), "count": count, "runs": times})
     return rows
@@ -264,7 +278,7 @@ def _chart(chart: Chart) -> dict[str, Any]:
         "t": _numbers(chart.curve.seconds[rows], 3), "v": _significant(chart.curve.values[rows]),
     }  # fmt: skip
     if chart.marks is not None and len(chart.marks.seconds):
-        kept = slice(None, None, max(1, -(-len(chart.marks.seconds) // MOST_MARKS)))
+        kept = _every(len(chart.marks.seconds), MOST_MARKS)
         values["marks"] = {"t": _numbers(chart.marks.seconds[kept], 3), "v": _significant(chart.marks.values[kept])}
     return values
 

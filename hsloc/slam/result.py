@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from hsloc.dataclass_json import Measured
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from hsloc.model.occupancy_grid import OccupancyGrid
@@ -93,3 +94,8 @@ class MappingResult:
     """What is saved to go on from; None if no scan had a return."""
     evidence: Evidence
     """Whether the map is right, as far as what was recorded tells."""
+
+    def loop_ends(self) -> NDArray[np.int64]:
+        """Rows of `keyscan_poses` (k, 2) that the k loops join, accepted or not: the frames of their submaps."""
+        pairs = [(loop.first, loop.second) for loop in self.loops]
+        return self.submap_references[np.array(pairs, dtype=np.int64).reshape(-1, 2)]

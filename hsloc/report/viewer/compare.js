@@ -5,8 +5,7 @@
   const make = (tag, text = "", className = "") => { const made = document.createElement(tag); made.textContent = text; made.className = className; return made; };
 
   function change(first, value) {
-    if (first === null || value === null || first === undefined || value === undefined || first === value) return "";
-    if (first === 0) return "";
+    if (first === null || value === null || first === undefined || value === undefined || first === value || first === 0) return "";
     const percent = 100 * (value - first) / Math.abs(first);
     if (Math.abs(percent) < 0.05) return "";
     return `${percent > 0 ? "+" : "−"}${Math.abs(percent) < 10 ? Math.abs(percent).toFixed(1) : Math.abs(percent).toFixed(0)} %`;

@@ -84,7 +84,7 @@ def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, 
         folder / "output",
         progress=lambda share: report("write", share, 1.0, scans),
     )
-    write_viewer(written.parts, folder / "output")
+    write_viewer(written.view, folder / "output")
     limits = exceeded_limits(request, written.metrics)
     found = {"outcome": "below_threshold" if limits else "ok", "limits": [line[:500] for line in limits]}
     return found | summarise(written.metrics, written.timings)

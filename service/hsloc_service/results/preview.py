@@ -5,19 +5,17 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-from hsloc.report.view import view_of
-
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from hsloc.report.data import ReportParts
+    from hsloc.report.view import ReportView
+
+_PICTURE = "viewer-map.png"
 
 
-def write_viewer(parts: ReportParts, folder: Path) -> None:
+def write_viewer(view: ReportView, folder: Path) -> None:
     """Write `viewer.json` and, where the map has a known cell, its picture `viewer-map.png`."""
-    view, png = view_of(parts)
-    if png is not None:
-        view["map"]["image"] = "viewer-map.png"
-        (folder / "viewer-map.png").write_bytes(png)
-    text = json.dumps(view, separators=(",", ":"), allow_nan=False)
+    if view.map_png is not None:
+        (folder / _PICTURE).write_bytes(view.map_png)
+    text = json.dumps(view.with_picture(_PICTURE), separators=(",", ":"), allow_nan=False)
     (folder / "viewer.json").write_text(text, encoding="utf-8")

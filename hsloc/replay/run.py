@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import signal
 import time
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
@@ -13,6 +11,7 @@ import numpy as np
 
 from hsloc.config import preset
 from hsloc.errors import ConfigError, LogError
+from hsloc.interrupts import interrupts_held_back
 from hsloc.kernels.cache import compilation_reported
 from hsloc.log import LogSummary, Losses, open_log
 from hsloc.matching.likelihood_field import LikelihoodField
@@ -358,21 +357,8 @@ def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:
     """Have the kernels compiled (once after an installation, up to a minute) before the clock of the replay starts."""
     points = np.zeros((1, 2))
     window = Window(likelihood.T_map_field, 0.1, 0.1, 0.1)
-    with interrupts_held_back():
+    with interrupts_held_back():  # A compiler that is interrupted may take the process with it.
         matcher.match(points, likelihood, window, np.random.default_rng(0))
-
-
-@contextmanager
-def interrupts_held_back() -> Iterator[None]:
-    """Hold back Ctrl-C until the end: a compiler that is interrupted may take the process with it."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _cut(request: RunRequest) -> bool:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import HslocError
-from hsloc.replay.run import interrupts_held_back
+from hsloc.interrupts import interrupts_held_back
 from hsloc.sweep.runs import BROKEN, FAILED, STOP, Outcome, SweepRun, sweep
 
 if TYPE_CHECKING:
@@ -99,10 +99,20 @@ def _note_interrupts() -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
+def _start_tracker() -> None:
+    """Start multiprocessing's tracker, if it does not run: its start ends with SIGINT unblocked in this thread."""
+    if hasattr(signal, "pthread_sigmask"):
+        from multiprocessing import resource_tracker
+
+        with interrupts_held_back():
+            resource_tracker.ensure_running()
+
+
 class _Pool(ProcessPoolExecutor):
     """Its processes hold back Ctrl-C until `_note_interrupts`: while they import, it would end in a traceback."""
 
     def submit(self, call: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        _start_tracker()
         with interrupts_held_back():
             return super().submit(call, *arguments, **named)
 

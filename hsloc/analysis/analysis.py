@@ -84,14 +84,18 @@ def analyse(
     residuals = Residuals(result.grid)
     check = ExtrinsicsCheck(likelihood, matcher, scans, lasers)
     sample = ConvergenceSample(likelihood, matcher, scans)
-    overlay = ScanOverlayBuilder(residuals, scans, _not_matched(result))
+    overlay = ScanOverlayBuilder(scans, _not_matched(result))
     for posed in posed_events(result, progress):
         if observer is not None:
             observer(posed)
         if isinstance(posed.event, PairedScan):
-            for statistics in (residuals, check, sample) if posed.localised else ():
-                statistics.add(posed.event.scan, posed.T_map_base)
-            overlay.add(posed.event.scan, posed.T_map_base)
+            scan, T_map_base = posed.event.scan, posed.T_map_base
+            distance = residuals.distances(scan, T_map_base)
+            if posed.localised:
+                residuals.add(scan, distance)
+                check.add(scan, T_map_base)
+                sample.add(scan, T_map_base)
+            overlay.add(scan, T_map_base, distance)
     errors = _Errors(result, request.alignment or ("se2" if result.mode == "slam" else "none"))
     found = (*quality_warnings(result), *offset_warnings(result), *residuals.warnings(), *check.warnings())
     warnings = (*result.warnings, *found)

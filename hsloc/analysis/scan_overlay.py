@@ -10,7 +10,6 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hsloc.analysis.scan_statistics import Residuals
     from hsloc.model.events import Scan
     from hsloc.model.pose2 import Pose2
 
@@ -45,9 +44,8 @@ class ScanOverlay:
 class ScanOverlayBuilder:
     """Collects a `ScanOverlay`; memory is bounded but for three numbers and a stamp for each scan."""
 
-    def __init__(self, residuals: Residuals, scans: int, not_matched_ns: NDArray[np.int64]) -> None:
+    def __init__(self, scans: int, not_matched_ns: NDArray[np.int64]) -> None:
         """`scans` is the number of scans to come, `not_matched_ns` the stamps of those that were not matched."""
-        self._residuals = residuals
         self._every = max(scans // SHOWN_SCANS, 1)
         step = max(-(-len(not_matched_ns) // SHOWN_NOT_MATCHED), 1)
         self._wanted = set(not_matched_ns[::step].tolist())
@@ -58,9 +56,8 @@ class ScanOverlayBuilder:
         self._points: list[Floats] = []
         self._distances: list[Floats] = []
 
-    def add(self, scan: Scan, T_map_base: Pose2) -> None:
-        """A scan, and the pose of the base at its stamp, whether that is known or a guess."""
-        distance = self._residuals.distances(scan, T_map_base)
+    def add(self, scan: Scan, T_map_base: Pose2, distance: NDArray[np.float32]) -> None:
+        """A scan, the pose of the base at its stamp (maybe a guess), and the points' distances (n,) to the map [m]."""
         n = len(distance)
         if (len(self._stamps) % self._every == 0 or scan.stamp_ns in self._wanted) and n:
             step = max(n // SHOWN_POINTS, 1)

@@ -71,9 +71,8 @@ class Residuals:
         distance[inside] = self._distance[cells[inside, 1], cells[inside, 0]]
         return distance
 
-    def add(self, scan: Scan, T_map_base: Pose2) -> None:
-        """Count the points of a scan; those outside the map count as far from any wall."""
-        distance = self.distances(scan, T_map_base)
+    def add(self, scan: Scan, distance: NDArray[np.float32]) -> None:
+        """Count the points of a scan with their `distances` (n,); those outside the map count as far from any wall."""
         bins = np.minimum(distance / _BIN_M, _BINS - 1).astype(np.int64)
         counts = self._by_laser.setdefault(scan.frame_id, np.zeros(_BINS, dtype=np.int64))
         counts += np.bincount(bins, minlength=_BINS)

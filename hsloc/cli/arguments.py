@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from math import isfinite
 from pathlib import Path
@@ -13,6 +14,7 @@ from hsloc.options import BY_NAME, offered
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+    from hsloc.client import Client
     from hsloc.log import ReadOptions
     from hsloc.model.pose2 import Pose2
     from hsloc.options import Door, Option
@@ -112,6 +114,21 @@ def add_read_arguments(parser: argparse.ArgumentParser) -> None:
     names = [option.name for option in offered("replay") if option.place == "read"]
     add_options(parser, "replay", names)
     add_no_progress(parser)
+
+
+def add_service(parser: argparse.ArgumentParser) -> None:
+    """Add `--url`, the address of a service."""
+    parser.add_argument(
+        "--url", default=os.environ.get("HSLOC_URL", "http://127.0.0.1:8000"),
+        help="Address of the service (default: $HSLOC_URL, else http://127.0.0.1:8000).",
+    )  # fmt: skip
+
+
+def service_client(arguments: argparse.Namespace) -> Client:
+    """A client of the service of `--url`, with the token of $HSLOC_TOKEN."""
+    from hsloc.client import Client
+
+    return Client(arguments.url, os.environ.get("HSLOC_TOKEN"))
 
 
 def add_no_progress(parser: argparse._ActionsContainer) -> None:

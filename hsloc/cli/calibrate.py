@@ -6,11 +6,11 @@ does not determine is named.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.cli.arguments import add_read_arguments, read_options
+from hsloc.cli.output import print_warnings
 from hsloc.cli.progress import ProgressLine
 
 if TYPE_CHECKING:
@@ -63,8 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(dumps(written.as_json(found), indent=2))
     elif not arguments.quiet:
-        for warning in found.summary.warnings:
-            print(f"hsloc: warning: {warning}", file=sys.stderr)
+        print_warnings(found.summary.warnings)
         print("\n".join(written.as_lines(found)))
         if found.estimate.determined[3:6].any():
             print(written.as_static_transform(found))

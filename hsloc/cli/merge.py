@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hsloc.cli.arguments import add_no_progress, whole
+from hsloc.cli.output import refuse_early
 from hsloc.cli.progress import ProgressLine
 
 if TYPE_CHECKING:
@@ -23,26 +25,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `hsloc merge`."""
     parser.add_argument("maps", nargs="+", metavar="MAP", help="Folder or map.npz of a mapping run; two or more.")
     parser.add_argument("--out", required=True, metavar="DIR", help="Folder to write, which must not exist.")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="Seed of all random numbers (default: 0).")
+    parser.add_argument("--seed", type=whole, default=0, metavar="N", help="Seed of all random numbers (default: 0).")
     parser.add_argument("--json", action="store_true", help="Print merge.json.")
     parser.add_argument("-q", "--quiet", action="store_true", help="Print errors only.")
-    parser.add_argument("--no-progress", action="store_true", help="Show no progress line.")
+    add_no_progress(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Merge and write; returns the exit code."""
     from json import dumps
 
-    from hsloc.errors import ConfigError, OutputError
+    from hsloc.errors import OutputError
     from hsloc.export.merged_map import merge_summary, write_merged_map
     from hsloc.replay.map_merge import merge_maps
 
     out = Path(arguments.out)
     if out.exists():
         raise OutputError(f"{out}: exists already; choose another --out")
-    if arguments.seed < 0:
-        raise ConfigError(f"--seed is {arguments.seed}; it must be 0 or more")
-    with ProgressLine(arguments.quiet or arguments.no_progress) as line:
+    refuse_early(out, overwrite=False)
+    with ProgressLine(arguments.quiet or arguments.json or arguments.no_progress) as line:
         merge = merge_maps(
             [Path(name) for name in arguments.maps], arguments.seed, lambda part: line.show("merge", part)
         )

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hsloc.cli.arguments import add_no_progress, add_options, values
+from hsloc.cli.arguments import add_no_progress, add_options, add_service, service_client, values
 from hsloc.cli.output import print_job
 from hsloc.cli.progress import ProgressLine
 from hsloc.options import BY_NAME, MATCHER_ALIASES, merged
@@ -30,10 +29,7 @@ The token, if the service asks for one, is read from $HSLOC_TOKEN.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Where to, what, and whether to wait."""
     parser.add_argument("log", nargs="+", type=Path, help="Logs, each one file; several are one run.")
-    parser.add_argument(
-        "--url", default=os.environ.get("HSLOC_URL", "http://127.0.0.1:8000"),
-        help="Address of the service (default: $HSLOC_URL, else http://127.0.0.1:8000).",
-    )  # fmt: skip
+    add_service(parser)
     parser.add_argument("--wait", action="store_true", help="Wait until the job has ended; 1 unless it succeeded.")
     parser.add_argument("--out", type=Path, metavar="DIR", help="Wait, and fetch the results into this folder.")
     parser.add_argument("--tag", metavar="TAG", help="Run the job only where workers were started with this tag.")
@@ -45,9 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Upload, submit, wait, fetch."""
     from hsloc.cli.main import EXIT_BELOW_LIMIT, EXIT_DATA_LOST, EXIT_FAILED, EXIT_OK
-    from hsloc.client import Client
 
-    client = Client(arguments.url, os.environ.get("HSLOC_TOKEN"))
+    client = service_client(arguments)
     with ProgressLine(arguments.quiet or arguments.no_progress) as line:
 
         def uploaded(done: int, total: int) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 from typing import TYPE_CHECKING, Any
+
+from hsloc.cli.arguments import add_service, service_client
 
 if TYPE_CHECKING:
     import argparse
@@ -20,20 +21,16 @@ The token, if the service asks for one, is read from $HSLOC_TOKEN; it needs the 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Whom to ask."""
-    parser.add_argument(
-        "--url", default=os.environ.get("HSLOC_URL", "http://127.0.0.1:8000"),
-        help="Address of the service (default: $HSLOC_URL, else http://127.0.0.1:8000).",
-    )  # fmt: skip
+    add_service(parser)
     parser.add_argument("--json", action="store_true", help="Print what the service answers.")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print; 1 if one of them is not alive."""
     from hsloc.cli.main import EXIT_FAILED, EXIT_OK
-    from hsloc.client import Client
     from hsloc.text_table import table
 
-    found: list[dict[str, Any]] = Client(arguments.url, os.environ.get("HSLOC_TOKEN")).workers()
+    found: list[dict[str, Any]] = service_client(arguments).workers()
     if arguments.json:
         print(json.dumps(found, indent=2))
     elif not found:

@@ -9,14 +9,11 @@ import numpy as np
 
 from hsloc.config import Config
 from hsloc.errors import MapError
-from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.model.pose2 import Pose2
-from hsloc.replay.map_sources import state_file
+from hsloc.replay.map_sources import read_saved_map, resumed
 from hsloc.slam.back_end import finish_session
 from hsloc.slam.map_extension import connect
 from hsloc.slam.map_session import from_map_state
-from hsloc.slam.map_state import STATE_FILE, read_state
-from hsloc.slam.parameters import Resume
 from hsloc.slam.trajectory_correction import EventLog
 
 if TYPE_CHECKING:
@@ -49,7 +46,7 @@ def merge_maps(paths: Sequence[Path], seed: int = 0, progress: Callable[[float],
     """
     if len(paths) < 2:
         raise MapError("a single map has nothing to be merged with; name two or more")
-    states = [_state(path) for path in paths]
+    states = [read_saved_map(path) for path in paths]
     merged, placed, joints = states[0], [Pose2(0.0, 0.0, 0.0)], [0]
     result: MappingResult | None = None
     for k, state in enumerate(states[1:], 1):
@@ -66,19 +63,11 @@ def merge_maps(paths: Sequence[Path], seed: int = 0, progress: Callable[[float],
     return MapMerge(tuple(str(path) for path in paths), tuple(placed), tuple(joints), result)
 
 
-def _state(path: Path) -> MapState:
-    file = state_file(path)
-    if not file.exists():
-        raise MapError(f"{path}: no {STATE_FILE} there; merge needs the results of runs that built their maps")
-    return read_state(file)
-
-
 def _joined(old: MapState, new: MapState, seed: int, report: Callable[[float], None]) -> MappingResult:
     config, rng = Config(), np.random.default_rng(seed)
-    field = LikelihoodField.from_grid(old.grid, config.likelihood_field.sigma, config.likelihood_field.margin)
     # The steps of a saved map are mended already, and its odometry was held against it.
     parameters = replace(config.graph_mapper, use_odometry=False)
-    resume = Resume(old, field, config.make_matcher(), config.localiser.relocaliser)
+    resume = resumed(old, config, config.make_matcher())
     track = EventLog(parameters.front_end.turn_length)
     try:
         session = connect(resume, from_map_state(new, parameters), parameters, rng)

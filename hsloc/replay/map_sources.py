@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 from hsloc.errors import MapError
 from hsloc.maps import read_map
 from hsloc.maps.metadata import read_metadata
+from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.slam.map_state import STATE_FILE, fingerprint, read_state
+from hsloc.slam.parameters import Resume
 from hsloc.warnings import RunWarning, WarningCode
 
 _MAP_TYPES = ("nav_msgs/msg/OccupancyGrid", "foxglove.Grid")
@@ -17,8 +19,11 @@ _HEAD = 4096
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from hsloc.config import Config
     from hsloc.log import Log, LogSummary
+    from hsloc.matching.match import Matcher
     from hsloc.model.occupancy_grid import OccupancyGrid
+    from hsloc.model.pose2 import Pose2
     from hsloc.request import RunRequest
     from hsloc.slam.map_state import MapState
 
@@ -77,15 +82,27 @@ def load_grid(path: Path) -> tuple[OccupancyGrid, tuple[RunWarning, ...]]:
     return loaded.grid, loaded.warnings
 
 
+def read_saved_map(path: Path) -> MapState:
+    """The saved map of a mapping run: its folder of results, or the map.npz in it. Raises MapError."""
+    file = state_file(path)
+    if not file.exists():
+        raise MapError(f"{path}: no {STATE_FILE} there; give the results of a run that built its map")
+    return read_state(file)
+
+
+def resumed(state: MapState, config: Config, matcher: Matcher, begin: Pose2 | None = None) -> Resume:
+    """A saved map to go on from, with the field to search it by; `begin` is the first pose in it, if that is known."""
+    field = LikelihoodField.from_grid(state.grid, config.likelihood_field.sigma, config.likelihood_field.margin)
+    return Resume(state, field, matcher, config.localiser.relocaliser, begin)
+
+
 def load_state(request: RunRequest) -> tuple[MapState | None, tuple[RunWarning, ...]]:
     """The saved map that is to be extended, if one is, and warnings. Raises MapError."""
     path = request.resume
     if path is None:
         return None, ()
     file = state_file(path)
-    if not file.exists():
-        raise MapError(f"{path}: no {STATE_FILE} there; --resume needs the results of a run that built its map")
-    state = read_state(file)
+    state = read_saved_map(path)
     if state.fingerprint != fingerprint(request.mapping()):
         text = f"{file}: built with other parameters of the mapper; those of this run are used from here on"
         return state, (RunWarning(WarningCode.MAP_PARAMETERS_DIFFER, text),)

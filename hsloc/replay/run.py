@@ -24,13 +24,12 @@ from hsloc.preprocessing.odometry_resets import ContinuousOdometry
 from hsloc.preprocessing.odometry_watch import OdometryWatch, UnusableOdometry
 from hsloc.replay.engine import rarely_collected, replay
 from hsloc.replay.initial_pose import find_start, first_odometry
-from hsloc.replay.map_sources import find_map, load_state, require_map
+from hsloc.replay.map_sources import find_map, load_state, require_map, resumed
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory, pose_covariances
 from hsloc.request import RunRequest
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
-from hsloc.slam.parameters import Resume
 from hsloc.slam.point_mapper import PointMapper
 from hsloc.slam.time_offset import HINT_S, as_option, in_words, offset_warning, offsets_of_log
 from hsloc.warnings import RunWarning, WarningCode
@@ -334,12 +333,10 @@ def _mapper(request: RunRequest, state: MapState | None, lidar_only: bool) -> Ma
             raise ConfigError("the point mapper predicts with odometry; leave out --no-odom, or use --mapper graph")
         start = IDENTITY if request.initial_pose is None else request.initial_pose
         return PointMapper(request.matcher, request.config.point_mapper, np.random.default_rng(request.seed), start)
-    config = request.config
     resume = None
     if state is not None:
-        field = LikelihoodField.from_grid(state.grid, config.likelihood_field.sigma, config.likelihood_field.margin)
         begin = None if request.unknown_start else request.initial_pose
-        resume = Resume(state, field, request.matcher, config.localiser.relocaliser, begin)
+        resume = resumed(state, request.config, request.matcher, begin)
     return Mapper(
         replace(request.config.graph_mapper, use_odometry=not lidar_only), np.random.default_rng(request.seed), resume
     )

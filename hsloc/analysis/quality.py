@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.verdict import localisation_reasons
+from hsloc.localisation.states import localisation_reasons
 from hsloc.model.estimate import Status
 from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.slam.time_offset import Headings, find_offset, offset_warning, offsets_of_log

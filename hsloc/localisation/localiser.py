@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from hsloc.localisation.match_gate import MatchGate, MatchLimits
-from hsloc.localisation.motion import fuse_match, normalised_innovation, predict_covariance
-from hsloc.localisation.motion_gate import MotionGate
+from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate
+from hsloc.localisation.kalman_filter import fuse_match, normalised_innovation, predict_covariance
 from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, OdometryNoise, OmnidirectionalNoise
 from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
-from hsloc.localisation.track_monitor import TrackMonitor
+from hsloc.localisation.track_evidence import TrackMonitor
 from hsloc.matching.certificate import CertificateParameters, certify
 from hsloc.matching.covariance import match_information
 from hsloc.matching.exact import heuristic

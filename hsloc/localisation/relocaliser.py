@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.gates import MotionGate
 from hsloc.localisation.global_search import RelocaliserResult
 from hsloc.localisation.hypotheses import (
     RECORDED,
@@ -29,8 +30,7 @@ from hsloc.localisation.hypotheses import (
     likely_places,
     quick_matcher,
 )
-from hsloc.localisation.motion import fuse_match, predict_covariance
-from hsloc.localisation.motion_gate import MotionGate
+from hsloc.localisation.kalman_filter import fuse_match, predict_covariance
 from hsloc.localisation.track_evidence import MOST_FROM_RIVAL, USUAL_EXPLAINED, place_evidence, rival_evidence
 from hsloc.localisation.whole_map_search import join_scans
 from hsloc.matching.covariance import match_information

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.motion import predict_covariance
-from hsloc.localisation.smoothing import Anchor, between_matches, smooth_matches
+from hsloc.localisation.kalman_filter import Anchor, between_matches, predict_covariance, smooth_matches
 from hsloc.localisation.states import StateLog
 from hsloc.model.estimate import ScanDiagnostics, Status
 from hsloc.model.events import Odometry, PairedScan, Truth

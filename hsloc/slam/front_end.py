@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.motion import OdometryNoise
+from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.matching.hide import Hide
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Status

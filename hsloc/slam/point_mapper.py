@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import ConfigError
-from hsloc.localisation.motion import OdometryNoise, predict_covariance
+from hsloc.localisation.kalman_filter import predict_covariance
+from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Status
 from hsloc.model.events import HELD, Odometry, PairedScan

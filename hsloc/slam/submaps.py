@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.motion import predict_covariance
+from hsloc.localisation.kalman_filter import predict_covariance
 from hsloc.model.pose2 import IDENTITY, Pose2, compose_poses, relative_poses
 from hsloc.slam.local_map import LocalMap
 

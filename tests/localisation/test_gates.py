@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hsloc.localisation.match_gate import MatchGate, MatchLimits
-from hsloc.localisation.motion_gate import MotionGate
+from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate
 from hsloc.model import Pose2
 
 LIMITS = MatchLimits(min_fitness=0.3, min_fitness_ratio=0.7, recovery_fitness_ratio=0.9)

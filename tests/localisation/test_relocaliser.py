@@ -10,7 +10,7 @@ import pytest
 from rooms import L_SHAPE, beside, grid, seen
 
 from hsloc.errors import ConfigError
-from hsloc.localisation.motion import OdometryNoise
+from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
 from hsloc.matching import Hide, LikelihoodField
 from hsloc.model import Pose2, wrap_angle

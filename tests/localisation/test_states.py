@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from hsloc.export.results_folder import STATES_HEADER, write_states
-from hsloc.localisation.states import StateLog, StateRows
-from hsloc.localisation.verdict import localisation_reasons
+from hsloc.localisation.states import StateLog, StateRows, localisation_reasons
 from hsloc.model import Estimate, Evidence, Pose2, State, Status, Trajectory
 from hsloc.model.verdict import Verdict, verdict_of
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from drives import ape_rmse, drive
 
-from hsloc.localisation.motion import OdometryNoise
+from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.model import Odometry, PairedScan, Pose2
 from hsloc.simulation.odometer import Slip
 from hsloc.simulation.presets import preset

@@ -1,15 +1,36 @@
-"""The match gate: which matches are accepted, and after how many refusals in a row the pose is lost.
+"""The gates of localiser and mapper: which scans are matched, and which matches are accepted.
 
-A match is measured by its fitness and by the usual fitness, an exponentially weighted mean over the matches accepted
-before. Localiser and mapper share it; their limits differ.
+The motion gate opens after the robot has moved ([P] V; AMCL's update_min_d and update_min_a). The match gate measures a
+match by its fitness and by the usual fitness, an exponentially weighted mean over the matches accepted before, and
+counts refusals in a row. Localiser and mapper share it; their limits differ.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import hypot
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hsloc.model.pose2 import Pose2
+
 
 _WEIGHT_OF_NEW = 0.05
 """Weight of a new match in the usual fitness: its memory is about 20 matches."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionGate:
+    """Open where a motion is long enough or turns far enough."""
+
+    min_distance: float
+    """Least translation that opens the gate [m], 0 or more."""
+    min_angle: float
+    """Least rotation that opens the gate [rad], 0 or more."""
+
+    def is_open(self, motion: Pose2) -> bool:
+        """Whether a motion since the last scan that was used reaches one of the limits."""
+        return hypot(motion.x, motion.y) >= self.min_distance or abs(motion.theta) >= self.min_angle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

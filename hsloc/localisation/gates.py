@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from hsloc.model.pose2 import Pose2
 
-
 _WEIGHT_OF_NEW = 0.05
 """Weight of a new match in the usual fitness: its memory is about 20 matches."""
 

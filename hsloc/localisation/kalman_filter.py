@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     F64 = NDArray[np.float64]
 
-
 _MAX_SQUARED = 16.3
 """Squared difference by its covariance, prediction to smoothed pose, up to which it was noise: the 99.9 % quantile
 of chi squared with 3 degrees of freedom. Beyond it a wheel slipped."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.beam_classes import SHORT, THROUGH, UNMAPPED, classify_beams
+from hsloc.kernels.beams import SHORT, THROUGH, UNMAPPED, classify_beams
 from hsloc.kernels.fitness import point_scores
 from hsloc.localisation.hypotheses import Own, bounded_search, fittest_other
 from hsloc.matching.harmony_search import low_discrepancy_order

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
     from hsloc.model.trajectory import Trajectory
 
-
 CONFIDENCE = 0.9
 """Least probability that the track is right for a pose to be called localised."""
 MAX_SIGMA = 0.1
@@ -35,7 +34,6 @@ _SETTLED = 5
 """Matches after which the covariance no longer knows how a track began."""
 _BRIDGED_M = 2.0
 """Over this path length of refused scans the pose is interpolated if the next match agrees with the prediction (m)."""
-
 
 USABLE_SHARE = 0.5
 """Least share of localised poses of a result that is usable as a whole."""

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from hsloc.model.events import PairedScan
     from hsloc.model.pose2 import Pose2
 
-
 States = tuple[float, float, float]
 """A number for each state: right, alike, astray."""
 
@@ -83,7 +82,6 @@ _SEVERAL, _LEAST_USUAL_OF_SEVERAL = 3, 0.65
 """So many comparisons that vouch for the track show what is usual even on a poor map; not below this, though."""
 _CERTIFIED_M = 6.0
 """A comparison that leaves the others behind vouches for the scans of this path length before it (m)."""
-
 
 _FEWEST_JOINED = 4
 """Scans that a place is compared by, at least."""

@@ -2,7 +2,7 @@
 
 Unlike a search that samples, the answer is complete: every pose on open ground that is fitter than `bound` lies within
 the radius and angle of one of the modes. Coarse squares of places and intervals of headings are ruled out first
-(hsloc/kernels/map_search.py), what is left is searched in continuous boxes (hsloc/kernels/box_search.py).
+(hsloc/kernels/map_search.py), what is left is searched in continuous boxes (hsloc/kernels/branch_and_bound.py).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 
-from hsloc.kernels.box_search import BoxSearch, maximise
+from hsloc.kernels.branch_and_bound import BoxSearch, maximise
 from hsloc.kernels.fitness import fitness_many
 from hsloc.kernels.map_search import Clusters, expected_loss, fit_boxes
 from hsloc.matching.certificate import lever

@@ -1,7 +1,7 @@
 """What can be proven about a match: that no pose of the window is fitter, and how fit any other place can be at most.
 
 A search such as HIDE finds a pose and knows nothing of those it did not look at. Branch and bound over continuous boxes
-(hsloc/kernels/box_search.py) starts from that pose, rules out all others, or finds the fitter one. See
+(hsloc/kernels/branch_and_bound.py) starts from that pose, rules out all others, or finds the fitter one. See
 docs/certificates.md for what this states about a robot, and what it does not.
 """
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from hsloc.kernels.box_search import BoxSearch, maximise
+from hsloc.kernels.branch_and_bound import BoxSearch, maximise
 from hsloc.matching.covariance import match_covariance
 from hsloc.matching.harmony_search import half_widths_in, information_at, low_discrepancy_order
 from hsloc.matching.score_pyramid import score_pyramid

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import MapError
-from hsloc.kernels.distance_transform import column_distances, squared_distances
 from hsloc.kernels.fitness import fitness_many, pack, point_scores
+from hsloc.kernels.score_field import column_distances, squared_distances
 from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle
 
 if TYPE_CHECKING:

@@ -20,9 +20,8 @@ from hsloc.matching.window import Window
 from hsloc.model.estimate import Status
 from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle
 from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive, Ratio
-from hsloc.slam.keyscans import KeyScan
+from hsloc.slam.keyscans import SURPRISE, KeyScan, MovingScan, RecentScans, ScanRegistration, fused_covariance
 from hsloc.slam.local_map import LocalMap
-from hsloc.slam.recent_scans import SURPRISE, MovingScan, RecentScans, ScanRegistration, fused_covariance
 
 if TYPE_CHECKING:
     from numpy.random import Generator

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.score_field_update import decay_table, splat
+from hsloc.kernels.score_field import decay_table, splat
 from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.model.pose2 import Pose2
 

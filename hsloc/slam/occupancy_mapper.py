@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from hsloc.errors import ConfigError
-from hsloc.kernels.occupancy_counts import trace
+from hsloc.kernels.beams import trace
 from hsloc.model.occupancy_grid import UNKNOWN, OccupancyGrid
 from hsloc.model.pose2 import Pose2
 from hsloc.parameters import NonNegative, Parameters, Positive, Range

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.window_motion import composed_motions, window_motions
+from hsloc.kernels.registration import composed_motions, window_motions
 from hsloc.model.pose2 import wrap_angles
 from hsloc.slam.marginals import information_of_a_point
 

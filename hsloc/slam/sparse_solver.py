@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import bsr_array, csc_array, tril
 from scipy.sparse.linalg import splu
 
-from hsloc.kernels.selected_inverse import diagonal_blocks, selected_inverse
+from hsloc.kernels.normal_equations import diagonal_blocks, selected_inverse
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from hsloc.config import Config
+    from hsloc.sweep.remote import RemoteLog, UrlFolder
     from hsloc.sweep.runs import Outcome, SweepRun
     from hsloc.sweep.shards import Shard
 
@@ -30,13 +31,20 @@ EXAMPLES = """
   hsloc sweep run.mcap --out compare --matcher hide --matcher icp --csv
   hsloc sweep logs/*.mcap --out nightly --shard 0/4
   hsloc sweep --merge --out nightly
+  hsloc sweep 's3://bucket/logs/*.mcap' --out s3://bucket/nightly --shard auto/4
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Logs, what to vary, and how."""
-    parser.add_argument("log", nargs="*", type=Path, help="Logs; each is a run of its own. With --merge: folders.")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="Folder of all results.")
+    parser.add_argument(
+        "log", nargs="*", type=_place,
+        help="Logs, or URLs such as s3://bucket/*.mcap; each is a run of its own. With --merge: folders.",
+    )  # fmt: skip
+    parser.add_argument(
+        "--out", type=_place, required=True, metavar="DIR",
+        help="Folder of all results, or its URL, such as s3://bucket/nightly.",
+    )  # fmt: skip
     parser.add_argument(
         "--jobs", "-j", type=_positive, default=1, metavar="N", help="Runs at the same time (default: 1)."
     )
@@ -71,9 +79,9 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.cli.main import EXIT_USAGE
     from hsloc.errors import OutputError
     from hsloc.sweep.shards import merge, write_shard
-    from hsloc.sweep.table import as_csv, as_json, as_markdown, as_text, rows
+    from hsloc.sweep.table import as_csv, as_json, as_markdown, as_parquet, as_text, rows
 
-    folder: Path = arguments.out
+    folder: Path | UrlFolder = arguments.out
     if not arguments.merge and not arguments.log:
         print("hsloc sweep: error: no log is given (see hsloc sweep --help)", file=sys.stderr)
         return EXIT_USAGE
@@ -93,6 +101,8 @@ def run(arguments: argparse.Namespace) -> int:
             (folder / "sweep.csv").write_text(as_csv(table), encoding="utf-8")
             (folder / "sweep.json").write_text(as_json(table), encoding="utf-8")
             (folder / "sweep.md").write_text(as_markdown(table), encoding="utf-8")
+            if (content := as_parquet(table)) is not None:
+                (folder / "sweep.parquet").write_bytes(content)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
     form = as_json if arguments.json else as_csv if arguments.csv else as_text
@@ -101,10 +111,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _plan(arguments: argparse.Namespace) -> list[SweepRun]:
+    from hsloc.sweep.remote import UrlFolder, remote_logs
     from hsloc.sweep.runs import plan
 
+    logs: list[Path | RemoteLog] = []
+    for place in arguments.log:
+        logs += remote_logs(place.url) if isinstance(place, UrlFolder) else [place]
     common = {name: value for name, value in values(arguments).items() if not BY_NAME[name].varied and name != "set"}
-    return plan(arguments.log, configs(arguments), arguments.seeds, **common)
+    return plan(logs, configs(arguments), arguments.seeds, **common)
 
 
 def _sweep(arguments: argparse.Namespace, runs: list[SweepRun]) -> list[Outcome]:
@@ -167,6 +181,15 @@ def configs(arguments: argparse.Namespace) -> dict[str, tuple[str, Config]]:
 
 def _label(before: str, added: str, keep: object) -> str:
     return f"{before}-{added}" if keep else added
+
+
+def _place(text: str) -> Path | UrlFolder:
+    """A path, or what is at a URL."""
+    if "://" not in text:
+        return Path(text)
+    from hsloc.sweep.remote import UrlFolder
+
+    return UrlFolder(text)
 
 
 def varied(text: str) -> tuple[str, list[Any]]:

@@ -17,13 +17,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from hsloc.sweep.remote import UrlFolder
+
 _THREADS = "NUMBA_NUM_THREADS"
 DASK_TIMEOUT_S = 10.0
 """Time within which a scheduler must answer [s]."""
 
 
 def sweep_in_processes(
-    runs: Sequence[SweepRun], folder: Path, jobs: int, progress: Callable[[Outcome], None] | None = None
+    runs: Sequence[SweepRun], folder: Path | UrlFolder, jobs: int, progress: Callable[[Outcome], None] | None = None
 ) -> list[Outcome]:
     """As `sweep`, in `jobs` processes.
 
@@ -47,7 +49,7 @@ def sweep_in_processes(
 
 
 def sweep_on_dask(
-    runs: Sequence[SweepRun], folder: Path, address: str, progress: Callable[[Outcome], None] | None = None
+    runs: Sequence[SweepRun], folder: Path | UrlFolder, address: str, progress: Callable[[Outcome], None] | None = None
 ) -> list[Outcome]:
     """As `sweep`, on the workers of the Dask scheduler at `address` (`tcp://HOST:PORT`), which see the same folders.
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import tempfile
 import threading
 import traceback
 from concurrent.futures import as_completed
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,7 @@ from hsloc.replay.map_sources import map_file, state_file
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
 from hsloc.run_metrics import RunMetrics, RunTimings
+from hsloc.sweep.remote import RemoteLog, UrlFolder
 from hsloc.version import __version__
 
 if TYPE_CHECKING:
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor, Future
 
     from hsloc.config import Config
+    from hsloc.replay.run import Result
 
 KEY_FILE = "sweep_key.json"
 """In a run's folder: what it was made of."""
@@ -43,12 +46,16 @@ DONE, SKIPPED, FAILED = "done", "skipped", "failed"
 
 @dataclass(frozen=True, slots=True)
 class SweepRun:
-    """One run: the name of its folder, the labels of its row, and what to run."""
+    """One run: the name of its folder, the labels of its row, and what to run.
+
+    The logs of the request are names only where `remote` has the log.
+    """
 
     name: str
     log: str
     config: str
     request: RunRequest
+    remote: RemoteLog | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +67,7 @@ class Outcome:
 
     run: SweepRun
     state: str
-    folder: Path
+    folder: Path | UrlFolder
     metrics: RunMetrics | None = None
     timings: RunTimings | None = None
     error: str = ""
@@ -77,7 +84,7 @@ class Outcome:
 
 
 def plan(
-    logs: Sequence[Path | Sequence[Path]],
+    logs: Sequence[Path | RemoteLog | Sequence[Path]],
     configs: Mapping[str, Config | tuple[str, Config]],
     seeds: Iterable[int] = (0,),
     **common: Any,
@@ -90,7 +97,11 @@ def plan(
     seeds = list(seeds)
     labels: dict[str, int] = {}
     for paths in logs:
-        parts = (paths,) if isinstance(paths, Path) else tuple(paths)
+        remote = paths if isinstance(paths, RemoteLog) else None
+        if isinstance(paths, RemoteLog):
+            parts: tuple[Path, ...] = (Path(paths.name),)
+        else:
+            parts = (paths,) if isinstance(paths, Path) else tuple(paths)
         label = parts[0].name.split(".")[0] or "log"
         labels[label] = labels.get(label, 0) + 1
         if labels[label] > 1:
@@ -99,14 +110,16 @@ def plan(
             preset, config = item if isinstance(item, tuple) else ("default", item)
             for seed in seeds:
                 values = {**common, "preset": preset, "config": config, "seed": seed}
+                if remote is not None:
+                    values["bare_names"] = True  # The folder of its copy must not be a part of the results.
                 request = RunRequest.from_values(parts, values)
-                runs.append(SweepRun(f"{label}-{name}-seed{seed}".replace("/", "_"), label, name, request))
+                runs.append(SweepRun(f"{label}-{name}-seed{seed}".replace("/", "_"), label, name, request, remote))
     return runs
 
 
 def sweep(
     runs: Sequence[SweepRun],
-    folder: Path,
+    folder: Path | UrlFolder,
     executor: Executor,
     progress: Callable[[Outcome], None] | None = None,
 ) -> list[Outcome]:
@@ -128,11 +141,11 @@ def sweep(
     try:
         for index, item in enumerate(runs):
             try:
-                key = run_key(item.request, hashes)
+                key = run_key(item.request, hashes, item.remote)
+                known = finished(item, folder, key)
             except HslocError as error:
                 settle(index, Outcome(item, FAILED, folder / item.name, error=str(error)))
                 continue
-            known = finished(item, folder, key)
             if known is not None:
                 settle(index, known)
                 continue
@@ -156,28 +169,41 @@ def sweep(
 BROKEN = "the process ended: "
 
 
-def _broken(item: SweepRun, folder: Path, error: Exception) -> Outcome:
+def _broken(item: SweepRun, folder: Path | UrlFolder, error: Exception) -> Outcome:
     reason = (str(error).splitlines() or [type(error).__name__])[0]
     return Outcome(item, FAILED, folder / item.name, error=f"{BROKEN}{reason}")
 
 
-def do_run(item: SweepRun, folder: Path, key: str) -> Outcome:
+def do_run(item: SweepRun, folder: Path | UrlFolder, key: str) -> Outcome:
     """One run, in whatever process the executor chose; raises nothing but BaseException."""
     target = folder / item.name
     try:
-        result = run(item.request, _heed_stop)
-        # Only what looks like a run of ours is replaced.
-        written = write_results(result, target, overwrite=(target / "metrics.json").exists(), progress=_heed_stop)
-        (target / KEY_FILE).write_text(json.dumps({"key": key}) + "\n", encoding="utf-8")
-        return Outcome(item, DONE, target, written.metrics, written.timings)
+        request = item.request
+        if item.remote is not None:
+            request = replace(request, logs=(item.remote.fetch(),))
+        result = run(request, _heed_stop)
+        if isinstance(target, Path):
+            metrics, timings = _write(result, target, key)
+        else:
+            with tempfile.TemporaryDirectory(prefix="hsloc-run-") as local:
+                metrics, timings = _write(result, Path(local) / item.name, key)
+                target.replace(Path(local) / item.name, KEY_FILE)
+        return Outcome(item, DONE, target, metrics, timings)
     except HslocError as error:
         return Outcome(item, FAILED, target, error=str(error))
     except Exception as error:  # A defect of ours must not end the sweep; its trace is kept for the report of it.
         reason = (str(error).splitlines() or [""])[0]
         trace = folder / f"{item.name}.error.txt"
-        with suppress(OSError):
+        with suppress(OSError, HslocError):
             trace.write_text(traceback.format_exc(), encoding="utf-8")
         return Outcome(item, FAILED, target, error=f"{type(error).__name__}: {reason} (see {trace})")
+
+
+def _write(result: Result, target: Path, key: str) -> tuple[RunMetrics, RunTimings]:
+    # Only what looks like a run of ours is replaced.
+    written = write_results(result, target, overwrite=(target / "metrics.json").exists(), progress=_heed_stop)
+    (target / KEY_FILE).write_text(json.dumps({"key": key}) + "\n", encoding="utf-8")
+    return written.metrics, written.timings
 
 
 def _heed_stop(_: object) -> None:
@@ -185,21 +211,22 @@ def _heed_stop(_: object) -> None:
         raise KeyboardInterrupt
 
 
-def finished(item: SweepRun, folder: Path, key: str) -> Outcome | None:
+def finished(item: SweepRun, folder: Path | UrlFolder, key: str) -> Outcome | None:
     """The outcome of a run that was done before with the same key."""
     target = folder / item.name
     try:
         if json.loads((target / KEY_FILE).read_text(encoding="utf-8"))["key"] != key:
             return None
-        metrics = RunMetrics.read(target / "metrics.json")
+        metrics = RunMetrics.from_json(json.loads((target / "metrics.json").read_text(encoding="utf-8")))
         timings = RunTimings.from_json(json.loads((target / "timings.json").read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError, HslocError):
         return None
     return Outcome(item, SKIPPED, target, metrics, timings)
 
 
-def run_key(request: RunRequest, hashes: dict[Path, str] | None = None) -> str:
-    """Hash of all that decides a run: version, options, and the bytes of its files.
+def run_key(request: RunRequest, hashes: dict[Path, str] | None = None, remote: RemoteLog | None = None) -> str:
+    """Hash of all that decides a run: version, options, and the bytes of its files; of a log at a URL what its store
+    says of them.
 
     `hashes` remembers those of files between calls. Raises HslocError where a file cannot be read.
     """
@@ -216,7 +243,10 @@ def run_key(request: RunRequest, hashes: dict[Path, str] | None = None) -> str:
         path: str | Path | None = getattr(request, name)
         if path is not None and Path(path).is_file():
             values[name] = [Path(path).name, _digest(Path(path), hashes)]
-    values["input"] = [_log_digest(path, hashes) for path in request.logs]
+    if remote is not None:
+        values["input"] = [[file.path, file.size, file.version] for file in remote.files]
+    else:
+        values["input"] = [_log_digest(path, hashes) for path in request.logs]
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 
 

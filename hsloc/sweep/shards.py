@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.atomic_write import write_text_atomically
 from hsloc.errors import HslocError
+from hsloc.sweep.remote import UrlFolder
 from hsloc.sweep.runs import DONE, FAILED, SKIPPED, request_values
 from hsloc.sweep.table import COLUMNS, rows
 
@@ -90,12 +91,14 @@ def _from_environment(environment: Mapping[str, str]) -> tuple[int, int | None]:
 
 
 def plan_hash(runs: Sequence[SweepRun]) -> str:
-    """Hash of what a sweep is: names and options of all its runs, without the bytes of their logs."""
-    values = [[item.name, request_values(item.request)] for item in runs]
+    """Hash of what a sweep is: names and options of all its runs, without the bytes and the places of their logs."""
+    values = [[item.name, {**request_values(item.request), "bare_names": False}] for item in runs]
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def write_shard(folder: Path, shard: Shard, runs: Sequence[SweepRun], outcomes: Sequence[Outcome]) -> Path:
+def write_shard(
+    folder: Path | UrlFolder, shard: Shard, runs: Sequence[SweepRun], outcomes: Sequence[Outcome]
+) -> Path | UrlFolder:
     """Write the table of one part of a sweep of `runs`, whole or not at all; its path. Raises OutputError."""
     path = folder / f"sweep-shard-{shard.index}-of-{shard.count}.json"
     content = {
@@ -105,11 +108,15 @@ def write_shard(folder: Path, shard: Shard, runs: Sequence[SweepRun], outcomes: 
         "runs": len(runs),
         "rows": rows(outcomes),
     }
-    write_text_atomically(path, json.dumps(content, indent=2) + "\n")
+    text = json.dumps(content, indent=2) + "\n"
+    if isinstance(path, UrlFolder):
+        path.write_text(text)
+    else:
+        write_text_atomically(path, text)
     return path
 
 
-def merge(folders: Sequence[Path]) -> list[dict[str, Any]]:
+def merge(folders: Sequence[Path | UrlFolder]) -> list[dict[str, Any]]:
     """The rows of a whole sweep, in the order of its plan, from the tables of its parts in any of the folders.
 
     Where a part was done twice, a row that did not fail counts, then that of the folder named first. A run that was
@@ -135,12 +142,12 @@ def merge(folders: Sequence[Path]) -> list[dict[str, Any]]:
     return [merged[index] for index in sorted(merged)]
 
 
-def _tables(folder: Path) -> list[Path]:
+def _tables(folder: Path | UrlFolder) -> list[Path | UrlFolder]:
     found = [(re.findall(r"\d+", path.name), path) for path in folder.glob(_FILES)]
-    return [path for _, path in sorted(found, key=lambda each: ([int(text) for text in each[0]], each[1]))]
+    return [path for _, path in sorted(found, key=lambda each: ([int(text) for text in each[0]], str(each[1])))]
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path | UrlFolder) -> dict[str, Any]:
     """The table of a part. Raises HslocError for anything else."""
     try:
         part = json.loads(path.read_text(encoding="utf-8"))

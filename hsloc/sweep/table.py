@@ -101,6 +101,29 @@ def as_csv(table: Sequence[Row]) -> str:
     return stream.getvalue()
 
 
+_TEXTS = ("run", "log", "config", "state", "verdict", "limits", "error")
+_WHOLE = ("seed", "scans", "used")
+
+
+def as_parquet(table: Sequence[Row]) -> bytes | None:
+    """The same columns with types that do not depend on the values; None where the package pyarrow is missing."""
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError:
+        return None
+
+    def kind(name: str) -> Any:
+        if name in _TEXTS:
+            return pyarrow.string()
+        return pyarrow.int64() if name in _WHOLE else pyarrow.bool_() if name == "data_lost" else pyarrow.float64()
+
+    stream = io.BytesIO()
+    schema = pyarrow.schema([(name, kind(name)) for name in COLUMNS])
+    parquet.write_table(pyarrow.Table.from_pylist([dict(row) for row in table], schema=schema), stream)
+    return stream.getvalue()
+
+
 _SHOWN = (
     ("run", "run", "{}"),
     ("state", "state", "{}"),

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,10 +20,12 @@ from ruamel.yaml import YAML
 
 from hsloc.cli.main import build_parser, main
 from hsloc.config import Config
-from hsloc.errors import HslocError
+from hsloc.errors import HslocError, LogError, OutputError
 from hsloc.sweep import process_pool
-from hsloc.sweep.runs import DONE, FAILED, SKIPPED, Outcome, SweepRun, plan, sweep
+from hsloc.sweep.remote import RemoteLog, UrlFolder, remote_logs
+from hsloc.sweep.runs import DONE, FAILED, SKIPPED, Outcome, SweepRun, finished, plan, sweep
 from hsloc.sweep.shards import Shard, merge, parse_shard, plan_hash, write_shard
+from hsloc.sweep.table import as_parquet
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -133,16 +138,93 @@ def test_shards_of_the_command_make_the_same_table_as_one_sweep(
     common = ["sweep", *logs, "--end", "1.5", "-q"]
     assert main([*common, "--out", str(tmp_path / "one")]) == 1  # one log is missing
     monkeypatch.setenv("JOB_COMPLETION_INDEX", "0")
-    assert main([*common, "--out", str(tmp_path / "parts"), "--shard", "auto/2"]) == 1
-    assert main([*common, "--out", str(tmp_path / "parts"), "--shard", "1/2"]) == 0
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / HALL.name).symlink_to(HALL)
+    assert main([*common, "--out", f"file://{tmp_path}/parts", "--shard", "auto/2"]) == 1
+    common[2] = f"file://{tmp_path}/logs/*.mcap"
+    assert main([*common, "--out", f"file://{tmp_path}/parts", "--shard", "1/2"]) == 0
     assert not (tmp_path / "parts" / "sweep.csv").exists()
     monkeypatch.chdir(tmp_path / "parts")
     assert main([*common, "--out", ".", "--shard", "1/2"]) == 0  # the same shard once more
     assert main(["sweep", "--merge", "--out", "."]) == 1
     assert rows_of(tmp_path / "parts" / "sweep.json") == rows_of(tmp_path / "one" / "sweep.json")
+    for path in (tmp_path / "one" / "hall-default-seed0").glob("[jmt]*[.jt][sux]*"):
+        assert (
+            path.name == "timings.json"
+            or path.read_bytes() == (tmp_path / "parts" / path.parent.name / path.name).read_bytes()
+        )
     capsys.readouterr()
     assert main(["sweep", "--out", "."]) == 2
     assert capsys.readouterr().err == "hsloc sweep: error: no log is given (see hsloc sweep --help)\n"
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_a_run_at_a_url_is_done_again_where_the_log_has_changed_or_it_is_not_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = shutil.copy(HALL, tmp_path)
+    words = ["sweep", f"file://{tmp_path}/*.mcap", "--end", "1", "--out", f"file://{tmp_path}/out", "-q", "--json"]
+
+    def state() -> str:
+        assert main(words) == 0
+        return str(json.loads(capsys.readouterr().out)[0]["state"])
+
+    assert state() == DONE
+    os.utime(log, (1, 1))
+    assert [state(), state()] == [DONE, SKIPPED]
+    folder = tmp_path / "out" / "hall-default-seed0"
+    assert not list(folder.glob(".*"))
+    for name in ("timings.json", "sweep_key.json"):
+        (folder / name).unlink()  # a machine died while it wrote
+        assert (
+            finished(plan(remote_logs(words[1]), {"default": Config()})[0], UrlFolder(f"file://{tmp_path}/out"), "")
+            is None
+        )
+    if (content := as_parquet(table := json.loads((tmp_path / "out" / "sweep.json").read_text()))) is not None:
+        parquet = pytest.importorskip("pyarrow.parquet")
+        assert parquet.read_table(io.BytesIO(content)).to_pylist() == table
+
+
+def test_urls_that_cannot_be_used_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def says(*words: str) -> str:
+        assert main(["sweep", *words, "-q"]) == 1
+        return capsys.readouterr().err.removeprefix("hsloc: error: ").splitlines()[-1]
+
+    out = ["--out", f"file://{tmp_path}/out"]
+    assert says(f"file://{tmp_path}/*.mcap", *out) == f"file://{tmp_path}/*.mcap: no log is there"
+    assert says(f"file://{tmp_path}/no.mcap", *out) == f"file://{tmp_path}/no.mcap: not found"
+    assert "Protocol not known: nothing" in says("nothing://x/*.mcap", *out)
+    (tmp_path / "file").touch()
+    assert "cannot be written" in says(str(OFFICE), "--end", "1", "--out", f"file://{tmp_path}/file/out")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").touch()
+    with pytest.raises(OutputError, match="is in use for something else"):
+        UrlFolder(f"file://{tmp_path}/out").replace(tmp_path, "metrics.json")
+    assert (tmp_path / "out" / "thesis.tex").exists()
+    log = remote_logs(f"file://{OFFICE}")[0]
+    with pytest.raises(LogError, match="it changed while it was read"):
+        RemoteLog(log.url, (replace(log.files[0], size=1),)).fetch()
+
+
+def test_a_folder_of_an_object_store_is_a_log(tmp_path: Path) -> None:
+    fs = pytest.importorskip("fsspec").filesystem("memory")
+    fs.pipe({"/bucket/logs/run/a.db3": b"one", "/bucket/logs/run/metadata.yaml": b"two", "/bucket/logs/b.mcap": b"b"})
+    run = remote_logs("memory://bucket/logs/run")[0]
+    assert [file.path for file in run.files] == ["a.db3", "metadata.yaml"]
+    assert [log.name for log in remote_logs("memory://bucket/logs/*")] == ["b.mcap", "run"]
+    folder = run.fetch()
+    assert [(path.name, path.read_text()) for path in sorted(folder.iterdir())] == [
+        ("a.db3", "one"), ("metadata.yaml", "two"),
+    ]  # fmt: skip
+    remote_logs("memory://bucket/logs/b.mcap")[0].fetch()
+    assert not folder.exists()
+    place = UrlFolder("memory://bucket/results")
+    for content in ("one", "two"):
+        (tmp_path / "metrics.json").write_text(content)
+        (tmp_path / "sweep_key.json").write_text(content)
+        place.replace(tmp_path, "sweep_key.json")
+    assert (place / "metrics.json").read_text() == "two"
+    assert [each.name for each in place.glob("*.json")] == ["metrics.json", "sweep_key.json"]
 
 
 @pytest.fixture

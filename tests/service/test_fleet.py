@@ -271,8 +271,8 @@ def test_a_store_that_cannot_be_used_is_named_by_its_setting(tmp_path: Path) -> 
 @pytest.fixture
 def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A bucket of moto's S3; the URL of a prefix in it."""
-    server = pytest.importorskip("moto.server", reason="S3 IS NOT TESTED: pip install 'moto[server]' s3fs")
-    s3fs = pytest.importorskip("s3fs", reason="S3 IS NOT TESTED: pip install 'moto[server]' s3fs")
+    server = pytest.importorskip("moto.server", reason="S3 IS NOT TESTED: pip install 'hsloc[dev]'")
+    s3fs = pytest.importorskip("s3fs", reason="S3 IS NOT TESTED: pip install 'hsloc[dev]'")
     running = server.ThreadedMotoServer("127.0.0.1", 0)
     running.start()
     host, port = running.get_host_and_port()

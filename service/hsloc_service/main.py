@@ -20,7 +20,7 @@ from hsloc_service.auth import SCOPES, Tokens
 from hsloc_service.backup import back_up
 from hsloc_service.db.database import database_place, open_database
 from hsloc_service.http.app import create_app
-from hsloc_service.http.timeouts import protocol_class
+from hsloc_service.http.middleware import protocol_class
 from hsloc_service.logs import configure
 from hsloc_service.settings import Settings, SettingsError
 from hsloc_service.storage import Storage

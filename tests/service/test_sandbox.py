@@ -13,7 +13,7 @@ import pytest
 from fastapi.testclient import TestClient
 from live_service import settings, submit, upload, wait
 
-from hsloc_service.execution import landlock
+from hsloc_service.execution import limits
 from hsloc_service.execution.sandbox import bubblewrap_problem, choose_sandbox
 from hsloc_service.http.app import create_app
 from hsloc_service.settings import Settings, SettingsError
@@ -31,7 +31,7 @@ RECORDINGS = Path(__file__).parents[2] / "recordings"
 def need(kind: str) -> None:
     if kind == "bubblewrap" and (reason := bubblewrap_problem()) is not None:
         pytest.skip(f"BUBBLEWRAP IS NOT TESTED: {reason} (apt-get install bubblewrap)")
-    if kind == "landlock" and landlock.abi() < landlock.MIN_ABI:
+    if kind == "landlock" and limits.landlock_abi() < limits.MIN_LANDLOCK_ABI:
         pytest.skip("LANDLOCK IS NOT TESTED: the kernel has none")
 
 
@@ -138,7 +138,7 @@ def test_a_tree_without_permissions_is_removed(tmp_path: Path) -> None:
 
 def test_where_no_sandbox_can_be_had_the_server_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "which", lambda name: None)
-    monkeypatch.setattr(landlock, "abi", lambda: 0)
+    monkeypatch.setattr(limits, "landlock_abi", lambda: 0)
     for wanted in ("auto", "bubblewrap", "landlock"):
         with pytest.raises(SettingsError, match=r"cannot be kept apart.*install bubblewrap.*HSLOC_SANDBOX=none"):
             choose_sandbox(wanted, tmp_path, ())

@@ -15,7 +15,7 @@ import httpx2 as httpx
 import pytest
 from live_service import upload
 
-from hsloc_service.reconciliation import reconcile
+from hsloc_service.housekeeping import reconcile
 from hsloc_service.uploads.repository import Files
 
 if TYPE_CHECKING:

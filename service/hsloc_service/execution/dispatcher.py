@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Protocol
 from sqlalchemy.exc import OperationalError
 
 from hsloc_service.execution.processes import kill_marked
+from hsloc_service.housekeeping import reconcile
 from hsloc_service.jobs.leases import new_owner
 from hsloc_service.logs import log
-from hsloc_service.reconciliation import reconcile
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import hsloc
 import hsloc_service
-from hsloc_service.execution import landlock
+from hsloc_service.execution import limits
 from hsloc_service.logs import log
 from hsloc_service.settings import SettingsError
 
@@ -117,9 +117,9 @@ def choose_sandbox(wanted: str, data: Path, command: tuple[str, ...]) -> Sandbox
             return Sandbox("bubblewrap", hidden, command)
         reasons.append(f"bubblewrap: {reason}")
     if wanted in ("auto", "if-possible", "landlock"):
-        if (version := landlock.abi()) >= landlock.MIN_ABI:
+        if (version := limits.landlock_abi()) >= limits.MIN_LANDLOCK_ABI:
             return Sandbox("landlock", hidden, command)
-        reasons.append(f"Landlock: the kernel has version {version}, {landlock.MIN_ABI} is needed")
+        reasons.append(f"Landlock: the kernel has version {version}, {limits.MIN_LANDLOCK_ABI} is needed")
     problem = f"jobs cannot be kept apart on this machine ({'; '.join(reasons)})"
     if wanted == "if-possible":
         log("sandbox.none", logging.WARNING, problem=problem)

@@ -25,12 +25,17 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from hsloc.replay.run import Progress
+    from hsloc.report.view import ReportView
     from hsloc.request import RunRequest
     from hsloc.run_metrics import RunMetrics, RunTimings
 
 EVERY_S = 0.25
 """Progress is told this often at most."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+_SUMMARISED = ("verdict", "run", "log", "scans", "localised", "ape", "relations", "losses")
+"""Keys of metrics.json that the job's row holds, too."""
+_MOST_LINES = 50
+_PICTURE = "viewer-map.png"
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -64,7 +69,6 @@ def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, 
     from hsloc.evaluation import read_relations
     from hsloc.export.results_folder import write_results
     from hsloc.replay.run import run
-    from hsloc_service.results.preview import write_viewer
 
     report("open", 0.0, 1.0, 0)
     request = make_request(job, folder)
@@ -88,11 +92,6 @@ def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, 
     limits = exceeded_limits(request, written.metrics)
     found = {"outcome": "below_threshold" if limits else "ok", "limits": [line[:500] for line in limits]}
     return found | summarise(written.metrics, written.timings)
-
-
-_SUMMARISED = ("verdict", "run", "log", "scans", "localised", "ape", "relations", "losses")
-"""Keys of metrics.json that the job's row holds, too."""
-_MOST_LINES = 50
 
 
 def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
@@ -204,6 +203,14 @@ def _throttled(tell: Callable[[dict[str, Any]], None]) -> Callable[[str, float, 
             tell({"phase": now_in, "part": done, "total": total, "scans": scans})
 
     return report
+
+
+def write_viewer(view: ReportView, folder: Path) -> None:
+    """Write `viewer.json` and, where the map has a known cell, its picture `viewer-map.png`."""
+    if view.map_png is not None:
+        (folder / _PICTURE).write_bytes(view.map_png)
+    text = json.dumps(view.with_picture(_PICTURE), separators=(",", ":"), allow_nan=False)
+    (folder / "viewer.json").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ from hsloc_service.call_timeout import BoundedExecutor
 from hsloc_service.execution.warm_up import WarmUp
 from hsloc_service.housekeeping import Housekeeping
 from hsloc_service.http import (
-    events_routes,
     files_routes,
     jobs_routes,
     metrics,
@@ -26,10 +25,9 @@ from hsloc_service.http import (
     system_routes,
     tus,
 )
-from hsloc_service.http.conditional import Conditional
 from hsloc_service.http.context import Context, known_query
-from hsloc_service.http.error_handlers import add_error_handlers
 from hsloc_service.http.guard import Guard
+from hsloc_service.http.middleware import Conditional, add_error_handlers
 from hsloc_service.http.openapi import add_openapi
 from hsloc_service.jobs.repository import Jobs
 from hsloc_service.jobs.workers import Presence
@@ -53,7 +51,6 @@ ROUTERS = tuple(
         files_routes,
         tus,
         jobs_routes,
-        events_routes,
         results_routes,
         run_routes,
         system_routes,

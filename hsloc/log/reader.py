@@ -172,9 +172,9 @@ def _container(file: LogFile) -> Container:
 
         return McapContainer(file.path, file.shown)
     if file.kind == "db3":
-        from hsloc.log.db3 import Db3Container
+        from hsloc.log.ros_bags import Db3Container
 
         return Db3Container(file.path, file.shown)
-    from hsloc.log.bags import BagContainer
+    from hsloc.log.ros_bags import BagContainer
 
     return BagContainer(file.path, file.shown)

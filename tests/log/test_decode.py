@@ -17,8 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from hsloc.errors import LogFormatError
 from hsloc.log.container import Channel
 from hsloc.log.messages import decode, definitions, encode
-from hsloc.log.messages import definition_compatibility as schema
-from hsloc.log.messages.decoders import Undecodable, decoder_for, is_decodable
+from hsloc.log.messages.decoders import Undecodable, decoder_for, is_decodable, is_known
 from hsloc.log.messages.from_objects import FROM_OBJECT
 from hsloc.log.session.scan_geometry import ScanFixes
 from hsloc.log.transforms import Transform3
@@ -177,9 +176,9 @@ uint32 nanosec
 
 
 def test_definitions_as_recorders_write_them_are_known() -> None:
-    assert schema.is_known(COMMENTED, definitions.LASER_SCAN)
+    assert is_known(COMMENTED, definitions.LASER_SCAN)
     for name in definitions.KNOWN_TYPES:
-        assert schema.is_known(definitions.definition_text(name), name)
+        assert is_known(definitions.definition_text(name), name)
 
 
 @pytest.mark.parametrize(
@@ -195,7 +194,7 @@ def test_definitions_as_recorders_write_them_are_known() -> None:
 )
 def test_a_definition_that_differs_in_a_field_is_not_known(old: str, new: str) -> None:
     assert old in COMMENTED
-    assert not schema.is_known(COMMENTED.replace(old, new), definitions.LASER_SCAN)
+    assert not is_known(COMMENTED.replace(old, new), definitions.LASER_SCAN)
 
 
 def test_a_drifted_definition_is_decoded_by_what_the_log_says() -> None:

@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.cli.output import print_lines
     from hsloc.errors import OutputError
     from hsloc.evaluation.metrics import format_json
-    from hsloc.report.comparison import comparison_rows, read_runs, write_comparison
+    from hsloc.report.html import comparison_rows, read_runs, write_comparison
     from hsloc.text_table import table
 
     out: Path | None = arguments.out

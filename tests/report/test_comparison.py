@@ -14,9 +14,8 @@ from hsloc.cli.main import main
 from hsloc.evaluation.error_metrics import ErrorMetrics
 from hsloc.evaluation.metrics import compare
 from hsloc.model import Trajectory
-from hsloc.report.comparison import change, read_runs
 from hsloc.report.data import ReportParts
-from hsloc.report.html import write_report_html
+from hsloc.report.html import change, read_runs, write_report_html
 from hsloc.report.summary import ResultSummary
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from hsloc.dataclass_json import from_json, json_schema, to_json
 from hsloc.errors import HslocError
 from hsloc.evaluation import RelationsResult
 from hsloc.evaluation.error_metrics import ErrorMetrics
-from hsloc.evaluation.map_quality import Crispness, MapComparison
+from hsloc.evaluation.maps import Crispness, MapComparison
 from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.slam.result import MappingQuality
 from hsloc.warnings import RunWarning

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import EvaluationError
-from hsloc.evaluation.map_quality import compare_maps, crispness
+from hsloc.evaluation.maps import compare_maps, crispness
 from hsloc.evaluation.metrics import compare_run
 from hsloc.log import LaserSummary
 from hsloc.matching import summarise

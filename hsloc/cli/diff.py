@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import argparse
 
-    from hsloc.evaluation.map_changes import MapChanges
+    from hsloc.evaluation.maps import MapChanges
     from hsloc.model import OccupancyGrid, Pose2
 
 HELP = "what changed between two maps"
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from hsloc.dataclass_json import to_json
     from hsloc.errors import MapError
-    from hsloc.evaluation.map_changes import map_changes
+    from hsloc.evaluation.maps import map_changes
     from hsloc.replay.map_merge import merge_maps
     from hsloc.replay.map_sources import load_grid
 

@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     from json import dumps
 
     from hsloc.errors import OutputError
-    from hsloc.export.merged_map import merge_summary, write_merged_map
+    from hsloc.export.results_folder import merge_summary, write_merged_map
     from hsloc.replay.map_merge import merge_maps
 
     out = Path(arguments.out)

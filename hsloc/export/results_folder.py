@@ -10,12 +10,13 @@ import csv
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hsloc.analysis import Analysis, analyse, run_timings
 from hsloc.atomic_write import whole_folder
+from hsloc.dataclass_json import to_json
 from hsloc.errors import OutputError
 from hsloc.evaluation import write_json, write_tum
 from hsloc.export.provenance import config_text, provenance
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.localisation.states import StateRows
+    from hsloc.replay.map_merge import MapMerge
     from hsloc.replay.run import Result
     from hsloc.report.view import ReportView
     from hsloc.run_metrics import RunMetrics, RunTimings
@@ -43,6 +45,8 @@ STATES_HEADER = ("t", "state", "probability", "sigma_x", "sigma_y", "sigma_theta
 """Columns of states.csv: what is known of each pose of trajectory.tum, line by line in its order."""
 _OF_RESULTS = (("metrics.json", "config.yaml"), ("results.json", "report.md"))
 """Files that a folder of results holds, of a run or of the reproduced experiments, and no other folder."""
+
+COVARIANCES_HEADER = "t,xx,xy,xtheta,yy,ytheta,thetatheta"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,9 +168,6 @@ def write_states(path: Path, stamps_ns: NDArray[np.int64], rows: StateRows) -> N
             writer.writerow((format_stamp(stamp_ns), state.value, *figures, reason))
 
 
-COVARIANCES_HEADER = "t,xx,xy,xtheta,yy,ytheta,thetatheta"
-
-
 def write_covariances(path: Path, stamps_ns: NDArray[np.int64], covariances: NDArray[np.float64]) -> None:
     """Write one line for each of the n stamps: seconds, and the upper triangle of (n, 3, 3) in m^2, m rad and rad^2."""
     rows, columns = np.triu_indices(3)
@@ -175,3 +176,23 @@ def write_covariances(path: Path, stamps_ns: NDArray[np.int64], covariances: NDA
     for stamp_ns, row in zip(stamps_ns.tolist(), upper.tolist(), strict=True):
         lines.append(f"{format_stamp(stamp_ns)},%.4g,%.4g,%.4g,%.4g,%.4g,%.4g" % tuple(row))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def merge_summary(merge: MapMerge) -> dict[str, Any]:
+    """The content of merge.json: verdict, where each map lies (m, rad), the loops that join it, the map's quality."""
+    maps = [
+        {"map": name, "x": pose.x, "y": pose.y, "yaw": pose.theta, "loops": joints}
+        for name, pose, joints in zip(merge.names, merge.T_first_map, merge.joints, strict=True)
+    ]
+    return {**merge.mapping.evidence.to_dict(), "maps": maps, "mapping": to_json(merge.mapping.quality)}
+
+
+def write_merged_map(merge: MapMerge, folder: Path) -> None:
+    """Write map.yaml and map.pgm, map.npz to go on from, graph.g2o and merge.json. Raises OutputError."""
+    state = merge.mapping.state
+    with whole_folder(folder) as partial:
+        save_map(merge.mapping.grid, partial)
+        merge.mapping.graph.write_g2o(partial / "graph.g2o")
+        if state is not None:
+            write_state(state, partial / STATE_FILE)
+        write_json(partial / "merge.json", merge_summary(merge))

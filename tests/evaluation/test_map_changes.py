@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.cli.main import main
-from hsloc.evaluation.map_changes import map_changes
+from hsloc.evaluation.maps import map_changes
 from hsloc.maps import save_map
 from hsloc.model import OccupancyGrid, Pose2
 

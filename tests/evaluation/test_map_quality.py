@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hsloc.dataclass_json import to_json
 from hsloc.errors import EvaluationError
-from hsloc.evaluation.map_quality import compare_maps, crispness
+from hsloc.evaluation.maps import compare_maps, crispness
 from hsloc.model import OccupancyGrid, Pose2
 
 

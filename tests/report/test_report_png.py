@@ -14,7 +14,7 @@ from report_parts import NOTHING, parts
 
 from hsloc.errors import OutputError
 from hsloc.evaluation import PoseStatistics, RelationsResult, Statistics
-from hsloc.evaluation.map_quality import MapComparison
+from hsloc.evaluation.maps import MapComparison
 from hsloc.evaluation.metrics import compare
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
 from hsloc.model.pose2 import compose_poses

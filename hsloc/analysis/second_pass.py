@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from hsloc.log import open_log
 from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2
-from hsloc.preprocessing.odometry_resets import ContinuousOdometry
+from hsloc.preprocessing.odometry import ContinuousOdometry
 from hsloc.replay.engine import pair, rarely_collected
 
 if TYPE_CHECKING:

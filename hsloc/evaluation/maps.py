@@ -11,16 +11,14 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from hsloc.dataclass_json import Measured
+from hsloc.dataclass_json import Measured  # noqa: TC001 - read by get_type_hints
 from hsloc.errors import EvaluationError
-from hsloc.model import IDENTITY
 from hsloc.model.occupancy_grid import UNKNOWN, OccupancyGrid
 from hsloc.model.pose2 import IDENTITY
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hsloc.model import Pose2
     from hsloc.model.pose2 import Pose2
 
     Floats = NDArray[np.float64]

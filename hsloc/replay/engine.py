@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from hsloc.model.events import Odometry, PairedScan, Scan, Truth
 from hsloc.model.pose2 import IDENTITY, Pose2
-from hsloc.preprocessing.deskew import deskewed
-from hsloc.preprocessing.merge_scans import merged_scans
+from hsloc.preprocessing.scans import deskewed, merged_scans
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -20,8 +20,7 @@ from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
 from hsloc.options import AUTO
-from hsloc.preprocessing.odometry_resets import ContinuousOdometry
-from hsloc.preprocessing.odometry_watch import OdometryWatch, UnusableOdometry
+from hsloc.preprocessing.odometry import ContinuousOdometry, OdometryWatch, UnusableOdometry
 from hsloc.replay.engine import rarely_collected, replay
 from hsloc.replay.initial_pose import find_start, first_odometry
 from hsloc.replay.map_sources import find_map, load_state, require_map, resumed

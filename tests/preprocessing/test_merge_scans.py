@@ -7,7 +7,7 @@ import pytest
 
 from hsloc.model import Odometry, Pose2, Scan
 from hsloc.model.events import PairedScan
-from hsloc.preprocessing.merge_scans import merged_scans
+from hsloc.preprocessing.scans import merged_scans
 
 MS = 1_000_000
 

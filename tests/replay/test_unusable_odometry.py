@@ -14,7 +14,7 @@ from hsloc.log import ReadOptions, open_log
 from hsloc.log.messages import definitions, encode
 from hsloc.log.messages.decode import odometry as decode_odometry
 from hsloc.model import Odometry, Pose2, Scan
-from hsloc.preprocessing.odometry_watch import OdometryWatch, UnusableOdometry
+from hsloc.preprocessing.odometry import OdometryWatch, UnusableOdometry
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
 

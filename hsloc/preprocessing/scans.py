@@ -1,0 +1,148 @@
+"""Scans paired with odometry: deskewed, and those of several lasers merged.
+
+A lidar that turns while the robot drives measures each beam from another place. Beam i was measured at
+`stamp + i * time_increment`; odometry gives the pose of the base at that time. The scan waits for the odometry of its
+last beam.
+
+Scans of several lasers taken at about the same time are matched as one cloud. Matched one by one, lasers that measure
+together would not all be used: the first scan after each step of the robot passes the motion gate, and that is always
+the same laser's. One laser's view also determines less than all of them together. So a scan is held until every laser
+has a scan of about the same time; the last of them has the others as companions.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.model.events import Odometry, PairedScan
+from hsloc.model.pose2 import relative_poses
+from hsloc.model.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from hsloc.model.events import Scan, Truth
+
+    Paired = Odometry | PairedScan | Truth
+
+_RECENT = 512
+"""Odometry messages that are kept. Internal: a fifth of a second at 2.5 kHz, longer than a sweep."""
+_WAITING = 16
+"""Maximum number of scans that wait for odometry; then the odometry until now is used. Internal: bounds the memory."""
+_LONGEST_SWEEP_NS = 2_000_000_000
+"""Maximum duration of a sweep. Internal: no lidar turns more slowly, a longer one is an error of the log."""
+
+_JITTER = 0.1
+"""Tolerance for jitter of stamps as a ratio to the period.
+
+Scans of n lasers are merged within (n - 1) / n of the slowest laser's period plus this: where all turn equally fast,
+(n - 1) / n of it always contain a scan of each. Internal: it follows from how drivers stamp."""
+_USUAL_PERIOD_NS, _LONGEST_PERIOD_NS = 100_000_000, 400_000_000
+"""A laser's period before it is known, and its maximum. Internal: 2D lidars turn at 5 to 40 Hz."""
+_SILENT_NS = 500_000_000
+"""Silence after which a laser is not waited for. Internal: longer than the longest period."""
+
+
+def deskewed(events: Iterable[Paired]) -> Iterator[Paired]:
+    """Events as `hsloc.replay.engine.pair` gives them, each scan with where the base was at each of its beams.
+
+    A scan comes behind the odometry of its last beam; scans keep their order. Without `time_increment` (or with one
+    that makes a turn of over two seconds) a scan stays as it is.
+    """
+    recent: deque[Odometry] = deque(maxlen=_RECENT)
+    waiting: deque[PairedScan] = deque()
+    for event in events:
+        if isinstance(event, PairedScan):
+            waiting.append(event)
+        else:
+            yield event
+            if isinstance(event, Odometry):
+                recent.append(event)
+        while waiting and (len(waiting) > _WAITING or (recent and _is_covered(waiting[0].scan, recent[-1]))):
+            yield _moved(waiting.popleft(), recent)
+    while waiting:
+        yield _moved(waiting.popleft(), recent)
+
+
+def _sweep_ns(scan: Scan) -> int:
+    """Time from the first beam to the last; negative where the last one was first."""
+    sweep = (len(scan.ranges) - 1) * scan.time_increment * 1e9
+    return round(sweep) if abs(sweep) <= _LONGEST_SWEEP_NS else 0
+
+
+def _is_covered(scan: Scan, latest: Odometry) -> bool:
+    sweep = _sweep_ns(scan)
+    return sweep <= 0 or latest.stamp_ns >= scan.stamp_ns + sweep
+
+
+def _moved(paired: PairedScan, recent: Iterable[Odometry]) -> PairedScan:
+    scan = paired.scan
+    sweep = _sweep_ns(scan)
+    if sweep == 0 or len(scan.ranges) == 0:
+        return paired
+    first, last = scan.stamp_ns + min(sweep, 0) - _LONGEST_SWEEP_NS, scan.stamp_ns + max(sweep, 0) + _LONGEST_SWEEP_NS
+    poses_then = [(o.stamp_ns, o.T_odom_base) for o in recent if first <= o.stamp_ns <= last]
+    track = Trajectory.from_pairs([*poses_then, (scan.stamp_ns, paired.T_odom_base)])
+    beams = np.arange(len(scan.ranges), dtype=np.float64)
+    stamps = scan.stamp_ns + np.round(beams * (scan.time_increment * 1e9)).astype(np.int64)
+    poses = track.interpolated(stamps)
+    base = np.broadcast_to(paired.T_odom_base.to_array(), poses.shape)
+    return replace(paired, scan=replace(scan, T_base_beam=relative_poses(base, poses)))
+
+
+def merged_scans(events: Iterable[Paired]) -> Iterator[Paired]:
+    """Events as `hsloc.replay.engine.pair` gives them, scans of several lasers (by `frame_id`) merged.
+
+    All events pass in their order. Each scan is either held (`is_held`), or is to be matched together with its
+    `companions`, which were. Without odometry the motion between two scans is unknown: none is held then.
+    """
+    lasers = _Lasers()
+    has_odometry = False
+    for event in events:
+        has_odometry = has_odometry or isinstance(event, Odometry)
+        yield lasers.merge(event) if has_odometry and isinstance(event, PairedScan) else event
+
+
+class _Lasers:
+    """The last scan and the last match of each laser, and the scans that are held."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, int] = {}
+        self._period: dict[str, int] = {}
+        self._held: dict[str, PairedScan] = {}
+        self._matched: dict[str, int] = {}
+
+    def merge(self, paired: PairedScan) -> PairedScan:
+        """The scan, held or with its companions."""
+        frame, stamp = paired.scan.frame_id, paired.scan.stamp_ns
+        self._record(frame, stamp)
+        if len(self._last) == 1:
+            self._matched[frame] = stamp
+            return paired
+        lasers, period = len(self._last), max(self._period.values())
+        max_age = round(((lasers - 1) / lasers + _JITTER) * period)
+        self._held = {name: held for name, held in self._held.items() if abs(stamp - held.scan.stamp_ns) <= max_age}
+        self._held.pop(frame, None)
+        awake = {name for name, last in self._last.items() if abs(stamp - last) < _SILENT_NS}
+        # A laser whose scans never come near the others' must not wait for ever.
+        starved = abs(stamp - self._matched[frame]) > 2 * period
+        if awake <= {frame, *self._held} or starved:
+            companions = tuple(self._held.values())
+            self._matched |= dict.fromkeys((frame, *self._held), stamp)
+            self._held = {}
+            return replace(paired, companions=companions)
+        self._held[frame] = paired
+        return replace(paired, is_held=True)
+
+    def _record(self, frame: str, stamp_ns: int) -> None:
+        last = self._last.get(frame)
+        if last is None:
+            self._period[frame] = _USUAL_PERIOD_NS
+            self._matched[frame] = stamp_ns
+        elif 0 < stamp_ns - last < _LONGEST_PERIOD_NS:
+            self._period[frame] = stamp_ns - last
+        self._last[frame] = stamp_ns

@@ -35,7 +35,7 @@ from hsloc.config import load
 from hsloc.errors import HslocError
 from hsloc.evaluation import read_relations
 from hsloc.log import ReadOptions, check_log, open_log, read_calibration, read_profile
-from hsloc.maps.map_file import read_map, save_map
+from hsloc.maps import read_map, save_map
 from hsloc.model import OccupancyGrid, Pose2
 from hsloc.trajectory_io.reader import read_trajectory
 

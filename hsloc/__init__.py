@@ -20,7 +20,7 @@ from hsloc.lazy import lazy_names
 from hsloc.version import __version__
 
 if TYPE_CHECKING:
-    from hsloc.analysis import analyse
+    from hsloc.analysis.analyse import analyse
     from hsloc.config import Config, preset
     from hsloc.errors import (
         ConfigError,
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from hsloc.run_metrics import RunMetrics
 
 _MODULES = {
-    "hsloc.analysis": ("analyse",),
+    "hsloc.analysis.analyse": ("analyse",),
     "hsloc.config": ("Config", "preset"),
     "hsloc.errors": (
         "ConfigError", "EvaluationError", "HslocError", "LogError", "LogFormatError", "MapError", "OutputError",

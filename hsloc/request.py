@@ -35,7 +35,7 @@ class RunRequest:
     it is unknown whatever the log states. `reference` names poses to compare with, see `hsloc.replay.references`;
     otherwise they are those in the log. `alignment` and `relations` are for the evaluation. `own_matcher` is used
     instead of the one that `config` names. `calibration` is a file of `hsloc calibrate`. `min_localised`, `max_ape`,
-    `max_warnings` and `fail_if` are limits that the result must keep, see `hsloc.analysis.limits`. `labels` are the
+    `max_warnings` and `fail_if` are limits that the result must keep, see `hsloc.analysis.quality`. `labels` are the
     names of the logs in reports; with `bare_names` no folder is written into the results, so that they are the same
     wherever the files are.
     """

@@ -1,4 +1,4 @@
-"""Quality of a run's result: warnings, and the verdict with its reasons."""
+"""Quality of a run's result: warnings, the verdict with its reasons, and the limits that the user gave."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.replay.run import Result
+    from hsloc.request import RunRequest
+    from hsloc.run_metrics import RunMetrics
     from hsloc.slam.result import MappingResult
 
 _MAX_WITHOUT_PLACE = 0.5
@@ -31,6 +33,9 @@ _VERDICTS = {
     WarningCode.CLOCK_OFFSET_LARGE: Verdict.CHECK,
 }
 """Warnings that concern the whole result, with the verdict that each alone gives."""
+
+_MAP_REMEDY = "look at the places on the map; try another --seed, --no-odom, or a cut of the log (--start, --end)"
+_FAILING = {"failed": (Verdict.FAILED,), "check": (Verdict.FAILED, Verdict.CHECK)}
 
 
 def quality_warnings(result: Result) -> list[RunWarning]:
@@ -103,9 +108,6 @@ def verdict_reasons(result: Result, warnings: Sequence[RunWarning]) -> tuple[Ver
     return tuple(reasons)
 
 
-_MAP_REMEDY = "look at the places on the map; try another --seed, --no-odom, or a cut of the log (--start, --end)"
-
-
 def _of_the_map(mapping: MappingResult, result: Result) -> list[VerdictReason]:
     """What the mapper found against its own map."""
     stamps, first = result.diagnostics.stamps_ns, result.trajectory.stamps_ns
@@ -146,3 +148,22 @@ def _times(
     start = int(result.trajectory.stamps_ns.min())
     seconds = ((stamps_ns - start) / NS_PER_S).tolist()
     return tuple((seconds[first], seconds[end]) for first, end in spans)
+
+
+def exceeded_limits(request: RunRequest, metrics: RunMetrics) -> tuple[str, ...]:
+    """A line for each limit that is not kept: its flag, its value, and what was measured. Empty if all are kept."""
+    found = []
+    share = metrics.localised.share_of_poses
+    if request.min_localised is not None and share < request.min_localised:
+        found.append(f"--min-localised {request.min_localised:g}: {share:.4f} of the poses are localised")
+    if request.max_ape is not None:
+        if metrics.errors is None:
+            reason = metrics.evaluation_error or "there is no reference to compare with"
+            found.append(f"--max-ape {request.max_ape:g}: cannot be checked: {reason}")
+        elif not (rmse := metrics.errors.ape.trans_part.rmse) <= request.max_ape:
+            found.append(f"--max-ape {request.max_ape:g}: the RMSE of the position is {rmse:.4f} m")
+    if request.max_warnings is not None and len(metrics.warnings) > request.max_warnings:
+        found.append(f"--max-warnings {request.max_warnings}: there are {len(metrics.warnings)}")
+    if request.fail_if is not None and metrics.verdict in _FAILING[request.fail_if]:
+        found.append(f"--fail-if {request.fail_if}: the verdict is {metrics.verdict}")
+    return tuple(found)

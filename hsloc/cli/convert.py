@@ -6,7 +6,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from hsloc.cli.arguments import add_read_arguments, read_options
-from hsloc.cli.info import pose_text
+from hsloc.cli.output import pose_text
 from hsloc.cli.progress import ProgressLine
 
 if TYPE_CHECKING:

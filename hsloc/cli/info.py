@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from hsloc.cli.arguments import add_read_arguments, read_options
+from hsloc.cli.output import pose_text
 
 if TYPE_CHECKING:
     import argparse
 
     from hsloc.log import Log, LogSummary, Losses
-    from hsloc.model import Pose2
 
 HELP = "show what is in a log"
 EXAMPLES = """
@@ -177,8 +177,3 @@ def time_text(stamp_ns: int) -> str:
     if stamp_ns < YEAR_2000_NS or seconds >= 1 << 37:
         return f"{seconds}.{nanoseconds:09d} s"
     return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%S") + f".{nanoseconds:09d}Z"
-
-
-def pose_text(pose: Pose2) -> str:
-    """A pose for people."""
-    return f"x {pose.x:.3f} m, y {pose.y:.3f} m, yaw {pose.theta:.4f} rad"

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from typing import Any
 
+    from hsloc.model import Pose2
     from hsloc.report.table import Row
     from hsloc.run_metrics import RunMetrics, RunTimings
     from hsloc.warnings import RunWarning
@@ -117,3 +118,8 @@ def _table(rows: Sequence[Row]) -> list[str]:
         values = "".join(f"{value:>12}" for value in row.values) if len(row.values) == 2 else f"  {row.values[0]}"
         lines.append(f"{row.label:<{width}}{values}")
     return lines
+
+
+def pose_text(pose: Pose2) -> str:
+    """A pose for people."""
+    return f"x {pose.x:.3f} m, y {pose.y:.3f} m, yaw {pose.theta:.4f} rad"

@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser, door: Door = "replay") -> Non
 
 def run(arguments: argparse.Namespace) -> int:
     """Run, write the results, print the table; 4 where a limit is not kept, else 3 where part of the input was lost."""
-    from hsloc.analysis.limits import exceeded_limits
+    from hsloc.analysis.quality import exceeded_limits
     from hsloc.cli.main import EXIT_BELOW_LIMIT, EXIT_DATA_LOST, EXIT_OK
     from hsloc.cli.output import print_summary
     from hsloc.evaluation.metrics import format_json

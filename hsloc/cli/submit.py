@@ -78,7 +78,7 @@ def request_of(given: Mapping[str, Any], upload: Callable[[Path], str]) -> dict[
     for name, value in merged(given).items():
         option = BY_NAME[name]
         if name == "map":
-            from hsloc.maps.metadata import read_metadata
+            from hsloc.maps import read_metadata
 
             image = read_metadata(value).image
             request["map"] = {"yaml": upload(value), "image": upload(image)}

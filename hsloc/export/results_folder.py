@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hsloc.analysis import Analysis, analyse, run_timings
+from hsloc.analysis.analyse import Analysis, analyse
+from hsloc.analysis.metrics import run_timings
 from hsloc.atomic_write import whole_folder
 from hsloc.dataclass_json import to_json
 from hsloc.errors import OutputError

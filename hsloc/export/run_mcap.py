@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hsloc.analysis import Analysis, PosedEvent
+    from hsloc.analysis.analyse import Analysis
+    from hsloc.analysis.second_pass import PosedEvent
     from hsloc.replay.run import Result
 
 _PATH_POSES = 2000

@@ -6,8 +6,7 @@ import re
 from typing import TYPE_CHECKING
 
 from hsloc.errors import MapError
-from hsloc.maps import read_map
-from hsloc.maps.metadata import read_metadata
+from hsloc.maps import read_map, read_metadata
 from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.slam.map_state import STATE_FILE, fingerprint, read_state
 from hsloc.slam.parameters import Resume

@@ -17,7 +17,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hsloc.analysis.limits import exceeded_limits
+from hsloc.analysis.quality import exceeded_limits
 from hsloc.config import to_dict
 from hsloc.errors import HslocError
 from hsloc.export.results_folder import write_results

@@ -16,7 +16,7 @@ from live_service import upload, wait, without_command
 from paths import RECORDINGS
 
 from hsloc.errors import MapError
-from hsloc.maps.metadata import read_metadata
+from hsloc.maps import read_metadata
 from hsloc.report.view import MOST_POSES
 from hsloc_service.execution.worker import linked_map
 from hsloc_service.settings import Settings

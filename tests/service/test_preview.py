@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hsloc.analysis import analyse
+from hsloc.analysis.analyse import analyse
 from hsloc.export.results_folder import report_parts
 from hsloc.log import ReadOptions
 from hsloc.model import Trajectory

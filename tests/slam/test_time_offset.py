@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hsloc.analysis.analysis import analyse
+from hsloc.analysis.analyse import analyse
 from hsloc.evaluation import evaluate
 from hsloc.log import ReadOptions, open_log
 from hsloc.model import Odometry, Scan

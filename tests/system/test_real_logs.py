@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from hsloc.analysis import analyse
+from hsloc.analysis.analyse import analyse
 from hsloc.log import ReadOptions
 from hsloc.replay.run import run
 from hsloc.request import RunRequest

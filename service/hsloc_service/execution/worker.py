@@ -65,7 +65,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, float, int], None]) -> dict[str, Any]:
     """Replay and write the results into `folder/output`; returns the summary for the job's row."""
-    from hsloc.analysis.limits import exceeded_limits
+    from hsloc.analysis.quality import exceeded_limits
     from hsloc.evaluation import read_relations
     from hsloc.export.results_folder import write_results
     from hsloc.replay.run import run
@@ -145,7 +145,7 @@ def linked_map(folder: Path, name: str, image: str) -> Path:
     Of a path the last name counts: a YAML that says `image: /etc/passwd` must not have us read what was not uploaded.
     """
     from hsloc.errors import MapError
-    from hsloc.maps.metadata import load_yaml
+    from hsloc.maps import load_yaml
 
     path = folder / "map" / name
     values = load_yaml(path)

@@ -8,7 +8,8 @@ from hsloc.log import open_log
 from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.preprocessing.odometry import ContinuousOdometry
-from hsloc.replay.engine import pair, rarely_collected
+from hsloc.preprocessing.scans import pair
+from hsloc.replay.engine import rarely_collected
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

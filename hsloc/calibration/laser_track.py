@@ -12,7 +12,7 @@ from hsloc.model.calibration import corrected_odometry
 from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.preprocessing.odometry import ContinuousOdometry
-from hsloc.replay.engine import pair
+from hsloc.preprocessing.scans import pair
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.time_offset import half_sweep_ns
 

@@ -1,4 +1,7 @@
-"""Scans paired with odometry: deskewed, and those of several lasers merged.
+"""Scans paired with odometry, deskewed, and those of several lasers merged.
+
+A scan is paired with the odometry at its own stamp: that of a message with just this stamp if there is one, else
+interpolated between the messages before and after, for which the scan waits.
 
 A lidar that turns while the robot drives measures each beam from another place. Beam i was measured at
 `stamp + i * time_increment`; odometry gives the pose of the base at that time. The scan waits for the odometry of its
@@ -18,20 +21,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.model.events import Odometry, PairedScan
-from hsloc.model.pose2 import relative_poses
+from hsloc.model.events import Odometry, PairedScan, Scan, Truth
+from hsloc.model.pose2 import IDENTITY, Pose2, relative_poses
 from hsloc.model.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from hsloc.model.events import Scan, Truth
+    from hsloc.model.events import Event
 
     Paired = Odometry | PairedScan | Truth
 
-_RECENT = 512
+_RECENT_ODOMETRY = 64
+"""Odometry messages remembered for pairing; logs with jumping clocks need more than two."""
+_WAITING_SCANS = 64
+"""Scans that may wait for odometry; then the last odometry must do."""
+_RECENT_SWEEP = 512
 """Odometry messages that are kept. Internal: a fifth of a second at 2.5 kHz, longer than a sweep."""
-_WAITING = 16
+_WAITING_SWEEPS = 16
 """Maximum number of scans that wait for odometry; then the odometry until now is used. Internal: bounds the memory."""
 _LONGEST_SWEEP_NS = 2_000_000_000
 """Maximum duration of a sweep. Internal: no lidar turns more slowly, a longer one is an error of the log."""
@@ -47,13 +54,82 @@ _SILENT_NS = 500_000_000
 """Silence after which a laser is not waited for. Internal: longer than the longest period."""
 
 
+def pair(
+    events: Iterable[Event], *, deskew: bool = False, first: Pose2 | None = None
+) -> Iterator[Odometry | PairedScan | Truth]:
+    """Pair the scans with odometry, and deskew them if asked for; other events pass through in their order.
+
+    `first` is the first odometry to come, where it is known: scans long before it are paired with it, else with the
+    identity, as those of a log without any odometry are.
+    """
+    paired = _pair(events, IDENTITY if first is None else first)
+    return deskewed(paired) if deskew else paired
+
+
+def _pair(events: Iterable[Event], first: Pose2) -> Iterator[Odometry | PairedScan | Truth]:
+    recent: deque[Odometry] = deque(maxlen=_RECENT_ODOMETRY)
+    waiting: deque[Scan] = deque()
+    for event in events:
+        if isinstance(event, Truth):
+            yield event
+        elif isinstance(event, Scan):
+            exact = _exact(recent, event.stamp_ns)
+            if exact is not None and not waiting:
+                yield PairedScan(event, exact)
+                continue
+            waiting.append(event)
+            if len(waiting) > _WAITING_SCANS:
+                yield _paired(waiting.popleft(), recent, None, first)
+        else:
+            while waiting and _earliest(waiting) < event.stamp_ns:
+                yield _paired(waiting.popleft(), recent, event, first)
+            recent.append(event)
+            yield event
+            while waiting and _earliest(waiting) <= event.stamp_ns:
+                yield _paired(waiting.popleft(), recent, None, first)
+    while waiting:
+        yield _paired(waiting.popleft(), recent, None, first)
+
+
+def _earliest(waiting: deque[Scan]) -> int:
+    """Scans keep their order: one with a stamp from the future may not hold up those behind it."""
+    return min(scan.stamp_ns for scan in waiting)
+
+
+def _paired(scan: Scan, recent: deque[Odometry], following: Odometry | None, first: Pose2) -> PairedScan:
+    return PairedScan(scan, _at(scan.stamp_ns, recent, following, first))
+
+
+def _exact(recent: deque[Odometry], stamp_ns: int) -> Pose2 | None:
+    for odometry in reversed(recent):
+        if odometry.stamp_ns == stamp_ns:
+            return odometry.T_odom_base
+    return None
+
+
+def _at(stamp_ns: int, recent: deque[Odometry], following: Odometry | None, first: Pose2) -> Pose2:
+    """The odometry at a stamp: exact, else between neighbours in the log that enclose it, else the last one told."""
+    exact = _exact(recent, stamp_ns)
+    if exact is not None:
+        return exact
+    after = following
+    for before in reversed(recent):
+        if after is not None and before.stamp_ns < stamp_ns <= after.stamp_ns:
+            fraction = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+            return before.T_odom_base.interpolate(after.T_odom_base, fraction)
+        after = before
+    if recent and (following is None or following.stamp_ns >= stamp_ns):
+        return recent[-1].T_odom_base
+    return following.T_odom_base if following is not None else first
+
+
 def deskewed(events: Iterable[Paired]) -> Iterator[Paired]:
-    """Events as `hsloc.replay.engine.pair` gives them, each scan with where the base was at each of its beams.
+    """Events as `pair` gives them, each scan with where the base was at each of its beams.
 
     A scan comes behind the odometry of its last beam; scans keep their order. Without `time_increment` (or with one
     that makes a turn of over two seconds) a scan stays as it is.
     """
-    recent: deque[Odometry] = deque(maxlen=_RECENT)
+    recent: deque[Odometry] = deque(maxlen=_RECENT_SWEEP)
     waiting: deque[PairedScan] = deque()
     for event in events:
         if isinstance(event, PairedScan):
@@ -62,7 +138,7 @@ def deskewed(events: Iterable[Paired]) -> Iterator[Paired]:
             yield event
             if isinstance(event, Odometry):
                 recent.append(event)
-        while waiting and (len(waiting) > _WAITING or (recent and _is_covered(waiting[0].scan, recent[-1]))):
+        while waiting and (len(waiting) > _WAITING_SWEEPS or (recent and _is_covered(waiting[0].scan, recent[-1]))):
             yield _moved(waiting.popleft(), recent)
     while waiting:
         yield _moved(waiting.popleft(), recent)
@@ -95,7 +171,7 @@ def _moved(paired: PairedScan, recent: Iterable[Odometry]) -> PairedScan:
 
 
 def merged_scans(events: Iterable[Paired]) -> Iterator[Paired]:
-    """Events as `hsloc.replay.engine.pair` gives them, scans of several lasers (by `frame_id`) merged.
+    """Events as `pair` gives them, scans of several lasers (by `frame_id`) merged.
 
     All events pass in their order. Each scan is either held (`is_held`), or is to be matched together with its
     `companions`, which were. Without odometry the motion between two scans is unknown: none is held then.

@@ -12,7 +12,7 @@ from hsloc.errors import ConfigError
 from hsloc.log import LogWriter, ReadOptions, open_log
 from hsloc.model import Odometry, Pose2, Scan
 from hsloc.model.events import PairedScan
-from hsloc.replay.engine import pair
+from hsloc.preprocessing.scans import pair
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
 from hsloc.simulation.presets import preset

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from hsloc.model import Estimate, Event, Odometry, PairedScan, Pose2, Scan, Status, Truth
-from hsloc.replay.engine import pair, replay
+from hsloc.preprocessing.scans import pair
+from hsloc.replay.engine import replay
 
 RANGES = np.ones(3, dtype=np.float32)
 

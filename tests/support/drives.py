@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hsloc.model import Odometry, PairedScan, Trajectory, Truth
-from hsloc.replay.engine import pair
+from hsloc.preprocessing.scans import pair
 from hsloc.simulation.presets import preset
 from hsloc.simulation.simulator import events
 from hsloc.simulation.world_files import load_world

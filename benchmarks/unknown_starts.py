@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.benchmark.floors import floor, random_pose
+from hsloc.benchmark.whole_map import floor, random_pose
 from hsloc.config import Config
 from hsloc.kernels.raycasting import cast_rays
 from hsloc.localisation.localiser import Localiser

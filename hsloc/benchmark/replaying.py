@@ -17,7 +17,7 @@ from hsloc.localisation.localiser import Localiser
 from hsloc.log import open_log
 from hsloc.matching import LikelihoodField
 from hsloc.replay.engine import replay
-from hsloc.replay.map_sources import find_map
+from hsloc.replay.map_and_start import find_map
 from hsloc.replay.run import run
 from hsloc.replay.run_history import RunHistory
 from hsloc.request import RunRequest

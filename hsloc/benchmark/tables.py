@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from hsloc.benchmark.cases import CaseResult
     from hsloc.benchmark.memory import Memory
     from hsloc.benchmark.replaying import ReplayTiming
-    from hsloc.benchmark.targets import Bench
+    from hsloc.benchmark.run import Bench
 
 
 def markdown(bench: Bench) -> str:

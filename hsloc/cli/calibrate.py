@@ -41,7 +41,8 @@ def run(arguments: argparse.Namespace) -> int:
     from json import dumps
 
     from hsloc.atomic_write import write_text_atomically
-    from hsloc.calibration import calibrate, written
+    from hsloc.calibration.calibrate import calibrate
+    from hsloc.calibration.written import as_json, as_lines, as_static_transform, as_urdf, as_yaml
     from hsloc.errors import OutputError
     from hsloc.slam.parameters import GraphMapperParameters
 
@@ -55,17 +56,17 @@ def run(arguments: argparse.Namespace) -> int:
             raise OutputError(f"{target}: its folder does not exist; create it, or name another file with --out")
     options = read_options(arguments)
     with ProgressLine(arguments.quiet or arguments.json or arguments.no_progress) as line:
-        found = calibrate.calibrate(
+        found = calibrate(
             arguments.log, options, GraphMapperParameters(), lambda number, share: line.show(f"pass {number}", share)
         )
-    write_text_atomically(targets[0], written.as_yaml(found))
-    write_text_atomically(targets[1], written.as_urdf(found))
+    write_text_atomically(targets[0], as_yaml(found))
+    write_text_atomically(targets[1], as_urdf(found))
     if arguments.json:
-        print(dumps(written.as_json(found), indent=2))
+        print(dumps(as_json(found), indent=2))
     elif not arguments.quiet:
         print_warnings(found.summary.warnings)
-        print("\n".join(written.as_lines(found)))
+        print("\n".join(as_lines(found)))
         if found.estimate.determined[3:6].any():
-            print(written.as_static_transform(found))
+            print(as_static_transform(found))
         print(f"written: {targets[0]}, {targets[1]}")
     return 0

@@ -43,8 +43,8 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.dataclass_json import to_json
     from hsloc.errors import MapError
     from hsloc.evaluation.maps import map_changes
+    from hsloc.replay.map_and_start import load_grid
     from hsloc.replay.map_merge import merge_maps
-    from hsloc.replay.map_sources import load_grid
 
     first, second = (load_grid(Path(name))[0] for name in (arguments.first, arguments.second))
     pose: Pose2 | None = None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.config import dump, preset
 from hsloc.options import OPTIONS, written
-from hsloc.replay.map_sources import map_files
+from hsloc.replay.map_and_start import map_files
 from hsloc.report.data import Provenance
 from hsloc.version import __version__
 

@@ -10,7 +10,7 @@ import numpy as np
 from hsloc.config import Config
 from hsloc.errors import MapError
 from hsloc.model.pose2 import Pose2
-from hsloc.replay.map_sources import read_saved_map, resumed
+from hsloc.replay.map_and_start import read_saved_map, resumed
 from hsloc.slam.back_end import finish_session
 from hsloc.slam.map_extension import connect
 from hsloc.slam.map_session import from_map_state

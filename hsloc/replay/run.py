@@ -22,8 +22,7 @@ from hsloc.model.trajectory import Trajectory
 from hsloc.options import AUTO
 from hsloc.preprocessing.odometry import ContinuousOdometry, OdometryWatch, UnusableOdometry
 from hsloc.replay.engine import rarely_collected, replay
-from hsloc.replay.initial_pose import find_start, first_odometry
-from hsloc.replay.map_sources import find_map, load_state, require_map, resumed
+from hsloc.replay.map_and_start import find_map, find_start, first_odometry, load_state, require_map, resumed
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory, pose_covariances
 from hsloc.request import RunRequest

@@ -23,7 +23,7 @@ from hsloc.errors import HslocError
 from hsloc.export.results_folder import write_results
 from hsloc.log import open_log
 from hsloc.options import OPTIONS
-from hsloc.replay.map_sources import map_file, state_file
+from hsloc.replay.map_and_start import map_file, state_file
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
 from hsloc.run_metrics import RunMetrics, RunTimings

@@ -9,7 +9,7 @@ import naive
 import numpy as np
 import pytest
 
-from hsloc.benchmark.floors import floor, random_pose, scan_at
+from hsloc.benchmark.whole_map import floor, random_pose, scan_at
 from hsloc.errors import ConfigError
 from hsloc.kernels.fitness import fitness_many
 from hsloc.localisation.whole_map_search import WholeMapParameters, WholeMapSearch, join_scans

@@ -14,7 +14,7 @@ from hsloc.errors import ConfigError, MapError
 from hsloc.log import ReadOptions, open_log
 from hsloc.model import Odometry, Pose2
 from hsloc.model.occupancy_grid import OccupancyGrid
-from hsloc.replay.initial_pose import find_start
+from hsloc.replay.map_and_start import find_start
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
 from hsloc.warnings import WarningCode

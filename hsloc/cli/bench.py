@@ -33,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure and print. A promise that is not kept is printed, and no failure: the machine may be busy."""
+    from hsloc.benchmark.results import markdown
     from hsloc.benchmark.run import run_bench
-    from hsloc.benchmark.tables import markdown
     from hsloc.errors import ConfigError
     from hsloc.evaluation.metrics import format_json
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from hsloc.cli import service_module
 
 if TYPE_CHECKING:
     import argparse
@@ -79,15 +80,3 @@ def run(arguments: argparse.Namespace) -> int:
         )
     except settings.SettingsError as error:
         raise ConfigError(str(error)) from error
-
-
-def service_module(name: str) -> Any:
-    """A module of `hsloc_service`, found by name: the library does not import the service."""
-    from hsloc.errors import ConfigError
-
-    try:
-        return importlib.import_module(f"hsloc_service.{name}")
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"{error.name} is not installed; install the service with: pip install 'hsloc[serve]'"
-        ) from error

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hsloc.cli.serve import service_module
+from hsloc.cli import service_module
 
 if TYPE_CHECKING:
     import argparse

@@ -9,7 +9,8 @@ from hsloc.benchmark import memory as memory_module
 from hsloc.benchmark.clock import Timing, measure
 from hsloc.benchmark.kernel import EVALUATIONS, time_kernel, time_matches
 from hsloc.benchmark.memory import Memory, measure_memory
-from hsloc.benchmark.run import Target, machine
+from hsloc.benchmark.results import Target
+from hsloc.benchmark.run import machine
 from hsloc.benchmark.scene import office_scene
 from hsloc.benchmark.sub_cell import measure_sub_cell
 from hsloc.errors import HslocError

@@ -17,7 +17,7 @@ from hsloc.errors import HslocError, LogFormatError, TopicError
 from hsloc.log.range_codes import RangeRule
 from hsloc.log.reader import open_log
 from hsloc.log.summary import Losses, ReadOptions
-from hsloc.log.text.carmen import beam_angles
+from hsloc.log.text.formats import beam_angles
 from hsloc.log.text.line_format import stamp_ns
 from hsloc.model import Odometry, Pose2, Scan, Truth
 from hsloc.model.calibration import Calibration, LidarCalibration

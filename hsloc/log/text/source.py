@@ -7,30 +7,23 @@ import zlib
 from dataclasses import replace
 from typing import TYPE_CHECKING, BinaryIO, cast
 
-import numpy as np
-
 from hsloc.errors import LogFormatError, TopicError
 from hsloc.log.messages.decode import OdometryMessage, ScanMessage
 from hsloc.log.range_codes import NO_RETURN_CM, RANGE_MIN, NoReturnCode, RangeRule
 from hsloc.log.source import Observation
 from hsloc.log.summary import LogSummary, Losses, ReadOptions, TopicStatistics, TopicSummary
-from hsloc.log.text.carmen import Carmen, beam_angles, numbers
-from hsloc.log.text.line_format import Line, pose, rounded, stamp_ns
+from hsloc.log.text.formats import Carmen, Wean
 from hsloc.model import IDENTITY, Odometry, Scan
 from hsloc.model.calibration import LidarCalibration
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Collection, Iterator
     from pathlib import Path
 
-    from hsloc.log.text.line_format import LineFormat
+    from hsloc.log.text.line_format import Line, LineFormat
     from hsloc.model import Event, OccupancyGrid, Pose2
 
-_WEAN_UNIT = 0.01
-"""Unit of the Wean format [m]."""
-_WEAN_BEAMS = 180
-"""Beams of each scan of the Wean format."""
 MAX_LINE_BYTES = 1 << 20
 MAX_TOTAL_RATIO = 100
 FREE_UNPACKED_BYTES = 64 << 20
@@ -38,41 +31,6 @@ FREE_UNPACKED_BYTES = 64 << 20
 times; a small file that unpacks to gigabytes would keep a reader busy for hours."""
 _BYTES_TO_KNOW = 1 << 20
 _LINES_TO_KNOW = 200
-
-
-class Wean:
-    """The format of the Wean Hall logs (Carnegie Mellon's course on particle filters): O and L lines.
-
-    ::
-
-        O x y theta t
-        L x y theta laser_x laser_y laser_theta r1 .. r180 t
-
-    Centimetres and radians in the odometry's frame, seconds from the log's start; beams one degree apart from -90. Both
-    lines carry odometry, those of L that of the scan; O lines run about 0.15 s ahead of it and are not read where there
-    are L lines. The second pose of L is the laser's, which gives its mounting.
-    """
-
-    name = "Wean"
-    keywords = frozenset(("O", "L"))
-    states_mounting = frozenset(("L",))
-    laser_odometry = True
-
-    def parse(self, words: Sequence[str]) -> Line:
-        """As `LineFormat.parse`."""
-        expected = 5 if words[0] == "O" else 8 + _WEAN_BEAMS
-        if len(words) != expected:
-            raise ValueError(f"{len(words)} words, not {expected}")
-        stamp = stamp_ns(words[-1])
-        T_odom_base = pose(words[1:4], _WEAN_UNIT)
-        odometry = Odometry(stamp, T_odom_base)
-        if words[0] == "O":
-            return Line(odometry=odometry)
-        mounting = T_odom_base.between(pose(words[4:7], _WEAN_UNIT))
-        ranges = numbers(words[7:-1]) * np.float32(_WEAN_UNIT)
-        angle_min, increment = beam_angles(_WEAN_BEAMS)
-        scan = Scan(stamp, ranges, angle_min, increment, 0.0, 0.0, T_base_laser=rounded(mounting), frame_id="laser")
-        return Line(odometry=odometry, scan=scan)
 
 
 def _open(path: Path) -> BinaryIO:

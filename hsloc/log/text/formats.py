@@ -1,18 +1,4 @@
-"""CARMEN text logs: ODOM, FLASER, ROBOTLASER1 and TRUEPOS lines.
-
-Fields as in CARMEN's own loggers::
-
-    ODOM x y theta tv rv accel ipc_timestamp ipc_hostname logger_timestamp
-    FLASER n r1 .. rn x y theta odom_x odom_y odom_theta ipc_timestamp ipc_hostname logger_timestamp
-    ROBOTLASER1 type start_angle field_of_view resolution maximum_range accuracy remission_mode n r1 .. rn
-        m i1 .. im laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv forward side turn
-        ipc_timestamp ipc_hostname logger_timestamp
-    TRUEPOS x y theta odom_x odom_y odom_theta ipc_timestamp ipc_hostname logger_timestamp
-
-The stamp is the ipc_timestamp, third from the end. The odometry of laser lines is used only in logs without ODOM
-lines (it repeats them); the x, y, theta of FLASER are not used: depending on the log they are the laser's pose, or
-that of a mapper's correction.
-"""
+"""Formats of text logs: CARMEN, and the Wean Hall logs."""
 
 from __future__ import annotations
 
@@ -31,6 +17,11 @@ if TYPE_CHECKING:
 
 MAX_BEAMS = 20_000
 """Maximum number of beams of a scan. Internal: guards the memory against a damaged file."""
+
+_WEAN_UNIT = 0.01
+"""Unit of the Wean format [m]."""
+_WEAN_BEAMS = 180
+"""Beams of each scan of the Wean format."""
 
 
 def beam_angles(count: int) -> tuple[float, float]:
@@ -56,7 +47,21 @@ def readings(words: Sequence[str]) -> tuple[NDArray[np.float32], int]:
 
 
 class Carmen:
-    """The format. Where a line has no room for its stamp, IndexError says so."""
+    """The format of CARMEN: ODOM, FLASER, ROBOTLASER1 and TRUEPOS lines.
+
+    Fields as in CARMEN's own loggers::
+
+        ODOM x y theta tv rv accel ipc_timestamp ipc_hostname logger_timestamp
+        FLASER n r1 .. rn x y theta odom_x odom_y odom_theta ipc_timestamp ipc_hostname logger_timestamp
+        ROBOTLASER1 type start_angle field_of_view resolution maximum_range accuracy remission_mode n r1 .. rn
+            m i1 .. im laser_x laser_y laser_theta robot_x robot_y robot_theta tv rv forward side turn
+            ipc_timestamp ipc_hostname logger_timestamp
+        TRUEPOS x y theta odom_x odom_y odom_theta ipc_timestamp ipc_hostname logger_timestamp
+
+    The stamp is the ipc_timestamp, third from the end. The odometry of laser lines is used only in logs without ODOM
+    lines (it repeats them); the x, y, theta of FLASER are not used: depending on the log they are the laser's pose, or
+    that of a mapper's correction. Where a line has no room for its stamp, IndexError says so.
+    """
 
     name = "CARMEN"
     keywords = frozenset(("ODOM", "FLASER", "ROBOTLASER1", "TRUEPOS"))
@@ -113,3 +118,38 @@ def _robot_laser(words: Sequence[str]) -> Line:
         intensities=remissions if len(remissions) else None,
     )
     return Line(odometry=Odometry(stamp, T_world_base), scan=scan)
+
+
+class Wean:
+    """The format of the Wean Hall logs (Carnegie Mellon's course on particle filters): O and L lines.
+
+    ::
+
+        O x y theta t
+        L x y theta laser_x laser_y laser_theta r1 .. r180 t
+
+    Centimetres and radians in the odometry's frame, seconds from the log's start; beams one degree apart from -90. Both
+    lines carry odometry, those of L that of the scan; O lines run about 0.15 s ahead of it and are not read where there
+    are L lines. The second pose of L is the laser's, which gives its mounting.
+    """
+
+    name = "Wean"
+    keywords = frozenset(("O", "L"))
+    states_mounting = frozenset(("L",))
+    laser_odometry = True
+
+    def parse(self, words: Sequence[str]) -> Line:
+        """As `LineFormat.parse`."""
+        expected = 5 if words[0] == "O" else 8 + _WEAN_BEAMS
+        if len(words) != expected:
+            raise ValueError(f"{len(words)} words, not {expected}")
+        stamp = stamp_ns(words[-1])
+        T_odom_base = pose(words[1:4], _WEAN_UNIT)
+        odometry = Odometry(stamp, T_odom_base)
+        if words[0] == "O":
+            return Line(odometry=odometry)
+        mounting = T_odom_base.between(pose(words[4:7], _WEAN_UNIT))
+        ranges = numbers(words[7:-1]) * np.float32(_WEAN_UNIT)
+        angle_min, increment = beam_angles(_WEAN_BEAMS)
+        scan = Scan(stamp, ranges, angle_min, increment, 0.0, 0.0, T_base_laser=rounded(mounting), frame_id="laser")
+        return Line(odometry=odometry, scan=scan)

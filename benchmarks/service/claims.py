@@ -46,7 +46,7 @@ def fill(database: Database, count: int) -> None:
 def measure(database: Database, workers: int, count: int) -> tuple[float, list[float]]:
     """Jobs per second, and the time of each claim [s]."""
     fill(database, count)
-    leases, times = Leases(database, 30.0, 3), list[float]()
+    leases, times = Leases(database, 30.0), list[float]()
 
     def run(name: str) -> None:
         while True:

@@ -19,7 +19,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -37,16 +37,18 @@ from hsloc_service.results.upload_parts import UploadParts
 
 ENDS = ("succeeded", "failed", "crashed", "cancelled")
 LEASE_S = 4.0
+"""By default; a busy machine needs more, or jobs are requeued because nothing is scheduled."""
 
 
 class Fleet:
-    def __init__(self, folder: Path, database: postgresql.Server, workers: int) -> None:
+    def __init__(self, folder: Path, database: postgresql.Server, workers: int, lease_s: float) -> None:
+        self.lease_s = lease_s
         self.folder, self.database, self.url = folder, database, database.new_database()
         self.store = f"file://{folder}/store"
         shared = {
             "HSLOC_DATABASE_URL": self.url,
             "HSLOC_STORE_URL": self.store,
-            "HSLOC_LEASE_S": str(LEASE_S),
+            "HSLOC_LEASE_S": str(lease_s),
             "HSLOC_HEARTBEAT_S": "0.5",
             "HSLOC_MAX_ATTEMPTS": "60",
             "HSLOC_MAX_QUEUED": "10000",
@@ -60,8 +62,17 @@ class Fleet:
     def folders(self) -> list[Path]:
         return [each.data for each in (*self.servers, *self.workers)]
 
+    def kill(self) -> None:
+        """End what still runs, however this script ends."""
+        for each in (*self.servers, *self.workers):
+            if each.process is not None and each.process.poll() is None:
+                each.process.kill()
+
     def mistreat(self, rng: random.Random) -> str:
         """Do one thing to one of them; what it was."""
+        for each in (*self.servers, *self.workers):
+            if each.process is not None and each.process.poll() is not None:
+                each.start()  # as the system's manager of services does: it was started while PostgreSQL was away
         kind = rng.choices(("worker", "job process", "server", "stop", "database"), (40, 30, 20, 7, 3))[0]
         if kind == "job process":
             pids = [pid for folder in self.folders() for pid in jobs_processes(folder)]
@@ -82,7 +93,7 @@ class Fleet:
             if kind == "stop":
                 assert worker.process is not None
                 worker.process.send_signal(signal.SIGSTOP)
-                time.sleep(1.5 * LEASE_S)
+                time.sleep(1.5 * self.lease_s)
                 worker.process.send_signal(signal.SIGCONT)
             else:
                 worker.end(signal.SIGKILL)
@@ -178,6 +189,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=100)
     parser.add_argument("--kills", type=int, default=60)
     parser.add_argument("--workers", type=int, default=3)
+    parser.add_argument("--lease-s", type=float, default=LEASE_S)
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     folder, rng = Path(tempfile.mkdtemp(prefix="hsloc-fleet-")), random.Random(arguments.seed)
@@ -185,8 +197,10 @@ def main() -> int:
     receiver = Receiver()
     threading.Thread(target=receiver.serve_forever, daemon=True).start()
     hook = f"http://127.0.0.1:{receiver.server_port}/"
-    with postgresql.running() as database:
-        fleet = Fleet(folder, database, arguments.workers)
+    with ExitStack() as stack:
+        database = stack.enter_context(postgresql.running())
+        fleet = Fleet(folder, database, arguments.workers, arguments.lease_s)
+        stack.callback(fleet.kill)
         begin = time.monotonic()
         clients = []
         for k, server in enumerate(fleet.servers):
@@ -198,9 +212,9 @@ def main() -> int:
             time.sleep(rng.uniform(0.05, 1.5))
             done[fleet.mistreat(rng)] += 1
         for thread in clients:
-            thread.join(600.0)
+            thread.join()
         client = Client(fleet.servers[0].url)
-        states = Counter(client.wait(job)["state"] for job in accepted)
+        states = Counter(client.wait(job)["state"] for job in list(accepted))
         attempts = Counter(client.job(job)["attempt"] for job in accepted)
         seconds = time.monotonic() - begin
         deadline = time.monotonic() + 60.0

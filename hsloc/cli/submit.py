@@ -32,6 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_service(parser)
     parser.add_argument("--wait", action="store_true", help="Wait until the job has ended; 1 unless it succeeded.")
     parser.add_argument("--out", type=Path, metavar="DIR", help="Wait, and fetch the results into this folder.")
+    parser.add_argument(
+        "--priority", type=int, metavar="N", help="Of your waiting jobs a higher one is begun first (default: 0)."
+    )
     parser.add_argument("--tag", metavar="TAG", help="Run the job only where workers were started with this tag.")
     parser.add_argument("-q", "--quiet", action="store_true", help="Print the job's id only.")
     add_no_progress(parser)
@@ -49,6 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
             line.show("upload", done / total if total else 1.0, f"{done / 1e6:.1f} MB of {total / 1e6:.1f} MB")
 
         request = request_of(values(arguments), client.upload)
+        if arguments.priority is not None:
+            request["priority"] = arguments.priority
         if arguments.tag is not None:
             request["tag"] = arguments.tag
         job = client.submit([client.upload(path, uploaded) for path in arguments.log], **request)

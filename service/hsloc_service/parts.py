@@ -10,7 +10,7 @@ from hsloc_service.execution.dispatcher import LocalDispatcher
 from hsloc_service.execution.input_cache import InputCache
 from hsloc_service.execution.sandbox import choose_sandbox
 from hsloc_service.execution.supervisor import Supervisor
-from hsloc_service.jobs.leases import Leases
+from hsloc_service.jobs.leases import Leases, RetryPolicy
 from hsloc_service.results.deletion_queue import DeletionQueue
 from hsloc_service.results.stores import ResultStores
 from hsloc_service.results.upload_parts import UploadParts
@@ -61,7 +61,8 @@ def open_parts(
     if stores.parts_store is not None:
         upload_parts = UploadParts(database, stores.parts_store, settings.store_timeout_s)
     deletions = DeletionQueue(database, storage, stores, settings.store_timeout_s, upload_parts)
-    leases = Leases(database, settings.lease_s, settings.max_attempts, settings.tags)
+    policy = RetryPolicy(settings.max_attempts, settings.attempts_by_reason(), settings.retry_wait_s)
+    leases = Leases(database, settings.lease_s, policy, settings.tags, settings.max_running)
     inputs = InputCache(storage, upload_parts, settings.cache_bytes)
     supervisor = Supervisor(leases, storage, settings, stores, sandbox, inputs, store_failed)
     dispatcher = LocalDispatcher(supervisor, deletions, ended)

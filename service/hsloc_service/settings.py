@@ -16,6 +16,12 @@ if TYPE_CHECKING:
 
 MIB, GIB = 1 << 20, 1 << 30
 WORKER = (sys.executable, "-P", "-m", "hsloc_service.execution.worker")
+UNLIMITED = 1_000_000
+RETRIED = (
+    "signal", "exit", "internal_error", "protocol", "out_of_memory", "cpu_limit", "wall_limit", "output_limit",
+    "disk_full", "store", "invalid_input", "fault_injection",
+)  # fmt: skip
+"""Reasons of a job's end that another attempt may be made after."""
 SANDBOXES = ("auto", "bubblewrap", "landlock", "if-possible", "none")
 
 
@@ -69,6 +75,8 @@ class Settings:
 
     max_queued: int = 100
     """Maximum number of waiting jobs of one tenant; more are refused (429)."""
+    max_running: int = UNLIMITED
+    """Maximum number of jobs of one tenant that run at the same time, on all servers and workers together."""
     max_streams: int = 64
     """Maximum number of event streams of one tenant at the same time."""
     requests_per_s: float = 200.0
@@ -96,6 +104,11 @@ class Settings:
     """Time between SIGTERM and SIGKILL when a job is cancelled [s]."""
     max_attempts: int = 3
     """Number of attempts after which a job whose process or server was killed ends as crashed."""
+    retry: tuple[str, ...] = ()
+    """Number of attempts at a job that ends for a reason, such as `signal=3,store=5`: it goes back into the queue until
+    it has had so many. What is not named is not tried again."""
+    retry_wait_s: float = 10.0
+    """Wait before the second attempt by `retry` [s]; doubled for each further one, up to an hour."""
     lease_s: float = 30.0
     """Time without a heartbeat after which a job goes back into the queue [s]."""
     heartbeat_s: float = 5.0
@@ -136,6 +149,7 @@ class Settings:
                 _check_number(each.name, value)
         if self.sandbox not in SANDBOXES:
             raise SettingsError(f"sandbox is {self.sandbox!r}; it must be one of {', '.join(SANDBOXES)}")
+        self.attempts_by_reason()
         for name in ("allowed_hosts", "worker_command"):
             if not getattr(self, name):
                 raise SettingsError(f"{name} is empty; give at least one value, or leave it out")
@@ -148,8 +162,21 @@ class Settings:
                 f"heartbeat_s is {self.heartbeat_s}; it must be above 0 and below lease_s {self.lease_s}"
             )
 
+    def attempts_by_reason(self) -> dict[str, int]:
+        """The table of `retry`. Raises SettingsError."""
+        found = {}
+        for part in self.retry:
+            reason, _, count = part.partition("=")
+            if reason not in RETRIED or not count.isdecimal() or not 1 <= int(count) <= 100:
+                raise SettingsError(
+                    f"retry has {part!r}; it must be REASON=ATTEMPTS with 1 to 100 attempts, and one of the reasons "
+                    f"{', '.join(RETRIED)}"
+                )
+            found[reason] = int(count)
+        return found
 
-MAY_BE_ZERO = ("slots", "cache_bytes", "min_free_bytes", "grace_s", "webhook_backoff_s")
+
+MAY_BE_ZERO = ("retry_wait_s", "slots", "cache_bytes", "min_free_bytes", "grace_s", "webhook_backoff_s")
 MAX_SECONDS = 1e9
 """Thirty years: times beyond that are misprints, and overflow."""
 

@@ -161,7 +161,9 @@ class Histories(RuleBasedStateMachine):
     @rule(claim=claims, state=st.sampled_from(["failed", "crashed"]))
     def fail(self, claim: Claim, state: str) -> None:
         model = self.holds(claim)
-        assert self.leases.fail(claim, state, "x", "x") == (model is not None)
+        assert self.leases.fail(claim, state, "x", "x") == (
+            None if model is None else "cancelled" if model.state == "cancelling" else state
+        )
         if model is not None:
             model.end(state)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from live_service import settings, submit, wait
@@ -16,7 +16,7 @@ from hsloc_service.db.database import open_database
 from hsloc_service.db.tables import JobRow
 from hsloc_service.errors import ServiceError
 from hsloc_service.execution.job_process import parse_line
-from hsloc_service.jobs.leases import Leases
+from hsloc_service.jobs.leases import Leases, RetryPolicy
 from hsloc_service.jobs.repository import ORDERS, JobFilter, Jobs
 from hsloc_service.jobs.workers import Presence
 from hsloc_service.results.store import Asset
@@ -43,12 +43,12 @@ class Parts:
         self.jobs = Jobs(self.database, self.storage, chosen)
 
     def leases(self, lease_s: float = 30.0, max_attempts: int = 3) -> Leases:
-        return Leases(self.database, lease_s, max_attempts)
+        return Leases(self.database, lease_s, RetryPolicy(max_attempts))
 
-    def submit(self, who: Principal = ANYBODY) -> str:
+    def submit(self, who: Principal = ANYBODY, **options: Any) -> str:
         file = self.files.create(who, "run.mcap", 0)
         self.files.complete(file.id, 0, "00")
-        return self.jobs.submit(who, {"log": file.id, "map": None}).job.id
+        return self.jobs.submit(who, {"log": file.id, "map": None, **options}).job.id
 
 
 @pytest.fixture
@@ -299,3 +299,55 @@ def test_lists_in_every_order_and_by_every_filter(parts: Parts) -> None:
         assert {job.id for job in parts.jobs.list(ANYBODY, JobFilter(order=order))} == set(jobs)
     assert [job.id for job in parts.jobs.list(ANYBODY, JobFilter(verdict="good"))] == jobs[:1]
     assert parts.jobs.count(ANYBODY, JobFilter(search="RUN")) == 2
+
+
+def test_a_higher_priority_is_begun_first_but_not_before_another_tenants_turn(parts: Parts) -> None:
+    low, high, other = parts.submit(), parts.submit(priority=5), parts.submit(OTHER, priority=-5)
+    leases = parts.leases()
+    claims = [leases.claim("a") for _ in range(4)]
+    assert [claim and claim.job_id for claim in claims] == [high, other, low, None]
+
+
+def test_a_tenant_runs_no_more_than_its_share(parts: Parts) -> None:
+    first, second, third = (parts.submit() for _ in range(3))
+    other = parts.submit(OTHER)
+    leases = replace(parts.leases(), max_running=2)
+    claims = [leases.claim("a") for _ in range(4)]
+    assert [claim and claim.job_id for claim in claims] == [first, other, second, None]
+    assert claims[0] is not None
+    assert leases.fail(claims[0], "failed", "x", "x") == "failed"
+    assert (claim := leases.claim("b")) is not None
+    assert claim.job_id == third
+
+
+def test_claims_at_the_same_time_do_not_pass_the_share(parts: Parts) -> None:
+    for _ in range(12):
+        parts.submit()
+    leases = replace(parts.leases(), max_running=3)
+    with ThreadPoolExecutor(8) as executor:
+        claims = list(executor.map(lambda k: leases.claim(f"w{k}"), range(8)))
+    assert sum(claim is not None for claim in claims) == 3
+
+
+def test_a_reason_is_retried_as_the_policy_says(parts: Parts) -> None:
+    job = parts.submit()
+    policy = RetryPolicy(3, {"signal": 3}, wait_s=0.15)
+    leases = replace(parts.leases(), retries=policy)
+    assert [policy.retried_after_s("signal", k) for k in (1, 2, 3)] == [0.15, 0.3, None]
+    assert policy.retried_after_s("exit", 1) is None
+    claim = leases.claim("a")
+    assert claim is not None
+    assert leases.fail(claim, "crashed", "signal", "ended by SIGSEGV") == "queued"
+    assert leases.claim("a") is None
+    waiting = parts.jobs.get(ANYBODY, job)
+    assert (waiting.state, waiting.attempt) == ("queued", 1)
+    time.sleep(0.2)
+    claim = leases.claim("a")
+    assert claim is not None
+    assert claim.attempt == 2
+    assert leases.fail(claim, "failed", "invalid_input", "no scan") == "failed"
+    second = parts.submit()
+    claim = leases.claim("a")
+    assert claim is not None
+    parts.jobs.cancel(ANYBODY, second)
+    assert leases.fail(claim, "crashed", "signal", "x") == "cancelled"

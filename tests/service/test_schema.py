@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import sqlite3
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -173,7 +174,7 @@ STEPS = "; ".join((*migrations.STEPS[1], *migrations.STEPS[2]))
                 (
                     *migrations.STEPS[1],
                     *migrations.STEPS[2],
-                    "ALTER TABLE job ADD COLUMN tag VARCHAR",
+                    *(f"ALTER TABLE job ADD COLUMN {name}" for name in ("tag", "priority", "not_before", "sweep")),
                     "DROP TABLE asset",
                     f"PRAGMA user_version={SCHEMA_VERSION}",
                 )
@@ -201,6 +202,33 @@ def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
     path.write_bytes(b"not a database, but long enough to be read as one" * 100)
     with pytest.raises(SettingsError, match="file is not a database"):
         Database(path)
+
+
+def test_programs_of_the_schema_before_go_on_with_a_newer_one(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rolling upgrade: a server of the version before is killed and starts again beside one of the next."""
+    Database(old).close()
+    monkeypatch.setattr(migrations, "SCHEMA_VERSION", migrations.OLDEST_SCHEMA)
+    Database(old).close()
+    assert version(old) == SCHEMA_VERSION
+    monkeypatch.setattr(migrations, "SCHEMA_VERSION", migrations.OLDEST_SCHEMA - 1)
+    with pytest.raises(SettingsError, match="newer hsloc"):
+        Database(old)
+
+
+def test_a_script_since_the_oldest_schema_takes_nothing_from_older_programs() -> None:
+    """It adds tables, indexes, and columns that an INSERT which does not know them may leave out."""
+    for path in sorted((Path(migrations.__file__).parent / "scripts" / "versions").glob("schema_*.py")):
+        if int(path.stem.removeprefix("schema_")) <= migrations.OLDEST_SCHEMA:
+            continue
+        calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+        done = {
+            call.func.attr
+            for call in calls
+            if isinstance(call.func, ast.Attribute) and ast.unparse(call.func)[:3] == "op."
+        }
+        assert done <= {"add_column", "create_table", "create_index"}, path
+        for column in (ast.unparse(call) for call in calls if ast.unparse(call.func) == "sa.Column"):
+            assert "nullable=True" in column or "server_default=" in column, column
 
 
 def test_a_full_disk_does_not_keep_a_server_from_starting(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:

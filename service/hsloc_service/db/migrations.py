@@ -9,9 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sqlalchemy import inspect
+from sqlalchemy import delete, insert, inspect, select
 
-from hsloc_service.db.tables import SCHEMA_VERSION, Base
+from hsloc_service.db.tables import SCHEMA_VERSION, Base, CounterRow
 from hsloc_service.settings import SettingsError
 
 if TYPE_CHECKING:
@@ -37,6 +37,10 @@ STEPS: dict[int, tuple[str, ...]] = {
 }
 """What leads from a version to the next one; tables that are new are made afterwards, by `create_all`."""
 FIRST_OF_ALEMBIC = 4
+OLDEST_SCHEMA = 5
+"""Programs of this schema and later work on today's tables: what came since are tables, indexes, and columns that may
+be left out. To be raised with a script that does more: then all servers must be stopped for the upgrade."""
+OLDEST = "schema.oldest"
 
 
 VERSION_TABLE = "alembic_version"
@@ -45,11 +49,15 @@ VERSION_TABLE = "alembic_version"
 def migrate(connection: Connection, name: str) -> tuple[int, int]:
     """Bring the database to `SCHEMA_VERSION`, in the caller's transaction; the versions before and after.
 
-    An empty one gets the tables of today. Raises SettingsError, with nothing changed, for a database of a newer hsloc
-    or of something else, and for one whose tables are not what its version says.
+    An empty one gets the tables of today, and one of a newer hsloc that older ones may use stays as it is. Raises
+    SettingsError, with nothing changed, for a database of another newer hsloc or of something else, and for one whose
+    tables are not what its version says.
     """
     tables = set(inspect(connection).get_table_names())
     before = _version(connection, tables)
+    if before > SCHEMA_VERSION and _oldest(connection, tables) <= SCHEMA_VERSION:
+        _need_columns(connection, name, before)
+        return before, before
     if before > SCHEMA_VERSION:
         raise SettingsError(
             f"{name}: written by a newer hsloc (schema {before}, known up to {SCHEMA_VERSION}); "
@@ -67,10 +75,20 @@ def migrate(connection: Connection, name: str) -> tuple[int, int]:
         else:
             _stamp(connection, SCHEMA_VERSION)
         Base.metadata.create_all(connection)
+        connection.execute(delete(CounterRow).where(CounterRow.name == OLDEST))
+        connection.execute(insert(CounterRow).values(name=OLDEST, value=OLDEST_SCHEMA))
         if connection.dialect.name == "sqlite":
             connection.exec_driver_sql(f"PRAGMA user_version={SCHEMA_VERSION}")
     _need_columns(connection, name, before or SCHEMA_VERSION)
     return before, SCHEMA_VERSION
+
+
+def _oldest(connection: Connection, tables: set[str]) -> int:
+    """The oldest schema whose programs may use the database; its own where it does not say."""
+    found = None
+    if CounterRow.__tablename__ in tables:
+        found = connection.execute(select(CounterRow.value).where(CounterRow.name == OLDEST)).scalar_one_or_none()
+    return _version(connection, tables) if found is None else found
 
 
 def _version(connection: Connection, tables: set[str]) -> int:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from sqlalchemy import JSON, BigInteger, Index, Integer, Text, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 """Stored in the database; what leads from one to the next is in `migrations`."""
 
 JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
@@ -105,9 +105,16 @@ class JobRow(Base):
     """What a server or worker must be started with to run the job."""
     bytes: Mapped[int] = mapped_column(default=0)
     """What the results take, by their manifest."""
+    priority: Mapped[int] = mapped_column(default=0, server_default="0")
+    """Of a tenant's waiting jobs those with a higher one are begun first."""
+    not_before: Mapped[float | None]
+    """When the next attempt may begin, after one that failed."""
+    sweep: Mapped[str | None] = mapped_column(index=True)
+    """The sweep that the job is a run of."""
     __table_args__ = (
         Index("job_by_state", "state", "seq"),
         Index("job_by_tenant", "tenant", "state", "bytes"),  # the quota, and how many wait: asked at every submission
+        Index("job_by_start", "tenant", "started"),  # when a tenant was served last: asked at every claim
     )
 
 
@@ -224,3 +231,38 @@ class SecretRow(Base):
     tenant: Mapped[str] = mapped_column(primary_key=True)
     webhook: Mapped[str]
     __table_args__ = (UniqueConstraint("tenant"),)
+
+
+class SweepRow(Base):
+    """Jobs that were submitted together: logs x configurations x seeds."""
+
+    __tablename__ = "sweep"
+    id: Mapped[str] = mapped_column(primary_key=True)
+    tenant: Mapped[str] = mapped_column(index=True)
+    name: Mapped[str]
+    created: Mapped[float]
+    runs: Mapped[dict[str, Any]]
+    """For each job by its id: name of the run, log, configuration and seed, in the order of the table."""
+
+
+class AuditRow(Base):
+    """Who did something that cannot be undone, or gave or took access."""
+
+    __tablename__ = "audit"
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    at: Mapped[float]
+    tenant: Mapped[str]
+    actor: Mapped[str]
+    """Id of the token; `operator` for the command line, `retention` for the server itself, `` without tokens."""
+    action: Mapped[str]
+    target: Mapped[str]
+    __table_args__ = (Index("audit_by_tenant", "tenant", "id"),)
+
+
+class RateRow(Base):
+    """A token bucket that several servers share."""
+
+    __tablename__ = "rate"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    level: Mapped[float]
+    at: Mapped[float]

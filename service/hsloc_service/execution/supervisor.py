@@ -173,9 +173,10 @@ class ResultPublisher:
         if outcome.kind == "again":
             self._leases.release(claim, outcome.message, counts=outcome.reason != "shutdown")
             return "queued"
-        if outcome.kind != "lost":
-            self._leases.fail(claim, outcome.kind, outcome.reason, self._without_paths(outcome.message, output.parent))
-        return outcome.kind
+        if outcome.kind == "lost":
+            return "lost"
+        message = self._without_paths(outcome.message, output.parent)
+        return self._leases.fail(claim, outcome.kind, outcome.reason, message) or "lost"
 
     @staticmethod
     def _without_paths(message: str, folder: Path) -> str:
@@ -194,8 +195,8 @@ class ResultPublisher:
         except Interrupted as end:
             return self._write(interrupted(end.reason), output)
         except OSError as error:
-            self._leases.fail(claim, "failed", "disk_full", f"the results could not be stored: {error.strerror}")
-            return "failed"
+            message = f"the results could not be stored: {error.strerror}"
+            return self._leases.fail(claim, "failed", "disk_full", message) or "lost"
         if self._leases.succeed(claim, name, assets, outcome.summary or {}, store.url):
             return "succeeded"
         with suppress(StoreError):  # then the sweep removes them

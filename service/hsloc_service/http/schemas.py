@@ -136,6 +136,9 @@ class RunRequest(_Run):  # type: ignore[misc, valid-type]
         description="run only where servers or workers were started with this tag",
         examples=["big-memory"],
     )
+    priority: Annotated[int, Field(ge=-100, le=100)] | None = Field(
+        default=None, description="of your waiting jobs those with a higher one are begun first; 0 by default"
+    )
 
 
 _Job = Model("JobOptions", __base__=RunRequest, **_fields(option for option in _HTTP if option.is_upload))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 import uuid
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from sqlalchemy import func, or_, select
@@ -21,11 +21,13 @@ from hsloc_service.db.database import is_unreachable
 from hsloc_service.db.tables import AssetRow, FileRow, JobRow
 from hsloc_service.jobs.events import record
 from hsloc_service.jobs.repository import finish_job
+from hsloc_service.settings import UNLIMITED
 from hsloc_service.stored_request import MAP_STATE, files_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Callable, Collection, Iterable, Mapping
 
+    from sqlalchemy import ColumnElement
     from sqlalchemy.orm import Session
 
     from hsloc_service.db.database import Database
@@ -69,26 +71,49 @@ class HeartbeatReply(NamedTuple):
     cancel: bool
 
 
+MAX_RETRY_WAIT_S = 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class RetryPolicy:
+    """How often a job is begun."""
+
+    max_attempts: int = 3
+    """Where its process or its server was killed."""
+    by_reason: Mapping[str, int] = field(default_factory=dict)
+    """Number of attempts where it ended for a reason; once for all others."""
+    wait_s: float = 10.0
+    """Wait before the second attempt by reason [s]; doubled for each further one."""
+
+    def retried_after_s(self, reason: str, attempt: int) -> float | None:
+        """Wait before the attempt after this one; None if there is none."""
+        if attempt >= self.by_reason.get(reason, 1):
+            return None
+        return min(self.wait_s * 2.0 ** (attempt - 1), MAX_RETRY_WAIT_S)
+
+
 @dataclass(frozen=True, slots=True)
 class Leases:
     """The queue as the workers see it."""
 
     database: Database
     lease_s: float
-    max_attempts: int
+    retries: RetryPolicy = RetryPolicy()
     tags: tuple[str, ...] = ()
     """Tags of jobs that are taken, besides those without one."""
+    max_running: int = UNLIMITED
+    """Number of running jobs of a tenant at which no more of its jobs are taken."""
 
     def claim(self, owner: str) -> Claim | None:
-        """Take the oldest waiting job of the tenant whose turn it is; None if none waits."""
+        """Take the first waiting job of the tenant whose turn it is; None if none waits."""
         with self.database.write() as session:
-            job = _next(session, self.tags)
+            now = self.database.now(session)
+            job = self._next(session, now)
             if job is None:
                 return None
-            now = self.database.now(session)
             job.state, job.owner, job.attempt = "running", owner, job.attempt + 1
             job.lease_until, job.heartbeat = now + self.lease_s, now
-            job.started = job.started or now
+            job.started, job.not_before = job.started or now, None
             job.phase = job.done = job.total = job.scans = job.speed = job.progressed = None
             record(session, job, "state", {"state": "running", "attempt": job.attempt})
             names, source = _names(session, job.request), _source(session, job)
@@ -142,19 +167,56 @@ class Leases:
             finish_job(session, job, "succeeded", None, None)
             return True
 
-    def fail(self, claim: Claim, state: str, reason: str, message: str) -> bool:
-        """End a job otherwise: failed, crashed or cancelled."""
+    def fail(self, claim: Claim, state: str, reason: str, message: str) -> str | None:
+        """End a job otherwise: failed, crashed or cancelled; or put it back, as the policy says.
 
-        def fail() -> bool:
+        The state that was written; None if another attempt holds it.
+        """
+
+        def fail() -> str | None:
             with self.database.write() as session:
                 job = _held(session, claim)
                 if job is None:
-                    return False
+                    return None
+                wait_s = self.retries.retried_after_s(reason, job.attempt)
+                if wait_s is not None and not job.cancel:
+                    job.not_before = self.database.now(session) + wait_s
+                    _requeue(session, job, f"{reason}: {message}")
+                    return job.state
                 ended = ("cancelled", "cancelled") if job.cancel else (state, reason)
                 finish_job(session, job, *ended, message)
-                return True
+                return job.state
 
         return self._patiently(fail)
+
+    def _next(self, session: Session, now: float) -> JobRow | None:
+        """The next job that may run here, locked; tenants in turn.
+
+        Who has least running comes first, then who was served longest ago. A row that another claim has locked is
+        skipped, so that a claim may find nothing while jobs wait, and is tried again.
+        """
+        waiting = (
+            JobRow.state == "queued",
+            or_(JobRow.tag.is_(None), JobRow.tag.in_(self.tags)),
+            or_(JobRow.not_before.is_(None), JobRow.not_before <= now),
+        )
+        for running, _, _, tenant in _turns(session, waiting):
+            if running >= self.max_running:
+                break  # those that come have as many, or more
+            if self.max_running < UNLIMITED and not self._may_run(session, tenant):
+                continue
+            query = select(JobRow).where(*waiting, JobRow.tenant == tenant)
+            query = query.order_by(JobRow.priority.desc(), JobRow.seq).limit(1)
+            job = session.scalar(query.with_for_update(skip_locked=True))
+            if job is not None:
+                return job
+        return None
+
+    def _may_run(self, session: Session, tenant: str) -> bool:
+        """Whether one more job of the tenant may run; nobody else begins one until the transaction ends."""
+        self.database.lock(session, f"running {tenant}")
+        count = select(func.count()).where(JobRow.tenant == tenant, JobRow.state.in_(("running", "cancelling")))
+        return (session.scalar(count) or 0) < self.max_running
 
     def _patiently(self, work: Callable[[], T]) -> T:
         """The result of `work`, tried again while a shared database is away, for as long as a lease lasts."""
@@ -202,12 +264,16 @@ class Leases:
     def _again(self, session: Session, job: JobRow, reason: str, counts: bool) -> None:
         if job.cancel:
             finish_job(session, job, "cancelled", "cancelled", "cancelled")
-        elif counts and job.attempt >= self.max_attempts:
+        elif counts and job.attempt >= self.retries.max_attempts:
             finish_job(session, job, "crashed", "attempts", f"given up after {job.attempt} attempts: {reason}")
         else:
-            job.state = "queued"
-            job.owner = job.lease_until = None
-            record(session, job, "state", {"state": "queued", "reason": "requeued", "message": reason})
+            _requeue(session, job, reason)
+
+
+def _requeue(session: Session, job: JobRow, reason: str) -> None:
+    job.state = "queued"
+    job.owner = job.lease_until = None
+    record(session, job, "state", {"state": "queued", "reason": "requeued", "message": reason})
 
 
 def new_owner(instance: str) -> str:
@@ -220,23 +286,12 @@ def instance_of(owner: str) -> str:
     return owner.partition(":")[0]
 
 
-def _next(session: Session, tags: tuple[str, ...]) -> JobRow | None:
-    """The next job without a tag or with one of these, locked; tenants in turn.
-
-    Who has least running comes first, then who was served longest ago. A row that another claim has locked is skipped,
-    so that a claim may find nothing while jobs wait, and is tried again. A tenant's jobs are begun in the order of
-    `seq`, so that its last start is found at the end of its index, whatever number of jobs it has.
-    """
-    waiting = (JobRow.state == "queued", or_(JobRow.tag.is_(None), JobRow.tag.in_(tags)))
+def _turns(session: Session, waiting: Iterable[ColumnElement[bool]]) -> list[tuple[int, float, int | None, str]]:
+    """The tenants with jobs that wait: how many run, when one was begun last, first `seq` and name, in their order."""
     tenants = select(JobRow.tenant).where(*waiting).distinct().subquery()
     other = aliased(JobRow)
     running = select(func.count()).where(other.tenant == tenants.c.tenant, other.state.in_(("running", "cancelling")))
-    served = (
-        select(other.started)
-        .where(other.tenant == tenants.c.tenant, other.started.is_not(None))
-        .order_by(other.seq.desc())
-        .limit(1)
-    )
+    served = select(func.max(other.started)).where(other.tenant == tenants.c.tenant)
     first = select(func.min(other.seq)).where(other.tenant == tenants.c.tenant, other.state == "queued")
     turns = session.execute(
         select(
@@ -246,12 +301,7 @@ def _next(session: Session, tags: tuple[str, ...]) -> JobRow | None:
             tenants.c.tenant,
         )
     ).all()
-    for *_, tenant in sorted(map(tuple, turns), key=lambda turn: (turn[0], turn[1], turn[2] or 0)):
-        query = select(JobRow).where(*waiting, JobRow.tenant == tenant).order_by(JobRow.seq).limit(1)
-        job = session.scalar(query.with_for_update(skip_locked=True))
-        if job is not None:
-            return job
-    return None
+    return sorted(((*turn,) for turn in turns), key=lambda turn: (turn[0], turn[1], turn[2] or 0))
 
 
 def _held(session: Session, claim: Claim) -> JobRow | None:

@@ -94,8 +94,8 @@ class Jobs:
                 if known.sha256 != digest:
                     raise conflict("idempotency", "this Idempotency-Key was used for a different request")
                 return Submitted(_job(session, who, known.job_id), created=False)
-            self._need_room(session, who)
-            job = self._insert(session, who, request, None)
+            self.need_room(session, who)
+            job = self.insert(session, who, request)
             if key is not None:
                 now = time.time()
                 session.add(IdempotencyRow(tenant=who.tenant, key=key, sha256=digest, job_id=job.id, created=now))
@@ -106,8 +106,8 @@ class Jobs:
         with self.database.write() as session:
             self.database.lock_tenant(session, who.tenant)
             old = _job(session, who, job_id)
-            self._need_room(session, who)
-            return self._insert(session, who, request, old.id)
+            self.need_room(session, who)
+            return self.insert(session, who, request, rerun_of=old.id)
 
     def get(self, who: Principal, job_id: str) -> JobRow:
         """One job."""
@@ -178,16 +178,26 @@ class Jobs:
                 raise conflict("in_use", "an active job extends the map of this one; cancel that first")
             delete_job(session, job)
 
-    def _need_room(self, session: Session, who: Principal) -> None:
+    def need_room(self, session: Session, who: Principal, count: int = 1) -> None:
+        """Raises ServiceError 429 where so many more jobs would be too many that wait, 507 for a full disk or quota."""
         self.storage.need_space()
         need_quota(session, who, self.settings.tenant_bytes)
         waiting = session.scalar(
             select(func.count()).select_from(JobRow).where(JobRow.tenant == who.tenant, JobRow.state == "queued")
         )
-        if (waiting or 0) >= self.settings.max_queued:
-            raise busy(f"{waiting} jobs are waiting already, which is the limit", 10.0)
+        if (waiting or 0) + count > self.settings.max_queued:
+            raise busy(f"{waiting} jobs are waiting already; the limit is {self.settings.max_queued}", 10.0)
 
-    def _insert(self, session: Session, who: Principal, request: dict[str, Any], rerun_of: str | None) -> JobRow:
+    def insert(
+        self,
+        session: Session,
+        who: Principal,
+        request: dict[str, Any],
+        *,
+        rerun_of: str | None = None,
+        sweep: str | None = None,
+    ) -> JobRow:
+        """Queue a job in the caller's transaction, which holds the tenant's lock. Raises ServiceError."""
         logs = [_complete_file(session, who, ident, "log") for ident in logs_of(request)]
         if request.get("map") is not None:
             _complete_file(session, who, request["map"]["yaml"], "map.yaml")
@@ -213,6 +223,8 @@ class Jobs:
             cancel=False,
             webhook=request.get("webhook"),
             tag=request.get("tag"),
+            priority=request.get("priority") or 0,
+            sweep=sweep,
         )
         session.add(job)
         session.flush()

@@ -31,7 +31,7 @@ EXAMPLES = """
   hsloc sweep run.mcap --out compare --matcher hide --matcher icp --csv
   hsloc sweep logs/*.mcap --out nightly --shard 0/4
   hsloc sweep --merge --out nightly
-  hsloc sweep 's3://bucket/logs/*.mcap' --out s3://bucket/nightly --shard auto/4
+  hsloc sweep 's3://bucket/logs/*.mcap' --out s3://bucket/nightly --shard 0/4
 """
 
 

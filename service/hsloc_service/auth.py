@@ -30,6 +30,8 @@ class Principal:
     tenant: str
     scopes: frozenset[str]
     token: str | None = None
+    job_id: str | None = None
+    """Of whoever came by a link: the job that it shows, and nothing else."""
 
     def need(self, scope: str) -> None:
         """Raises ServiceError 403 unless the scope is there."""
@@ -70,7 +72,7 @@ class Tokens:
             tenant=tenant,
             label=label,
             scopes=" ".join(scopes),
-            sha256=_sha256(token),
+            sha256=sha256_of(token),
             created=time.time(),
             expires=expires,
         )
@@ -83,7 +85,7 @@ class Tokens:
     def issue_operators(self, tenant: str, secret: str) -> None:
         """Accept the token that the operator chose, and revoke the one that the operator chose before."""
         self.issue(tenant, label=OPERATORS, secret=secret)
-        digest = _sha256(secret)
+        digest = sha256_of(secret)
         with self._database.write() as session:
             older = (TokenRow.label == OPERATORS, TokenRow.sha256 != digest, TokenRow.revoked.is_(None))
             session.execute(update(TokenRow).where(*older).values(revoked=time.time()))
@@ -108,7 +110,7 @@ class Tokens:
 
     def principal(self, token: str) -> Principal | None:
         """The principal of a token; None if it is unknown, revoked or expired."""
-        digest = _sha256(token)
+        digest = sha256_of(token)
         with self._database.read() as session:
             row = session.scalar(select(TokenRow).where(TokenRow.sha256 == digest))
         if row is None or not hmac.compare_digest(row.sha256, digest) or row.revoked is not None:
@@ -118,5 +120,6 @@ class Tokens:
         return Principal(row.tenant, frozenset(row.scopes.split()), row.id)
 
 
-def _sha256(token: str) -> str:
+def sha256_of(token: str) -> str:
+    """What is kept of a secret."""
     return hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()

@@ -37,9 +37,11 @@ READ = {
     ("get", "/v1/jobs/{job_id}"),
     ("get", "/v1/jobs/{job_id}/events"),
     ("get", "/v1/jobs/{job_id}/results"),
+    ("get", "/v1/jobs/{job_id}/shares"),
     ("get", "/v1/jobs/{job_id}/results.zip"),
     ("get", "/v1/jobs/{job_id}/results/{name}"),
     ("get", "/v1/jobs/{job_id}/webhooks"),
+    ("get", "/v1/labels"),
     ("get", "/v1/options"),
     ("get", "/v1/schemas"),
     ("get", "/v1/schemas/{name}"),
@@ -50,12 +52,15 @@ ADMIN = {("get", "/metrics"), ("get", "/v1/webhook-secret"), ("get", "/v1/worker
 WRITE = {
     ("delete", "/v1/files/{file_id}"),
     ("delete", "/v1/jobs/{job_id}"),
+    ("delete", "/v1/jobs/{job_id}/shares/{share_id}"),
+    ("patch", "/v1/jobs/{job_id}"),
     ("delete", "/v1/tus/{file_id}"),
     ("patch", "/v1/tus/{file_id}"),
     ("post", "/v1/files"),
     ("post", "/v1/jobs"),
     ("post", "/v1/jobs/{job_id}/cancel"),
     ("post", "/v1/jobs/{job_id}/rerun"),
+    ("post", "/v1/jobs/{job_id}/shares"),
     ("post", "/v1/run"),
     ("post", "/v1/tus"),
     ("put", "/v1/files/{file_id}"),
@@ -82,6 +87,7 @@ class World:
         self.job = submit(client)
         wait(client, self.job)
         self.file = str(client.get(f"/v1/jobs/{self.job}").json()["request"]["log"])
+        self.share = str(client.post(f"/v1/jobs/{self.job}/shares").json()["id"])
         headers = {"Tus-Resumable": "1.0.0", "Upload-Length": "9"}
         self.upload = client.post("/v1/tus", headers=headers).headers["location"].rsplit("/", 1)[1]
         del client.headers["Authorization"]
@@ -91,6 +97,7 @@ class World:
         headers = {} if who is None else {"Authorization": f"Bearer {self.tokens[who]}"}
         file = self.upload if "/tus/" in path else self.file
         url = path.replace("{file_id}", file).replace("{job_id}", self.job)
+        url = url.replace("{share_id}", self.share)
         url = url.replace("{name}", "run-metrics" if "/schemas/" in path else "trajectory.tum")
         options: dict[str, Any] = {}
         if "/tus" in path:
@@ -100,6 +107,8 @@ class World:
                 options["content"] = b"123"
         elif path == "/v1/jobs" and method == "post":
             options["json"] = {"log": self.file}
+        elif method == "patch":
+            options["json"] = {"title": "another"}
         elif path == "/v1/run":
             options["files"] = {"log": b"ok"}
         elif method in ("put", "post"):

@@ -10,6 +10,7 @@ import re
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from uuid import uuid4
 
 import hypothesis
 import pytest
@@ -88,6 +89,8 @@ class World:
             case.headers["Upload-Checksum"] = "sha1 2jmj7l5rSw0yVb/vlWAYkK/YBwk="
 
     def _known(self, name: str, method: str, path: str) -> str:
+        if name == "share_id":
+            return str(self.client.post(f"/v1/jobs/{self.job}/shares").json().get("id", uuid4()))
         if name == "job_id":
             return submit(self.client) if method == "DELETE" else self.job
         if "/tus/" in path:

@@ -11,6 +11,7 @@ import re
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 from live_service import upload
 from paths import RECORDINGS
@@ -68,6 +69,8 @@ def test_upload_watch_look_download(
     )
     assert page.locator("#key-figures div").count() == 3
     picture(page, "3-result")
+    assert "verdict: good" in (page.text_content("#job-log pre") or "")
+    share_by_a_link(page, open_page)
     with page.expect_download() as download:
         page.click("text=trajectory.tum")
     assert download.value.suggested_filename == "trajectory.tum"
@@ -100,6 +103,41 @@ def test_upload_watch_look_download(
     page.click("text=← all jobs")
     page.wait_for_function("() => document.querySelectorAll('#jobs tbody tr').length === 2")
     compare_two(page)
+
+
+def share_by_a_link(page: Any, open_page: Callable[..., Any]) -> None:
+    page.click("summary >> text=Share")
+    page.click("#make-share")
+    page.wait_for_selector("#shares li")
+    link = page.input_value("#share-link")
+    page.context.route("https://lichtblick-suite.github.io/**", lambda route: route.fulfill(body="a viewer"))
+    with page.expect_popup() as popup:
+        page.click("#job-buttons >> text=Open in Lichtblick")
+    popup.value.wait_for_url(
+        re.compile(r"lichtblick/\?ds=remote-file&ds\.url=http%3A.*%2Fhss_[\w-]{43}%2Fresults%2Frun\.mcap$")
+    )
+    file = unquote(popup.value.url.partition("ds.url=")[2])
+    read = """async (file) => { const part = await fetch(file, { headers: { range: "bytes=0-7" } });
+      return [part.status, part.headers.get("content-range"), (await part.text()).slice(1, 5)]; }"""
+    popup.value.close()
+    other = page.context.new_page()  # of no site at all, so that what it reads needs the headers of CORS
+    status, span, magic = other.evaluate(read, file)
+    assert (status, span.partition("/")[0], magic) == (206, "bytes 0-7", "MCAP")
+    other.close()
+    visitor = open_page(link)
+    visitor.wait_for_function("() => document.querySelector('.rv-now')?.textContent")
+    assert visitor.text_content("#job-title") == NASTY
+    assert visitor.locator("#job-buttons button").count() == 0
+    assert visitor.is_hidden("#job-describe")
+    assert visitor.is_hidden("#job-share")
+    with visitor.expect_download() as download:
+        visitor.click("text=trajectory.tum")
+    assert download.value.suggested_filename == "trajectory.tum"
+    picture(visitor, "9-shared")
+    for left in (1, 0):
+        page.click("#shares button")  # revokes
+        page.wait_for_function("(n) => document.querySelectorAll('#shares li').length === n", arg=left)
+    visitor.close()
 
 
 def compare_two(page: Any) -> None:

@@ -64,6 +64,7 @@ def test_several_logs_are_several_jobs_or_one_and_the_table_finds_them(
     page.fill("#search", "")
     page.select_option("#order", "name")
     page.wait_for_function("() => document.querySelector('#jobs tbody .name').textContent.startsWith('alpha')")
+    name_and_label(page)
     page.select_option("#filter", "state=failed")
     page.wait_for_function("() => document.querySelector('#page-text').textContent === 'no such job'")
     page.click("nav >> text=Uploads")
@@ -76,6 +77,28 @@ def test_several_logs_are_several_jobs_or_one_and_the_table_finds_them(
     with live.client() as client:
         assert len(client.get("/v1/jobs").json()["jobs"]) == 5
         assert len(client.get("/v1/files").json()["files"]) == 3
+
+
+def name_and_label(page: Any) -> None:
+    """Of alpha.log, the first in the table by name; the whole table by one label; and back to the filters of before."""
+    page.locator("#jobs tbody .name").first.click()
+    page.click("summary >> text=Name, labels and notes")
+    page.fill("#title", "<b>Hall</b> 3")
+    page.fill("#labels", "rain, floor 2,rain")
+    page.fill("#notes-text", "people at the door")
+    page.click("#describe button")
+    page.wait_for_selector("text=saved")
+    assert (page.text_content("#job-title") or "").startswith("<b>Hall</b> 3")
+    page.click("#job-labels >> text=floor 2")
+    page.wait_for_function("() => document.querySelectorAll('#jobs tbody tr').length === 1")
+    assert (page.input_value("#label-filter"), page.url.rpartition("#")[2]) == ("floor 2", "label=floor%202")
+    page.select_option("#label-filter", "")
+    page.wait_for_function("() => document.querySelectorAll('#jobs tbody tr').length > 2")
+    for box in page.locator("#jobs tbody input").all()[:2]:
+        box.check()
+    page.fill("#ticked-label", "night")
+    page.click("#label-ticked")
+    page.wait_for_function("() => document.querySelectorAll('#jobs tbody .label').length === 4")
 
 
 def test_a_page_goes_on_when_the_server_was_restarted(make_live: Callable[..., Live], browser: Any) -> None:

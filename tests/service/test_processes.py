@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import signal
 import threading
 import time
@@ -72,6 +73,8 @@ def test_ends_with_a_reason(
     poller.join()
     assert (ended["state"], ended["reason"], ended["attempt"]) == (state, reason, attempts)
     assert ended["message"]
+    log = re.findall(r"event: log\ndata: .*?\"lines\":\[(.*?)\]", client.get(f"/v1/jobs/{job}/events").text)
+    assert log == (['"last words"'] if word == b"exit 3" else [])
     assert missed == []
     storage = client.app.state.context.storage  # type: ignore[attr-defined]
     assert list(marked(f"{storage.instance}:")) == []

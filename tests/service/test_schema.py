@@ -162,6 +162,7 @@ def test_a_migration_that_fails_leaves_the_old_database(old: Path, monkeypatch: 
     assert version(old) == SCHEMA_VERSION
 
 
+JOB_COLUMNS = ("tag", "priority", "not_before", "sweep", "title", "labels", "notes")
 STEPS = "; ".join((*migrations.STEPS[1], *migrations.STEPS[2]))
 
 
@@ -174,7 +175,7 @@ STEPS = "; ".join((*migrations.STEPS[1], *migrations.STEPS[2]))
                 (
                     *migrations.STEPS[1],
                     *migrations.STEPS[2],
-                    *(f"ALTER TABLE job ADD COLUMN {name}" for name in ("tag", "priority", "not_before", "sweep")),
+                    *(f"ALTER TABLE job ADD COLUMN {name}" for name in JOB_COLUMNS),
                     "DROP TABLE asset",
                     f"PRAGMA user_version={SCHEMA_VERSION}",
                 )

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from sqlalchemy import JSON, BigInteger, Index, Integer, Text, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 """Stored in the database; what leads from one to the next is in `migrations`."""
 
 JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
@@ -111,6 +111,12 @@ class JobRow(Base):
     """When the next attempt may begin, after one that failed."""
     sweep: Mapped[str | None] = mapped_column(index=True)
     """The sweep that the job is a run of."""
+    title: Mapped[str | None]
+    """What a person calls the job; None: by the name of its log."""
+    labels: Mapped[str] = mapped_column(default=",", server_default=",")
+    """Words by which a person finds it, each between commas: `,floor 2,rain,`."""
+    notes: Mapped[str | None]
+    """What a person wrote about it."""
     __table_args__ = (
         Index("job_by_state", "state", "seq"),
         Index("job_by_tenant", "tenant", "state", "bytes"),  # the quota, and how many wait: asked at every submission
@@ -127,6 +133,18 @@ class AssetRow(Base):
     size: Mapped[int]
     sha256: Mapped[str]
     media_type: Mapped[str]
+
+
+class ShareRow(Base):
+    """A link by which whoever has it sees one job and its results; the secret itself is not kept."""
+
+    __tablename__ = "share"
+    id: Mapped[str] = mapped_column(primary_key=True)
+    tenant: Mapped[str]
+    job_id: Mapped[str] = mapped_column(index=True)
+    sha256: Mapped[str] = mapped_column(unique=True)
+    created: Mapped[float]
+    expires: Mapped[float]
 
 
 class RemovalRow(Base):

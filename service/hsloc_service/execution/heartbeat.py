@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy.exc import DBAPIError
@@ -28,6 +29,7 @@ class Heartbeat:
         self._stop, self._cancel = stop, cancel
         self._progress: dict[str, Any] | None = None
         self._written: dict[str, Any] | None = None
+        self._lines: list[str] = []
         self._checked = self._renewed = 0.0
         self._held_until = time.monotonic() + leases.lease_s
         self._begin = time.monotonic()
@@ -39,6 +41,17 @@ class Heartbeat:
     def report(self, phase: str, done: float, total: float, scans: int) -> None:
         """Keep the newest progress; it is written with the next heartbeat."""
         self._progress = {"phase": phase[:40], "done": done, "total": total, "scans": scans}
+
+    def log(self, lines: list[str]) -> None:
+        """Keep what the job's process wrote; it is written with the next heartbeat."""
+        self._lines += lines
+
+    def flush(self) -> None:
+        """Write the lines that are left, before the attempt ends. What cannot be written is no reason to fail it."""
+        if self._lines:
+            with suppress(DBAPIError):
+                self._leases.beat(self._claim, None, self._lines)
+            self._lines = []
 
     def enter(self, phase: str) -> None:
         """Begin a phase of the supervisor itself, such as `fetch` or `store`."""
@@ -57,17 +70,18 @@ class Heartbeat:
             return None
         self._checked = now
         fresh = self._progress is not None and self._progress is not self._written
-        if not fresh and now < self._renewed + self._interval_s and not cancelled:
+        if not fresh and not self._lines and now < self._renewed + self._interval_s and not cancelled:
             return None
         self._renewed = now
         try:
-            reply = self._leases.beat(self._claim, self._next_progress(now) if fresh else None)
+            reply = self._leases.beat(self._claim, self._next_progress(now) if fresh else None, self._lines)
         except DBAPIError as error:
             if not self._leases.database.shared or not is_unreachable(error):
                 raise
             # Until the lease ends nobody takes the job; a database that restarts is back by then.
             return None if time.monotonic() < self._held_until else "lost"
         self._held_until = now + self._leases.lease_s
+        self._lines = []
         return "lost" if not reply.mine else "cancelled" if reply.cancel else None
 
     def _next_progress(self, now: float) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from hsloc_service.execution.job_log import JobLog
 from hsloc_service.execution.outcome import Outcome, interrupted
 from hsloc_service.execution.processes import end_job, start_job
 from hsloc_service.storage import folder_bytes
@@ -41,6 +42,7 @@ class JobProcess:
         self._folder, self._mark, self._heartbeat = folder, mark, heartbeat
         self._storage, self._settings, self._sandbox = storage, settings, sandbox
         self._pipe_rest = b""
+        self._log = JobLog(folder / "log.txt")
         self._last_line: dict[str, Any] = {}
         """The line with `done` or `failed`, once the process has written it."""
 
@@ -64,6 +66,8 @@ class JobProcess:
         finally:
             end_job(process, self._mark, 0.0)
             os.close(pipe)
+            self._heartbeat.log(self._log.new_lines(ended=True))
+            self._heartbeat.flush()
 
     def _watch(self, process: Any, pipe: int) -> Outcome | None:
         """Read the pipe, renew the lease and check the limits, until the process has ended (None) or has to."""
@@ -81,6 +85,7 @@ class JobProcess:
                     return Outcome("failed", "wall_limit", f"the job took longer than {limit}")
                 if now >= size_at:
                     size_at = now + POLL_S
+                    self._heartbeat.log(self._log.new_lines())
                     if (full := self._disk_outcome()) is not None:
                         return full
                 reason = self._heartbeat.cancel_reason()

@@ -51,8 +51,13 @@ def main(argv: list[str] | None = None) -> int:
     def tell(line: dict[str, Any]) -> None:
         os.write(arguments.fd, json.dumps(line).encode() + b"\n")
 
+    begin = time.monotonic()
+
+    def say(text: str) -> None:
+        sys.stdout.write(f"{time.monotonic() - begin:7.1f} s  {plain_names(text)}\n")  # it is not buffered
+
     try:
-        tell({"done": execute(job, arguments.folder, _throttled(tell))})
+        tell({"done": execute(job, arguments.folder, _throttled(tell, say), say)})
     except MemoryError:
         tell({"failed": "out_of_memory", "message": "the job needed more memory than it is allowed"})
         return 1
@@ -63,8 +68,16 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, float, int], None]) -> dict[str, Any]:
-    """Replay and write the results into `folder/output`; returns the summary for the job's row."""
+def execute(
+    job: Mapping[str, Any],
+    folder: Path,
+    report: Callable[[str, float, float, int], None],
+    say: Callable[[str], None] = lambda _text: None,
+) -> dict[str, Any]:
+    """Replay and write the results into `folder/output`; returns the summary for the job's row.
+
+    `say` gets the lines of the job's log, which its page shows.
+    """
     from hsloc.analysis.quality import exceeded_limits
     from hsloc.evaluation import read_relations
     from hsloc.export.results_folder import write_results
@@ -83,12 +96,16 @@ def execute(job: Mapping[str, Any], folder: Path, report: Callable[[str, float, 
     plain = tuple(dataclasses.replace(each, text=plain_names(each.text)) for each in result.warnings)
     result = dataclasses.replace(result, warnings=plain)
     scans = len(result.diagnostics)
+    say(f"{scans} scans, {len(result.trajectory)} poses")
     written = write_results(
         result,
         folder / "output",
         progress=lambda share: report("write", share, 1.0, scans),
     )
     write_viewer(written.view, folder / "output")
+    for warning in written.metrics.warnings:
+        say(f"warning: {warning}")
+    say(f"verdict: {written.metrics.verdict}")
     limits = exceeded_limits(request, written.metrics)
     found = {"outcome": "below_threshold" if limits else "ok", "limits": [line[:500] for line in limits]}
     return found | summarise(written.metrics, written.timings)
@@ -192,12 +209,21 @@ def plain_names(text: str) -> str:
     return re.sub(rf"{re.escape(str(Path.cwd()))}/(?:(?:{folders})/)?", "", text)
 
 
-def _throttled(tell: Callable[[dict[str, Any]], None]) -> Callable[[str, float, float, int], None]:
-    last, phase = 0.0, ""
+def _throttled(
+    tell: Callable[[dict[str, Any]], None], say: Callable[[str], None]
+) -> Callable[[str, float, float, int], None]:
+    """Progress for the pipe at most every `EVERY_S`, and for the log each phase and each tenth of the replay."""
+    last, phase, tenth = 0.0, "", 0
 
     def report(now_in: str, done: float, total: float, scans: int) -> None:
-        nonlocal last, phase
+        nonlocal last, phase, tenth
         now = time.monotonic()
+        if now_in != phase:
+            say(now_in)
+            tenth = 0
+        if now_in == "replay" and total > 0.0 and int(10.0 * done / total) > tenth:
+            tenth = int(10.0 * done / total)
+            say(f"replay: {10 * tenth} %, {done:.0f} of {total:.0f} s, {scans} scans")
         if now - last >= EVERY_S or now_in != phase:
             last, phase = now, now_in
             tell({"phase": now_in, "part": done, "total": total, "scans": scans})

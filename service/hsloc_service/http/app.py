@@ -22,6 +22,7 @@ from hsloc_service.http import (
     metrics,
     results_routes,
     run_routes,
+    shares_routes,
     system_routes,
     tus,
 )
@@ -30,6 +31,7 @@ from hsloc_service.http.guard import Guard
 from hsloc_service.http.middleware import Conditional, add_error_handlers
 from hsloc_service.http.openapi import add_openapi
 from hsloc_service.jobs.repository import Jobs
+from hsloc_service.jobs.shares import Shares
 from hsloc_service.jobs.workers import Presence
 from hsloc_service.logs import log
 from hsloc_service.parts import open_parts
@@ -53,6 +55,7 @@ ROUTERS = tuple(
         jobs_routes,
         results_routes,
         run_routes,
+        shares_routes,
         system_routes,
     )
 )
@@ -80,7 +83,7 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.context = context
     app.add_middleware(Conditional)
-    app.add_middleware(Guard, settings=settings, tokens=Tokens(context.database))
+    app.add_middleware(Guard, settings=settings, tokens=Tokens(context.database), shares=context.shares)
     for router in ROUTERS:
         app.include_router(router, dependencies=[Depends(known_query)])
     _add_page(app)
@@ -93,13 +96,14 @@ def open_context(settings: Settings) -> Context:
     """The parts of a service on its data folder; nothing runs yet. Raises SettingsError."""
     parts = open_parts(settings, ended=metrics.attempt_ended, store_failed=metrics.STORE_ERRORS.inc)
     database, storage = parts.database, parts.storage
-    files = Files(database, storage, settings, parts.upload_parts)
+    files, jobs = Files(database, storage, settings, parts.upload_parts), Jobs(database, storage, settings)
     return Context(
         settings=settings,
         database=database,
         storage=storage,
         files=files,
-        jobs=Jobs(database, storage, settings),
+        jobs=jobs,
+        shares=Shares(database, jobs),
         receiver=UploadReceiver(files, settings),
         dispatcher=parts.dispatcher,
         stores=parts.stores,

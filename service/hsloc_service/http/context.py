@@ -15,6 +15,7 @@ from hsloc_service.errors import ServiceError
 from hsloc_service.execution.dispatcher import Dispatcher
 from hsloc_service.http.schemas import Problem
 from hsloc_service.jobs.repository import Jobs
+from hsloc_service.jobs.shares import Shares
 from hsloc_service.results.deletion_queue import DeletionQueue
 from hsloc_service.results.stores import ResultStores
 from hsloc_service.settings import Settings
@@ -37,6 +38,7 @@ class Context:
     storage: Storage
     files: Files
     jobs: Jobs
+    shares: Shares
     receiver: UploadReceiver
     dispatcher: Dispatcher
     stores: ResultStores
@@ -61,10 +63,17 @@ def _principal(scope: str) -> Callable[[Request], Principal]:
     return principal
 
 
+def _visitor(request: Request) -> Principal:
+    who: Principal = request.state.principal
+    return who
+
+
 Ctx = Annotated[Context, Depends(_context)]
 Reader = Annotated[Principal, Depends(_principal("read"))]
 Writer = Annotated[Principal, Depends(_principal("write"))]
 Admin = Annotated[Principal, Depends(_principal("admin"))]
+Visitor = Annotated[Principal, Depends(_visitor)]
+"""Whoever came by a link: the guard has found its job."""
 
 
 def known_query(request: Request) -> None:

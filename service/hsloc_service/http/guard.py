@@ -18,7 +18,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import Message
 
-from hsloc_service.auth import ANYBODY
+from hsloc_service.auth import ANYBODY, Principal
 from hsloc_service.errors import BrokenAnswer, ServiceError, busy
 from hsloc_service.http import metrics
 from hsloc_service.logs import log, request_id
@@ -26,11 +26,14 @@ from hsloc_service.logs import log, request_id
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Receive, Scope, Send
 
-    from hsloc_service.auth import Principal, Tokens
+    from hsloc_service.auth import Tokens
+    from hsloc_service.jobs.shares import Shares
     from hsloc_service.settings import Settings
 
 PUBLIC = ("/", "/healthz", "/readyz", "/openapi.json", "/favicon.ico")
 PUBLIC_PREFIX = "/web/"
+SHARED_PREFIX = "/v1/shared/"
+"""Behind it a secret takes the place of a token; pages of other sites, such as viewers, may read there."""
 UPLOADS = ("/v1/files", "/v1/tus", "/v1/run")
 """Paths whose bodies may be large; they count their bytes themselves."""
 METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
@@ -50,8 +53,8 @@ SECURITY = {
 class Guard:
     """The outermost layer."""
 
-    def __init__(self, app: ASGIApp, settings: Settings, tokens: Tokens) -> None:
-        self._app, self._settings, self._tokens = app, settings, tokens
+    def __init__(self, app: ASGIApp, settings: Settings, tokens: Tokens, shares: Shares) -> None:
+        self._app, self._settings, self._tokens, self._shares = app, settings, tokens, shares
         self._rates = Rates(settings.requests_per_s)
         self._closed = settings.require_token
         """Whether a token is required: by the settings, or because one was made meanwhile."""
@@ -88,7 +91,12 @@ class Guard:
                 await self._app(inner, self._counted(scope, receive), send_on)
             except BrokenAnswer as error:
                 # Returning before the end makes uvicorn close the connection.
-                log("answer.broken", logging.WARNING, route=scope["path"], error=str(error))
+                log(
+                    "answer.broken",
+                    logging.WARNING,
+                    route=getattr(inner.get("route"), "path", "other"),
+                    error=str(error),
+                )
         finally:
             route = getattr(inner.get("route"), "path", "other")
             seconds = time.perf_counter() - begin
@@ -116,13 +124,15 @@ class Guard:
             return None
         client = (scope.get("client") or ("unknown", 0))[0]
         try:
-            who = await self._principal(headers)
+            who = await (self._visitor(path) if path.startswith(SHARED_PREFIX) else self._principal(headers))
         except (OperationalError, InterfaceError) as error:
             log("database.error", error=str(error.orig))
             raise ServiceError(503, "database", "the database is busy", {"Retry-After": "1"}) from error
         if who is None:
             slow = self._settings.refusals_per_s
             self._rates.take(("refused", client), slow, 20.0 * slow)
+            if path.startswith(SHARED_PREFIX):
+                raise ServiceError(404, "not_found", "this link is unknown, expired or revoked")
             missing = "authorization" not in headers
             raise ServiceError(
                 401,
@@ -142,6 +152,8 @@ class Guard:
         name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
         if "*" not in allowed and name.lower() not in allowed:
             raise ServiceError(421, "host", "this Host is not served here; see --allowed-host")
+        if scope["path"].startswith(SHARED_PREFIX):
+            return
         origin = headers.get("origin")
         if origin is not None and origin.split("://", 1)[-1].lower() != host.lower():
             raise ServiceError(403, "origin", "requests from other sites are refused")
@@ -158,6 +170,10 @@ class Guard:
             # `hsloc serve --new-token` writes to the database of a server that runs.
             self._closed = await to_thread.run_sync(self._tokens.any)
         return None if self._closed else ANYBODY
+
+    async def _visitor(self, path: str) -> Principal | None:
+        row = await to_thread.run_sync(self._shares.find, path.removeprefix(SHARED_PREFIX).partition("/")[0])
+        return None if row is None else Principal(row.tenant, frozenset(), row.id, row.job_id)
 
     def _counted(self, scope: Scope, receive: Receive) -> Receive:
         """Bodies other than uploads are small; counted as received, whatever Content-Length says."""

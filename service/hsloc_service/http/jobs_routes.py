@@ -19,6 +19,7 @@ from hsloc_service.http.context import Context, Ctx, Reader, Writer, problems
 from hsloc_service.http.schemas import (
     UUID_PATTERN,
     DeliveryList,
+    JobDescription,
     JobList,
     JobRequest,
     JobView,
@@ -80,14 +81,18 @@ def list_jobs(
     order: JobOrder = "newest",
     verdict: Annotated[Verdict | None, Query(description="verdict of the result")] = None,
     search: Annotated[
-        str | None, Query(max_length=200, description="part of the log's name, or the beginning of the job's id")
+        str | None,
+        Query(
+            max_length=200, description="part of log's name, title, labels or notes, or the beginning of the job's id"
+        ),
     ] = None,
+    label: Annotated[str | None, Query(max_length=40, description="a label that the job has")] = None,
     brief: Annotated[
         bool, Query(description="of each summary the key figures alone, and how many jobs there are")
     ] = False,
 ) -> JobList:
     """Your jobs, newest first. Page with `next` and `before`; in another order with `offset`."""
-    wanted = JobFilter(state=state, verdict=verdict, search=search, order=order)
+    wanted = JobFilter(state=state, verdict=verdict, search=search, label=label, order=order)
     rows = ctx.jobs.list(who, wanted, before=before, offset=offset, limit=limit)
     views = [brief_view(row) if brief else job_view(row) for row in rows]
     more = len(rows) == limit and order == "newest"
@@ -99,6 +104,12 @@ def list_jobs(
 def get(ctx: Ctx, who: Reader, job_id: JobId) -> JobView:
     """One job."""
     return job_view(ctx.jobs.get(who, job_id))
+
+
+@router.patch("/{job_id}", responses=problems(404))
+def describe(ctx: Ctx, who: Writer, job_id: JobId, description: JobDescription) -> JobView:
+    """Set title, labels or notes of a job."""
+    return job_view(ctx.jobs.describe(who, job_id, description.model_dump(exclude_unset=True)))
 
 
 @router.post("/{job_id}/cancel", status_code=202, responses=problems(404))

@@ -42,8 +42,12 @@ _ZIP: dict[str, Any] = {"description": "the archive", "content": dict.fromkeys((
 @router.get("/{job_id}/results", responses=problems(404, 409))
 def manifest(ctx: Ctx, who: Reader, job_id: JobId) -> Manifest:
     """Names, sizes and SHA-256 of all files of the results."""
-    _, rows = _assets(ctx, who, job_id)
-    base = f"/v1/jobs/{job_id}/results"
+    _, rows = assets_of(ctx, who, job_id)
+    return manifest_of(job_id, rows, f"/v1/jobs/{job_id}/results")
+
+
+def manifest_of(job_id: str, rows: Sequence[AssetRow], base: str) -> Manifest:
+    """The manifest, with addresses below `base`."""
     views = [
         AssetView(name=r.name, size=r.size, sha256=r.sha256, media_type=r.media_type, href=f"{base}/{r.name}")
         for r in rows
@@ -61,7 +65,7 @@ def manifest(ctx: Ctx, who: Reader, job_id: JobId) -> Manifest:
 )
 async def archive(ctx: Ctx, who: Reader, job_id: JobId) -> StreamingResponse:
     """All files of the results in one archive, not compressed."""
-    job, rows = await to_thread.run_sync(_assets, ctx, who, job_id)
+    job, rows = await to_thread.run_sync(assets_of, ctx, who, job_id)
     name = safe_name(job.log_name.rsplit(".", 1)[0], "results")
     headers = {"Content-Disposition": f'attachment; filename="{name}-results.zip"'}
     readers = await _open(ctx, job, rows, job_id)
@@ -90,7 +94,21 @@ async def asset(
     if_none_match: Annotated[str | None, Header(max_length=4096)] = None,
 ) -> Response:
     """One file; ranges, ETag (its SHA-256) and If-None-Match work."""
-    job, rows = await to_thread.run_sync(_assets, ctx, who, job_id)
+    job, rows = await to_thread.run_sync(assets_of, ctx, who, job_id)
+    return await file_answer(request, ctx, job, rows, name, download=download, if_none_match=if_none_match)
+
+
+async def file_answer(
+    request: Request,
+    ctx: Context,
+    job: JobRow,
+    rows: Sequence[AssetRow],
+    name: str,
+    *,
+    download: bool,
+    if_none_match: str | None,
+) -> Response:
+    """A file of the results, or what of it the request asks for."""
     row = next((row for row in rows if row.name == name), None)
     if row is None:
         raise not_found("asset", name)
@@ -132,7 +150,8 @@ def parse_range(text: str | None, size: int) -> range | None:
     return range(start, stop)
 
 
-def _assets(ctx: Context, who: Principal, job_id: str) -> tuple[JobRow, Sequence[AssetRow]]:
+def assets_of(ctx: Context, who: Principal, job_id: str) -> tuple[JobRow, Sequence[AssetRow]]:
+    """A job that succeeded, and the manifest of its results. Raises ServiceError 404 and 409."""
     job, rows = ctx.jobs.assets(who, job_id)
     if job.state != "succeeded":
         raise ServiceError(409, "no_results", f"the job is {job.state}; only succeeded jobs have results")

@@ -212,6 +212,25 @@ Verdict = Literal["good", "check", "failed"]
 State = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
 
 
+Word = Annotated[str, Field(pattern=r"^[^\s,]([^,\x00-\x1f]{0,38}[^\s,])?$")]
+
+
+class JobDescription(Strict):
+    """What a person calls a job and notes about it; what is left out stays, null or nothing removes it."""
+
+    title: Annotated[str, Field(max_length=200)] | None = Field(default=None, description="instead of the log's name")
+    labels: Annotated[list[Word], Field(max_length=20)] | None = Field(
+        default=None, description="words without commas, by which jobs are found", examples=[["floor 2", "rain"]]
+    )
+    notes: Annotated[str, Field(max_length=4000)] | None = None
+
+
+class LabelList(BaseModel):
+    """All labels of your jobs."""
+
+    labels: list[str]
+
+
 class ProgressView(BaseModel):
     """How far a running job is."""
 
@@ -238,6 +257,9 @@ class JobView(BaseModel):
     reason: str | None
     message: str | None
     log: str = Field(description="what the client called the log")
+    title: str | None = Field(description="what a person calls the job")
+    labels: list[str]
+    notes: str | None
     request: dict[str, Any]
     rerun_of: str | None
     attempt: int

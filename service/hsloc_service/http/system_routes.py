@@ -18,7 +18,7 @@ from hsloc_service.db.tables import DeliveryRow, JobRow
 from hsloc_service.errors import ServiceError, not_found
 from hsloc_service.http import metrics
 from hsloc_service.http.context import Admin, Context, Ctx, Reader, problems
-from hsloc_service.http.schemas import Health, Info, Options, Problem, SecretView, WorkerList
+from hsloc_service.http.schemas import Health, Info, LabelList, Options, Problem, SecretView, WorkerList
 from hsloc_service.http.views import worker_view
 from hsloc_service.jobs.workers import workers
 from hsloc_service.webhooks import secret_of
@@ -87,6 +87,12 @@ def options(who: Reader) -> Options:
     """The options of a job, JSON Schema of its `config`, and the presets."""
     del who
     return Options(run=describe(), **job_options.options())
+
+
+@router.get("/v1/labels", responses=problems())
+def labels(ctx: Ctx, who: Reader) -> LabelList:
+    """The labels of all your jobs."""
+    return LabelList(labels=list(ctx.jobs.labels(who)))
 
 
 @router.get("/v1/schemas", responses=problems())

@@ -14,6 +14,7 @@ from hsloc_service.http.schemas import (
     known_moment,
     moment,
 )
+from hsloc_service.jobs.repository import split_labels
 
 if TYPE_CHECKING:
     from hsloc_service.db.tables import DeliveryRow, FileRow, JobRow
@@ -77,6 +78,9 @@ def job_view(row: JobRow) -> JobView:
         reason=row.reason,
         message=row.message,
         log=row.log_name,
+        title=row.title,
+        labels=split_labels(row.labels),
+        notes=row.notes,
         request=row.request,
         rerun_of=row.rerun_of,
         attempt=row.attempt,
@@ -105,6 +109,12 @@ def brief_view(row: JobRow) -> JobView:
             "key_figures": [each for name in names for each in summary.get("figures", []) if each["name"] == name],
         }
     return view.model_copy(update={"request": request, "summary": summary})
+
+
+def shared_view(row: JobRow) -> JobView:
+    """A job for whoever came by a link: without what its owner noted, and without where its end is reported."""
+    request = {key: value for key, value in row.request.items() if key != "webhook"}
+    return job_view(row).model_copy(update={"request": request, "labels": [], "notes": None})
 
 
 def delivery_view(row: DeliveryRow) -> DeliveryView:

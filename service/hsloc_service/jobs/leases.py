@@ -25,7 +25,7 @@ from hsloc_service.settings import UNLIMITED
 from hsloc_service.stored_request import MAP_STATE, files_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
     from sqlalchemy import ColumnElement
     from sqlalchemy.orm import Session
@@ -120,8 +120,8 @@ class Leases:
             waited_s = max(now - job.created, 0.0)
             return Claim(job.id, job.tenant, owner, job.attempt, job.log_name, job.request, names, source, waited_s)
 
-    def beat(self, claim: Claim, progress: dict[str, Any] | None) -> HeartbeatReply:
-        """Renew the lease, and write the progress."""
+    def beat(self, claim: Claim, progress: dict[str, Any] | None, lines: Sequence[str] = ()) -> HeartbeatReply:
+        """Renew the lease, and write the progress and the lines of the job's log."""
         with self.database.write() as session:
             job = _held(session, claim)
             if job is None:
@@ -132,6 +132,8 @@ class Leases:
                 job.phase, job.done, job.total = progress["phase"], progress["done"], progress["total"]
                 job.scans, job.speed, job.progressed = progress["scans"], progress["speed"], now
                 record(session, job, "progress", progress)
+            if lines:
+                record(session, job, "log", {"lines": list(lines)})
             return HeartbeatReply(mine=True, cancel=job.cancel)
 
     def succeed(

@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from sqlalchemy import ColumnElement, delete, func, or_, select
 
-from hsloc_service.db.tables import ACTIVE, AssetRow, CounterRow, DeliveryRow, EventRow, FileRow, IdempotencyRow, JobRow
+from hsloc_service.db.tables import (
+    ACTIVE,
+    AssetRow,
+    CounterRow,
+    DeliveryRow,
+    EventRow,
+    FileRow,
+    IdempotencyRow,
+    JobRow,
+    ShareRow,
+)
 from hsloc_service.errors import ServiceError, busy, conflict, not_found
 from hsloc_service.jobs.events import record
 from hsloc_service.results.deletion_queue import removal_of
@@ -20,7 +30,7 @@ from hsloc_service.uploads.repository import need_quota
 from hsloc_service.webhooks import queue_webhook
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from sqlalchemy.orm import Session
 
@@ -55,7 +65,9 @@ class JobFilter:
     verdict: str | None = None
     """Verdict of the result: good, check or failed."""
     search: str | None = None
-    """Part of the name of the log in any case, or the beginning of the job's id."""
+    """Part of the log's name, the title, the labels or the notes in any case, or the beginning of the job's id."""
+    label: str | None = None
+    """A label that the job has."""
     order: JobOrder = "newest"
 
     def conditions(self, who: Principal) -> list[ColumnElement[bool]]:
@@ -66,8 +78,11 @@ class JobFilter:
         if self.verdict is not None:
             found.append(JobRow.summary["metrics"]["verdict"].as_string() == self.verdict)
         if self.search:
-            by_name = JobRow.log_name.icontains(self.search, autoescape=True)
-            found.append(or_(by_name, JobRow.id.startswith(self.search, autoescape=True)))
+            texts = (JobRow.log_name, JobRow.title, JobRow.labels, JobRow.notes)
+            by_text = [text.icontains(self.search, autoescape=True) for text in texts]
+            found.append(or_(*by_text, JobRow.id.startswith(self.search, autoescape=True)))
+        if self.label is not None:
+            found.append(JobRow.labels.contains(f",{self.label},", autoescape=True))
         return found
 
 
@@ -107,7 +122,9 @@ class Jobs:
             self.database.lock_tenant(session, who.tenant)
             old = _job(session, who, job_id)
             self.need_room(session, who)
-            return self.insert(session, who, request, rerun_of=old.id)
+            job = self.insert(session, who, request, rerun_of=old.id)
+            job.title, job.labels = old.title, old.labels
+            return job
 
     def get(self, who: Principal, job_id: str) -> JobRow:
         """One job."""
@@ -163,6 +180,20 @@ class Jobs:
                 job.cancel, job.state = True, "cancelling"
                 record(session, job, "state", {"state": "cancelling"})
             return job
+
+    def describe(self, who: Principal, job_id: str, changes: Mapping[str, Any]) -> JobRow:
+        """Set title, labels or notes of a job; what `changes` does not name stays."""
+        with self.database.write() as session:
+            job = _job(session, who, job_id, lock=True)
+            for name, value in changes.items():
+                setattr(job, name, joined_labels(value or ()) if name == "labels" else value or None)
+            return job
+
+    def labels(self, who: Principal) -> Sequence[str]:
+        """The labels of all jobs, in the order of the alphabet."""
+        with self.database.read() as session:
+            texts = session.scalars(select(JobRow.labels).where(JobRow.tenant == who.tenant).distinct()).all()
+        return sorted({label for text in texts for label in split_labels(text)}, key=str.casefold)
 
     def delete(self, who: Principal, job_id: str) -> None:
         """Remove a job that has ended; its results are noted down for `DeletionQueue`.
@@ -232,6 +263,16 @@ class Jobs:
         return job
 
 
+def joined_labels(labels: Iterable[str]) -> str:
+    """The column of these labels, each once, in their order."""
+    return "".join(f",{label}" for label in dict.fromkeys(labels)) + ","
+
+
+def split_labels(text: str) -> list[str]:
+    """The labels of a column."""
+    return [label for label in text.split(",") if label]
+
+
 SEQ = "job.seq"
 
 
@@ -258,7 +299,7 @@ def delete_job(session: Session, *jobs: JobRow) -> None:
     """Delete jobs with all their rows, and record that their results are to be removed."""
     session.add_all([removal_of(job) for job in jobs if job.folder is not None])
     ids = [job.id for job in jobs]
-    for table in (AssetRow, EventRow, DeliveryRow, IdempotencyRow):
+    for table in (AssetRow, EventRow, DeliveryRow, IdempotencyRow, ShareRow):
         session.execute(delete(table).where(table.job_id.in_(ids)))
     session.execute(delete(JobRow).where(JobRow.id.in_(ids)))
 

@@ -1,15 +1,19 @@
-// The page: which part of it is shown, by the address. #job=ID&t=SECONDS, #compare=ID,ID, #files; else the jobs.
+// The page: which part of it is shown, by the address. #job=ID&t=SECONDS, #shared=SECRET&t=SECONDS, #compare=ID,ID,
+// #files, #label=TEXT; else the jobs.
 
 import { get, hasToken, onToken, useToken } from "./api.js";
 import { $, bytes, guarded, notice } from "./dom.js";
 import * as files from "./files.js";
 import * as form from "./form.js";
 import * as jobs from "./jobs.js";
+import * as labels from "./labels.js";
 import { build } from "./options.js";
 import * as result from "./result.js";
+import * as share from "./share.js";
 
 const EVERY_MS = 3000;
 const ID = /^[0-9a-f-]{36}$/; // of a job: what is in the address becomes part of a request's path
+const SECRET = /^hss_[\w-]{43}$/; // of a link
 let comparison = null;
 
 // --- token -----------------------------------------------------------------------------------------------------------
@@ -40,25 +44,28 @@ function route(event) {
   const [, name, value = ""] = /^#(\w+)=?(.*)$/.exec(location.hash) ?? [];
   const [list, time] = value.split("&t="), ids = list.split(",").filter(Boolean);
   const ofJobs = (name === "job" && ids.length === 1) || (name === "compare" && ids.length > 0);
-  const part = name === "files" || (ofJobs && ids.every((id) => ID.test(id))) ? name : "home";
+  const isShared = name === "shared" && SECRET.test(list);
+  const part = isShared ? "job" : name === "files" || (ofJobs && ids.every((id) => ID.test(id))) ? name : "home";
+  document.body.classList.toggle("visitor", isShared);
   for (const each of ["home", "job", "compare", "files"]) $(each).hidden = each !== part;
   document.title = "hsloc: where was the robot?";
   result.leave();
   comparison?.end();
   comparison = null;
   if (event) { notice(""); scrollTo(0, 0); }
-  if (part === "job") result.show(ids[0], Boolean(event), Number(time) || 0);
+  if (isShared) result.showShared(list, Number(time) || 0);
+  else if (part === "job") result.show(ids[0], Boolean(event), Number(time) || 0);
   else if (part === "compare") guarded(() => compare(ids));
   else if (part === "files") guarded(() => files.show(useAgain));
-  else guarded(jobs.refresh);
+  else guarded(async () => { await labels.known(); await jobs.refresh(name === "label" ? decodeURIComponent(value) : undefined); });
 }
 
 async function compare(ids) {
   const runs = [], address = location.hash;
   for (const id of ids.slice(0, 12)) {
-    const job = await get(`/v1/jobs/${id}`), loaded = job.state === "succeeded" ? await result.load(job) : null;
+    const job = await get(`/v1/jobs/${id}`), loaded = job.state === "succeeded" ? await result.load(`/v1/jobs/${id}/results`) : null;
     if (location.hash !== address) return; // something else is shown by now
-    if (loaded) runs.push({ name: `${job.log}, seed ${job.request.seed}`, href: `#job=${id}`, ...loaded });
+    if (loaded) runs.push({ name: `${job.title ?? job.log}, seed ${job.request.seed}`, href: `#job=${id}`, ...loaded });
     else notice(`${job.log}: ${job.state === "succeeded" ? "made by an earlier version; run it again to compare it" : "it has no result to compare"}`);
   }
   if (runs.length) comparison = new globalThis.ResultComparison($("comparison"), runs);
@@ -67,8 +74,10 @@ async function compare(ids) {
 form.listen((made) => { if (made.length === 1) location.hash = `job=${made[0].id}`; else guarded(jobs.refresh); });
 jobs.listen();
 files.listen(useAgain);
+labels.listen(result.renamed);
+share.listen();
 addEventListener("hashchange", route);
-about();
+if (!location.hash.startsWith("#shared=")) about();
 route();
 setInterval(async () => {
   if (!document.hidden && $("token-form").hidden && !$("home").hidden) {

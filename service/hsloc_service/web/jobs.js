@@ -2,6 +2,7 @@
 
 import { get, post, request } from "./api.js";
 import { $, badge, duration, element, guarded, when } from "./dom.js";
+import { chips, describe, known, words } from "./labels.js";
 
 const PAGE = 50;
 const ticked = new Set();
@@ -21,10 +22,10 @@ function row(job) {
   box.setAttribute("aria-label", `tick ${job.log}`);
   box.addEventListener("change", () => { if (box.checked) ticked.add(job.id); else ticked.delete(job.id); tick(); });
   cell(box);
-  const link = element("a", job.log, "name");
+  const link = element("a", job.title ?? job.log, "name");
   link.href = `#job=${job.id}`;
   link.dataset.job = job.id;
-  cell(link);
+  cell(link, ...(job.title ? [element("small", job.log, "quiet name")] : []), ...chips(job.labels));
   const result = cell(badge(job)), summary = job.summary ?? {};
   if (job.progress) {
     const bar = element("progress");
@@ -42,17 +43,19 @@ function row(job) {
   return line;
 }
 
-export async function refresh() {
+export async function refresh(label) {
+  if (label !== undefined) $("label-filter").value = label;
   const query = new URLSearchParams({ brief: "true", limit: PAGE, offset, order: $("order").value });
   if ($("search").value.trim()) query.set("search", $("search").value.trim());
   const [name, value] = $("filter").value.split("=");
   if (value) query.set(name, value);
+  if ($("label-filter").value) query.set("label", $("label-filter").value);
   const { jobs, total } = await get(`/v1/jobs?${query}`);
   if (!jobs.length && offset) { offset = Math.max(offset - PAGE, 0); return refresh(); }
   const lines = jobs.map(row), body = $("jobs").tBodies[0];
   if (lines.length !== body.rows.length || lines.some((line, k) => body.rows[k] !== line)) body.replaceChildren(...lines);
   for (const id of rows.keys()) if (!jobs.some((job) => job.id === id)) rows.delete(id);
-  const filtered = Boolean(value || $("search").value.trim());
+  const filtered = Boolean(value || $("search").value.trim() || $("label-filter").value);
   $("no-jobs").hidden = total > 0 || filtered;
   $("jobs").hidden = total === 0 && !filtered;
   $("page-text").textContent = total ? `${offset + 1} to ${offset + jobs.length} of ${total}` : filtered ? "no such job" : "";
@@ -79,12 +82,20 @@ export function listen() {
   const again = () => { offset = 0; guarded(refresh); };
   let timer = null;
   $("search").addEventListener("input", () => { clearTimeout(timer); timer = setTimeout(again, 250); });
-  $("filter").addEventListener("change", again);
+  for (const id of ["filter", "label-filter"]) $(id).addEventListener("change", again);
   $("order").addEventListener("change", again);
   $("older").addEventListener("click", () => { offset += PAGE; guarded(refresh); });
   $("newer").addEventListener("click", () => { offset = Math.max(offset - PAGE, 0); guarded(refresh); });
   $("compare-ticked").addEventListener("click", () => { location.hash = `compare=${[...ticked].join(",")}`; });
   $("rerun-ticked").addEventListener("click", () => guarded(() => each((id) => post(`/v1/jobs/${id}/rerun`))));
+  $("label-ticked").addEventListener("click", () => guarded(async () => {
+    const added = words($("ticked-label").value);
+    if (!added.length) throw new SyntaxError("type a label for the jobs that are ticked");
+    for (const id of ticked) await describe(id, { labels: [...(await get(`/v1/jobs/${id}`)).labels, ...added] });
+    $("ticked-label").value = "";
+    await known();
+    await refresh();
+  }));
   $("delete-ticked").addEventListener("click", () => {
     if (!confirm(`Delete ${ticked.size} jobs and their results?`)) return;
     guarded(() => each((id) => request(`/v1/jobs/${id}`, { method: "DELETE" })));

@@ -2,6 +2,8 @@
 
 import { events, get, hasToken, post, request } from "./api.js";
 import { $, ACTIVE, badge, button, bytes, element, guarded } from "./dom.js";
+import * as labels from "./labels.js";
+import * as share from "./share.js";
 
 let watching = null; // AbortController of the job that is shown
 let view = null;
@@ -13,34 +15,68 @@ export function leave() {
   clearTimeout(addressing);
   view?.end();
   view = null;
+  labels.leave();
+  share.leave();
 }
 
 // `time` (s) is where the result is opened, as in a link that somebody sent.
 export async function show(id, focus, time = 0) {
-  leave();
-  watching = new AbortController();
-  const mine = watching.signal;
-  $("result").hidden = true;
+  const mine = begin();
   const job = await guarded(() => get(`/v1/jobs/${id}`));
   if (!job || mine.aborted) return;
   render(job);
   if (focus) $("job-title").focus();
-  if (ACTIVE.includes(job.state)) {
-    for await (const _ of events(`/v1/jobs/${id}/events`, mine)) {
-      const now = await guarded(() => get(`/v1/jobs/${id}`));
-      if (now && !mine.aborted) render(now);
-    }
-  }
+  const ending = follow(job, mine);
+  if (ACTIVE.includes(job.state)) await ending;
   if (mine.aborted) return;
   const ended = await guarded(() => get(`/v1/jobs/${id}`));
   if (!ended || mine.aborted) return;
   render(ended);
-  if (ended.state === "succeeded") await guarded(() => showResult(ended, mine, time));
+  if (ended.state === "succeeded") await guarded(() => showResult(ended, `/v1/jobs/${id}/results`, mine, time));
 }
 
-function render(job) {
-  document.title = `${job.log}: hsloc`;
-  $("job-title").textContent = job.log;
+// The job that a link shows, read-only.
+export async function showShared(secret, time = 0) {
+  const mine = begin(), job = await guarded(() => get(`/v1/shared/${secret}`));
+  if (!job || mine.aborted) return;
+  render(job, false);
+  if (job.state === "succeeded") await guarded(() => showResult(job, `/v1/shared/${secret}/results`, mine, time));
+}
+
+function begin() {
+  leave();
+  watching = new AbortController();
+  $("result").hidden = $("job-log").hidden = true;
+  $("job-log").lastElementChild.textContent = $("job-notes").textContent = "";
+  return watching.signal;
+}
+
+// What the job's process writes, and how far it is, until it has ended.
+async function follow(job, mine) {
+  const isActive = ACTIVE.includes(job.state), box = $("job-log"), text = box.lastElementChild;
+  box.open = isActive ? box.open : ["failed", "crashed"].includes(job.state);
+  for await (const { kind, data } of events(`/v1/jobs/${job.id}/events`, mine)) {
+    if (kind === "log") {
+      const atEnd = text.scrollTop + text.clientHeight >= text.scrollHeight - 4;
+      text.append(`${data.lines.join("\n")}\n`);
+      box.hidden = false;
+      if (atEnd) text.scrollTop = text.scrollHeight;
+    } else if (isActive) {
+      const now = await guarded(() => get(`/v1/jobs/${job.id}`));
+      if (now && !mine.aborted) render(now);
+    }
+  }
+}
+
+export function renamed(job) {
+  $("job-title").replaceChildren(job.title ?? job.log, ...(job.title ? [" ", element("small", job.log, "quiet")] : []));
+  $("job-notes").textContent = job.notes ?? "";
+  document.title = `${job.title ?? job.log}: hsloc`;
+}
+
+function render(job, isMine = true) {
+  renamed(job);
+  labels.show(job);
   const state = $("job-state");
   state.replaceChildren(element("span", job.state, `state ${job.state}`));
   if (job.reason) state.append(` (${job.reason})`);
@@ -69,24 +105,28 @@ function render(job) {
       location.hash = "";
     }));
   }
-  $("job-buttons").replaceChildren(...buttons);
+  $("job-buttons").replaceChildren(...(isMine ? buttons : []));
+  $("job-describe").hidden = !isMine;
 }
 
-// The view of a job, and the picture of its map.
-export async function load(job) {
-  const base = `/v1/jobs/${job.id}/results`, data = await get(`${base}/viewer.json`);
+// The view of a result, and the picture of its map; `base` is the address of its files.
+export async function load(base) {
+  const data = await get(`${base}/viewer.json`);
   // Jobs of earlier versions have a view that this page cannot draw.
   if (!data.extent) return null;
   const image = data.map ? await createImageBitmap(await (await request(`${base}/${data.map.image}`)).blob()) : null;
   return { data, image };
 }
 
-async function showResult(job, mine, time) {
-  const base = `/v1/jobs/${job.id}/results`, manifest = await get(base);
+async function showResult(job, base, mine, time) {
+  const manifest = await get(base), isShared = base.startsWith("/v1/shared/");
   const names = new Set(manifest.assets.map((asset) => asset.name));
   const files = manifest.assets.filter((a) => !a.name.startsWith("viewer")).map(assetLine), zip = element("li");
-  zip.append(button("all files (.zip)", () => download(`${base}.zip`, "results.zip")));
-  if (names.has("report.html") && !hasToken()) {
+  if (isShared) zip.hidden = true;
+  else zip.append(button("all files (.zip)", () => download(`${base}.zip`, "results.zip")));
+  if (!isShared) share.show(job.id);
+  if (!isShared && names.has("run.mcap")) $("job-buttons").append(share.viewerButton(job.id));
+  if (names.has("report.html") && (isShared || !hasToken())) {
     const item = element("li"), link = element("a", "open the report");
     link.href = `${base}/report.html?download=false`;
     link.target = "_blank";
@@ -96,7 +136,7 @@ async function showResult(job, mine, time) {
   $("assets").replaceChildren(...files, zip);
   summary(job, null);
   $("result").hidden = false;
-  const loaded = names.has("viewer.json") ? await load(job) : null;
+  const loaded = names.has("viewer.json") ? await load(base) : null;
   if (!loaded || mine.aborted) return;
   summary(job, loaded.data.summary);
   view = new globalThis.ResultView($("view"), loaded.data, loaded.image, $("charts"));

@@ -88,7 +88,7 @@ class WarningCode(StrEnum):
     START_LATE = "start_late"
     """The log states an initial pose long after the first event; it is not used."""
     ODOMETRY_FROM_VELOCITIES = "odometry_from_velocities"
-    """The log has no odometry; it is made of measured velocities."""
+    """The log has no odometry; it is made of measured velocities, or rotations are predicted by an IMU."""
     ODOMETRY_RESET = "odometry_reset"
     """The odometry jumps; it is continued from the pose before the jump."""
     ODOMETRY_JUMPS = "odometry_jumps"

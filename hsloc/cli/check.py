@@ -78,7 +78,7 @@ def _offsets(arguments: argparse.Namespace, log: Log) -> dict[str, Offset]:
     from hsloc.slam.front_end import FrontEndParameters
     from hsloc.slam.time_offset import offsets_of_log
 
-    if log.summary.scan_topic is None or log.summary.odom_topic is None:
+    if log.summary.scan_topic is None or not (log.summary.odom_topic or log.summary.heading_topic):
         return {}
     try:
         return offsets_of_log(log.summary.paths, read_options(arguments), FrontEndParameters())

@@ -91,6 +91,7 @@ def _values(log: Log, losses: Losses, counts: dict[str, int]) -> dict[str, Any]:
         ],
         "scan_topic": summary.scan_topic,
         "odom_topic": summary.odom_topic,
+        "heading_topic": summary.heading_topic,
         "truth_topic": summary.truth_topic,
         "reference_candidates": list(summary.reference_candidates),
         "frames": {"odom": summary.odom_frame, "base": summary.base_frame, "laser": summary.laser_frame},
@@ -126,6 +127,7 @@ def _lines(summary: LogSummary, losses: Losses, report: dict[str, Any]) -> list[
     lines += ["", "what hsloc reads:"]
     chosen = (("scans", summary.scan_topic), ("odometry", summary.odom_topic), ("truth", summary.truth_topic))
     lines += [f"  {name + ':':<12}{topic or 'none'}" for name, topic in chosen]
+    lines += [f"  {'headings:':<12}{summary.heading_topic}"] if summary.heading_topic else []
     frames = " -> ".join(name for name in (summary.odom_frame, summary.base_frame, summary.laser_frame) if name)
     lines += [f"  {'frames:':<12}{frames or 'none'}"]
     if len(summary.lasers) > 1:

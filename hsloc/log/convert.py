@@ -9,7 +9,7 @@ from hsloc.errors import LogFormatError
 from hsloc.log.session.log_session import CONVERTED
 from hsloc.log.session.message_source import INITIAL_POSE
 from hsloc.log.writer import LogWriter
-from hsloc.model import IDENTITY, Odometry, Scan
+from hsloc.model import IDENTITY, Heading, Odometry, Scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,7 +41,7 @@ class Conversion:
 
 
 def convert_log(log: Log, target: Path, progress: Callable[[int], None] | None = None) -> Conversion:
-    """Write a log's events to an MCAP file: /scan, /odom, /tf, /tf_static, and /ground_truth and /map if it has them.
+    """Write a log's events to an MCAP file: /scan, /odom or /imu, /tf, /tf_static, and /ground_truth and /map.
 
     Header stamps are kept as they are, also where they run backwards; log times are their running maximum, so that
     the file is in order. A metadata record says that its order is that of the source, and `open_log` gives the same
@@ -94,6 +94,8 @@ class _Conversion:
             self._scan(event)
         elif isinstance(event, Odometry):
             self._odometry(event)
+        elif isinstance(event, Heading):
+            self._writer.heading(event.stamp_ns, event.theta, self._base_frame, self._log_time)
         else:
             self.truths += 1
             self._writer.odometry(

@@ -195,7 +195,8 @@ class LogSummary:
     lasers are merged, `scan_topic` names them all, `lasers` tells of each, and the other fields tell of the first.
     `parts` are the files that hold scans or odometry that are read, in the order of time. `segments` is how many
     messages make a turn of the lidar, where these were joined. `clocks_apart_s` is by how much the stamps of scans and
-    odometry differ beyond what their log times differ: a hint, since messages may be late.
+    odometry differ beyond what their log times differ: a hint, since messages may be late. `heading_topic` is that of
+    headings without positions, which predict rotations where there is no odometry.
     """
 
     paths: tuple[Path, ...]
@@ -207,6 +208,7 @@ class LogSummary:
     topics: tuple[TopicSummary, ...] = ()
     scan_topic: str | None = None
     odom_topic: str | None = None
+    heading_topic: str | None = None
     truth_topic: str | None = None
     reference_candidates: tuple[str, ...] = ()
     odom_frame: str | None = None

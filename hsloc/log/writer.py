@@ -131,6 +131,10 @@ class LogWriter:
         data = encode.odometry(stamp_ns, pose, covariance, twist, (frame_id, child_frame_id))
         self._add(topic, definitions.ODOMETRY, stamp_ns, data, log_time_ns)
 
+    def heading(self, stamp_ns: int, theta: float, frame_id: str, log_time_ns: int | None = None) -> None:
+        """sensor_msgs/Imu on /imu: the heading of a frame (rad), no rates and no accelerations."""
+        self._add("/imu", definitions.IMU, stamp_ns, encode.imu(stamp_ns, theta, frame_id), log_time_ns)
+
     def transforms(
         self,
         stamp_ns: int,

@@ -1,7 +1,7 @@
 """Frozen value types: poses, trajectories, scans, odometry, estimates and occupancy grids."""
 
 from hsloc.model.estimate import Estimate, Evidence, ScanDiagnostics, State, Status
-from hsloc.model.events import Event, Odometry, PairedScan, Scan, Truth
+from hsloc.model.events import Event, Heading, Odometry, PairedScan, Scan, Truth
 from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle, wrap_angles
 from hsloc.model.trajectory import Trajectory
@@ -11,6 +11,7 @@ __all__ = [
     "Estimate",
     "Event",
     "Evidence",
+    "Heading",
     "OccupancyGrid",
     "Odometry",
     "PairedScan",

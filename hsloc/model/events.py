@@ -1,4 +1,4 @@
-"""Events of a log, decoded when it is read: odometry, scans and, where there is one, the truth."""
+"""Events of a log, decoded when it is read: odometry or headings, scans and, where there is one, the truth."""
 
 from __future__ import annotations
 
@@ -26,6 +26,14 @@ class Odometry:
     T_odom_base: Pose2
     covariance: NDArray[np.float64] | None = None
     has_heading: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """The heading of the base (rad) from a start that is not known, where a log has no odometry; it may drift."""
+
+    stamp_ns: int
+    theta: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,13 +100,15 @@ class PairedScan:
     """A scan, and the pose of the base at its stamp by odometry.
 
     Of several lasers, scans of about the same time are matched together: `companions` are those that this one carries,
-    and a scan that another one will carry `is_held`: nothing is to be matched yet.
+    and a scan that another one will carry `is_held`: nothing is to be matched yet. `heading` is the last one before the
+    scan (rad), where the log has headings and no odometry.
     """
 
     scan: Scan
     T_odom_base: Pose2
     companions: tuple[PairedScan, ...] = ()
     is_held: bool = False
+    heading: float | None = None
 
     def points_base(self) -> NDArray[np.float64]:
         """The hits of the scan and its companions in the base's frame at the scan's stamp, metres, shape (m, 2)."""
@@ -116,4 +126,4 @@ HELD = "matched together with the next laser's scan"
 """Reason of the estimate of a scan that is held."""
 
 
-Event = Odometry | Scan | Truth
+Event = Odometry | Heading | Scan | Truth

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.model.events import Odometry, PairedScan, Scan, Truth
+from hsloc.model.events import Heading, Odometry, PairedScan, Scan, Truth
 from hsloc.model.pose2 import IDENTITY, Pose2, relative_poses
 from hsloc.model.trajectory import Trajectory
 
@@ -60,7 +60,7 @@ def pair(
     """Pair the scans with odometry, and deskew them if asked for; other events pass through in their order.
 
     `first` is the first odometry to come, where it is known: scans long before it are paired with it, else with the
-    identity, as those of a log without any odometry are.
+    identity, as those of a log without any odometry are. Of headings each scan gets the last one before it.
     """
     paired = _pair(events, IDENTITY if first is None else first)
     return deskewed(paired) if deskew else paired
@@ -69,10 +69,19 @@ def pair(
 def _pair(events: Iterable[Event], first: Pose2) -> Iterator[Odometry | PairedScan | Truth]:
     recent: deque[Odometry] = deque(maxlen=_RECENT_ODOMETRY)
     waiting: deque[Scan] = deque()
+    heading: float | None = None
     for event in events:
         if isinstance(event, Truth):
             yield event
+        elif isinstance(event, Heading):
+            # A log with headings has no odometry that scans would wait for.
+            heading = event.theta
+            while waiting:
+                yield _paired(waiting.popleft(), recent, None, first)
         elif isinstance(event, Scan):
+            if heading is not None and not recent:
+                yield PairedScan(event, first, heading=heading)
+                continue
             exact = _exact(recent, event.stamp_ns)
             if exact is not None and not waiting:
                 yield PairedScan(event, exact)

@@ -16,7 +16,7 @@ from hsloc.kernels.cache import compilation_reported
 from hsloc.log import LogSummary, Losses, open_log
 from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.matching.window import Window
-from hsloc.model.events import Odometry, Scan
+from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
 from hsloc.options import AUTO
@@ -71,7 +71,7 @@ class Result:
     `true_grid` is the one that the log carries, if any. `likelihood` is the field that was matched on, of a given map.
     `states` are the states of the poses of a localiser that weighs evidence; `localised` are those in this state,
     `tracked` the poses that were not searched for, whether their scans fit or not.
-    With `lidar_only` the log's odometry was not used: a localiser's `odometry` is then that of the scans. `deskewed`
+    With `lidar_only` no odometry of the log was used: a localiser's `odometry` is then that of the scans. `deskewed`
     says whether the beams were moved to where the robot was when each was measured.
     """
 
@@ -179,6 +179,7 @@ def _run_with(
     if not lidar_only:
         log, of_clocks = with_offset(request, log)
         warnings = (*warnings, *of_clocks)
+    lidar_only = lidar_only or log.summary.heading_topic is not None
     of_reference: list[RunWarning] = []
     reference = None if request.reference is None else read_reference(request.reference, request.logs, of_reference)
     grid, of_map = find_map(request, log)
@@ -300,14 +301,19 @@ def _diagnostics(history: RunHistory, mapping: MappingResult | None) -> ScanDiag
 
 
 def _events(request: RunRequest, log: Log, lidar_only: bool, localise: bool) -> Iterable[Event]:
-    """The events of the log; its odometry watched, or left out, or replaced for a localiser by that of the scans."""
+    """The events of the log; its odometry watched, or left out, or replaced for a localiser by that of the scans.
+
+    Headings stay, unless the scans alone are asked for.
+    """
     if not lidar_only:
         # The point mapper cannot do without odometry, whatever that is like.
         return log.events() if request.config.mapper == "point" and not localise else OdometryWatch(log.events())
+    unused = (Odometry, Heading) if request.no_odometry else (Odometry,)
+    events = (event for event in log.events() if not isinstance(event, unused))
     if localise:
         rng = np.random.default_rng((request.seed, 1))
-        return with_laser_odometry(log.events(), request.config.graph_mapper.front_end, rng)
-    return (event for event in log.events() if not isinstance(event, Odometry))
+        return with_laser_odometry(events, request.config.graph_mapper.front_end, rng)
+    return events
 
 
 def _share(progress: Callable[[Progress], None] | None, total: float, scans: int) -> Callable[[float], None] | None:

@@ -119,6 +119,8 @@ _OBSERVED = 0.1
 away from the odometry on five logs 95 of 100 right ones have 0.3 and more, slides along corridors 0.03 and less."""
 _BETTER = 0.03
 """A pose that HIDE found replaces the registered prediction if this much more of the points agree, or fit."""
+_HEADING_DRIFT = 0.02
+"""Drift of a heading [rad/s]: the zero-rate offset of common gyroscopes at rest, one degree per second."""
 _SLIP = 0.3
 """Standard deviation [m] of a motion that the scans contradict, without saying what it was."""
 _SLIP_ANGLE = 0.3
@@ -152,6 +154,7 @@ class FrontEnd:
         self._usual: float | None = None
         self._refused = 0
         self._last: tuple[int, Pose2] | None = None
+        self._last_heading: float | None = None
         self._velocity = np.zeros(3)
         self._period = float("inf")
         self._odometry_chi: list[float] = []
@@ -192,8 +195,13 @@ class FrontEnd:
         # A clock that jumps makes wild velocities: no step is predicted longer than the window is wide.
         most = np.array((p.no_odometry_window, p.no_odometry_window, p.no_odometry_window_angle))
         step = np.clip(self._velocity * periods, -most, most)
+        covariance = np.diag((most / p.window_sigmas) ** 2)
+        if paired.heading is not None and self._last_heading is not None:
+            step[2] = wrap_angle(paired.heading - self._last_heading)
+            of_turn = p.odometry_noise.covariance(Pose2(0.0, 0.0, float(step[2])))
+            covariance[2, 2] = of_turn[2, 2] + (_HEADING_DRIFT * seconds) ** 2 + FLOOR[2, 2]
         motion = self._T_map_key.between(pose @ Pose2(float(step[0]), float(step[1]), float(step[2])))
-        return motion, np.diag((most / p.window_sigmas) ** 2)
+        return motion, covariance
 
     def _matched(self, points: F64, scans: tuple[MovingScan, ...], motion: Pose2, covariance: F64) -> LocalMatch:
         key = self._T_map_key
@@ -301,7 +309,7 @@ class FrontEnd:
             self._velocity = step / max(seconds / self._period, 0.5)
         elif found.status is not Status.MATCHED:
             self._velocity = np.zeros(3)
-        self._last = (stamp, found.pose)
+        self._last, self._last_heading = (stamp, found.pose), paired.heading
         motion = found.motion
         moved = hypot(motion.x, motion.y) >= p.keyscan_min_d or abs(motion.theta) >= p.keyscan_min_a
         keep = found.is_keyscan and (moved or self._refused >= p.restart_after)
@@ -320,7 +328,7 @@ class FrontEnd:
         self._hidden = self._hidden + found.covariance if found.status is not Status.MATCHED else np.zeros((3, 3))
         self._T_map_key, self._T_odom_key = found.pose, paired.T_odom_base
         if self._last is None:
-            self._last = (paired.scan.stamp_ns, found.pose)
+            self._last, self._last_heading = (paired.scan.stamp_ns, found.pose), paired.heading
         moved = found.pose @ points[np.hypot(points[:, 0], points[:, 1]) < p.local_range]
         if found.status is Status.MATCHED or len(self._maps) == 1:
             for local, _ in self._maps:

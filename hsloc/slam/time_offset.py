@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hsloc.log import open_log
-from hsloc.model.events import Odometry, Scan
+from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.options import AUTO
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.warnings import RunWarning, WarningCode
@@ -170,8 +170,9 @@ def estimate_offset(
     def kept() -> Iterable[Event]:
         count, last_ns = 0, 0
         for event in events:
-            if isinstance(event, Odometry):
-                odometry.append((event.stamp_ns, event.T_odom_base.theta))
+            if isinstance(event, Odometry | Heading):
+                theta = event.theta if isinstance(event, Heading) else event.T_odom_base.theta
+                odometry.append((event.stamp_ns, theta))
                 if count >= most_scans and event.stamp_ns > last_ns + RANGE_S * NANOSECONDS:
                     return
             elif isinstance(event, Scan):

@@ -1,4 +1,4 @@
-"""Odometry from velocities and wheels, for logs that have none."""
+"""Odometry from velocities, wheels and inertial measurement units, for logs that have none."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ from log_formats import ROS2, messages, write
 from mcap.records import Channel, Schema
 
 from hsloc.errors import ConfigError, TopicError
-from hsloc.log import LogWriter, ReadOptions, open_log
-from hsloc.log.messages import definitions
+from hsloc.log import LogWriter, ReadOptions, convert_log, open_log
+from hsloc.log.messages import definitions, velocities
+from hsloc.log.messages.imu import ImuMessage, ImuMotion
+from hsloc.log.messages.joint_states import wheels_of
 from hsloc.log.messages.velocities import VelocityMessage
+from hsloc.log.session.event_builders import MotionFeed
 from hsloc.log.session.ordering import KIND_ODOMETRY, TopicClock
-from hsloc.log.session.velocity_odometry import VelocityFeed, wheels_of
 from hsloc.log.summary import Losses
-from hsloc.model import Odometry
+from hsloc.log.transforms import Transform3
+from hsloc.model import Heading, Odometry, Pose2
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -60,6 +63,12 @@ def joints(stamp: int, by_position: bool) -> Any:
     return KINDS[definitions.JOINT_STATE](header(stamp), names, *values)
 
 
+def imu(stamp: int) -> Any:
+    vector, none = KINDS["geometry_msgs/msg/Vector3"], np.zeros(9)
+    rates, unset = vector(0.0, 0.0, TURN), KINDS["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 0.0)
+    return KINDS[definitions.IMU](header(stamp), unset, none, rates, none, vector(0.0, 0.0, 9.81), none)
+
+
 def write_log(path: Path, topic: str, typename: str, by_position: bool = True, text: bool = True) -> Path:
     """Two seconds of scans and of the topic at 20 Hz."""
     scans = path.with_suffix(".scans")
@@ -75,10 +84,10 @@ def write_log(path: Path, topic: str, typename: str, by_position: bool = True, t
             data=definitions.definition_text(typename).encode() if text else b"",
         )
         channel = Channel(id=0, topic=topic, message_encoding="cdr", metadata={}, schema_id=0)
-        is_joints = typename == definitions.JOINT_STATE
+        is_joints, is_imu = (typename == each for each in (definitions.JOINT_STATE, definitions.IMU))
         for k in range(41):
             stamp = START + k * SECOND // 20
-            content = joints(stamp, by_position) if is_joints else velocity(typename, stamp)
+            content = joints(stamp, by_position) if is_joints else imu(stamp) if is_imu else velocity(typename, stamp)
             yield schema, channel, stamp, bytes(ROS2.serialize_cdr(content, typename))
         yield from messages(scans)
 
@@ -94,7 +103,7 @@ def assert_circle(path: Path, options: ReadOptions) -> None:
 
 
 @pytest.mark.parametrize("text", [True, False])
-@pytest.mark.parametrize("typename", definitions.VELOCITY_TYPES)
+@pytest.mark.parametrize("typename", [kind.typename for kind in velocities.KINDS])
 def test_velocities_are_summed_up(tmp_path: Path, typename: str, text: bool) -> None:
     path = write_log(tmp_path / "run.mcap", "/velocity", typename, text=text)
     assert_circle(path, ReadOptions(odom_topic="/velocity"))
@@ -109,7 +118,9 @@ def test_velocities_are_summed_up(tmp_path: Path, typename: str, text: bool) -> 
 )
 def test_time_that_runs_backwards_is_counted_once(seconds: tuple[float, ...], metres: float) -> None:
     losses = Losses()
-    feed = VelocityFeed(TopicClock("/velocity", KIND_ODOMETRY, losses), losses, definitions.TWIST_STAMPED)
+    kind = velocities.KINDS[0]
+    clock = TopicClock("/velocity", KIND_ODOMETRY, losses)
+    feed = MotionFeed(clock, losses, kind, velocities.VelocityMotion())
     poses = []
     for second in seconds:
         stamp = round(second * SECOND)
@@ -153,3 +164,48 @@ def test_wheels_that_are_none(text: str) -> None:
 )
 def test_the_sides_of_wheels_by_their_names(names: tuple[str, ...], sides: Any) -> None:
     assert wheels_of(names) == sides
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_an_imu_gives_headings_where_there_is_no_odometry_and_conversion_keeps_them(tmp_path: Path, text: bool) -> None:
+    log = open_log(write_log(tmp_path / "run.mcap", "/imu/data", definitions.IMU, text=text))
+    assert (log.summary.odom_topic, log.summary.heading_topic) == (None, "/imu/data")
+    assert any("rotations are predicted by /imu/data" in str(warning) for warning in log.summary.warnings)
+    convert_log(log, tmp_path / "converted.mcap")
+    for each in (log, open_log(tmp_path / "converted.mcap")):
+        headings = [event for event in each.events() if isinstance(event, Heading)]
+        assert not any(isinstance(event, Odometry) for event in each.events())
+        assert len(headings) == 41
+        assert headings[-1].theta - headings[0].theta == pytest.approx(2.0 * TURN)
+
+
+def test_odometry_counts_before_an_imu(tmp_path: Path) -> None:
+    parts = [write_log(tmp_path / "a.mcap", "/imu", definitions.IMU)]
+    with LogWriter(tmp_path / "b.mcap") as log:
+        for k in range(20):
+            log.odometry(START + k * SECOND // 10, Pose2(0.1 * k, 0.0, 0.0))
+    summary = open_log([*parts, tmp_path / "b.mcap"]).summary
+    assert (summary.odom_topic, summary.heading_topic) == ("/odom", None)
+
+
+UPSIDE_DOWN = Transform3(rotation=(1.0, 0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("rates", "orientation", "mounting", "turn"),
+    [
+        ((0.0, 0.0, 0.3), None, Transform3(), 0.03),
+        ((0.0, 0.0, 0.3), None, UPSIDE_DOWN, -0.03),
+        ((0.0, 0.3, 0.0), None, Transform3(rotation=(0.5**0.5, 0.0, 0.0, 0.5**0.5)), 0.03),  # lies on its side
+        ((0.0, 0.0, 0.0), (0.0, 0.0, np.sin(0.05), np.cos(0.05)), Transform3(), 0.1),  # a silent gyroscope
+        (None, (0.0, 0.0, np.sin(0.05), np.cos(0.05)), UPSIDE_DOWN, 0.1),
+        (None, None, Transform3(), None),
+        ((np.nan, 0.0, 0.1), None, Transform3(), None),
+    ],
+)
+def test_the_heading_of_an_imu(rates: Any, orientation: Any, mounting: Transform3, turn: float | None) -> None:
+    motion = ImuMotion(lambda _: mounting)
+    start = None if orientation is None else (0.0, 0.0, 0.0, 1.0)
+    motion.step(ImuMessage(1, "odom", "", "imu", rates, start), 0.0)
+    step = motion.step(ImuMessage(2, "odom", "", "imu", rates, orientation), 0.1)
+    assert step is None if turn is None else step == pytest.approx((0.0, 0.0, turn))

@@ -23,7 +23,10 @@ from hsloc.simulation.presets import preset
 from hsloc.simulation.recorder import record
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
+
+    from hsloc.model import Event
 
 FRONT, REAR = Pose2(0.3, 0.0, 0.0), Pose2(-0.3, 0.05, pi)
 BOTH = ReadOptions(scan_topic="/front,/rear")
@@ -45,7 +48,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(folder / "both.mcap", parts["front"], events, REAR)
 
 
-def write(path: Path, log: Log, events: list[Odometry | Scan | Truth], T_base_rear: Pose2 | None) -> Path:
+def write(path: Path, log: Log, events: Sequence[Event], T_base_rear: Pose2 | None) -> Path:
     """The events with the map and the start of a log, and a rear laser that is said to be there (None: unsaid)."""
     start = log.initial_pose()[1]
     links = [("base_link", "front", FRONT)] + ([] if T_base_rear is None else [("base_link", "rear", T_base_rear)])
@@ -58,7 +61,7 @@ def write(path: Path, log: Log, events: list[Odometry | Scan | Truth], T_base_re
                 writer.scan(event, topic=f"/{event.frame_id}")
             elif isinstance(event, Odometry):
                 writer.odometry(event.stamp_ns, event.T_odom_base)
-            else:
+            elif isinstance(event, Truth):
                 writer.odometry(event.stamp_ns, event.T_map_base, topic="/ground_truth", frame_id="map")
     return path
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import LogFormatError
 from hsloc.log.messages import cdr_batch_decode as columns
-from hsloc.log.messages import decode, definitions, foxglove, from_objects, point_cloud, velocities
+from hsloc.log.messages import decode, definitions, foxglove, from_objects, odometry_kinds, point_cloud
 from hsloc.log.messages.definitions import long_name, short_name
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -28,9 +28,11 @@ _ALIASES = {"tf/msg/tfMessage": definitions.TF_MESSAGE} | foxglove.TYPES
 """ROS 1's old name of a type that is otherwise the same, and Foxglove's types."""
 
 BY_HAND = decode.BY_HAND | {definitions.POINT_CLOUD2: point_cloud.point_cloud}
-FROM_OBJECT = (
-    from_objects.FROM_OBJECT | velocities.FROM_OBJECT | {definitions.POINT_CLOUD2: point_cloud.object_point_cloud}
-)
+FROM_OBJECT = {
+    **from_objects.FROM_OBJECT,
+    definitions.POINT_CLOUD2: point_cloud.object_point_cloud,
+    **{kind.typename: kind.from_object for kind in odometry_kinds.ODOMETRY_KINDS},
+}
 _ENCODINGS = ("cdr", "ros1", "json")
 _ZSTD = b"\x28\xb5\x2f\xfd"
 """How a payload begins that rosbag2 compressed by itself (`--compression-mode message`); CDR begins with a zero."""

@@ -20,7 +20,7 @@ TWIST = "geometry_msgs/msg/Twist"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 TWIST_WITH_COVARIANCE_STAMPED = "geometry_msgs/msg/TwistWithCovarianceStamped"
 JOINT_STATE = "sensor_msgs/msg/JointState"
-VELOCITY_TYPES = (TWIST_STAMPED, TWIST_WITH_COVARIANCE_STAMPED, TWIST)
+IMU = "sensor_msgs/msg/Imu"
 
 KNOWN_TYPES = (
     LASER_SCAN,
@@ -55,6 +55,15 @@ FIELDS: dict[str, tuple[str, ...]] = {
         "float64[] position",
         "float64[] velocity",
         "float64[] effort",
+    ),
+    "sensor_msgs/Imu": (
+        "std_msgs/Header header",
+        "geometry_msgs/Quaternion orientation",
+        "float64[9] orientation_covariance",
+        "geometry_msgs/Vector3 angular_velocity",
+        "float64[9] angular_velocity_covariance",
+        "geometry_msgs/Vector3 linear_acceleration",
+        "float64[9] linear_acceleration_covariance",
     ),
     "geometry_msgs/PoseStamped": ("std_msgs/Header header", "geometry_msgs/Pose pose"),
     "geometry_msgs/PoseWithCovarianceStamped": (

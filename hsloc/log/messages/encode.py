@@ -15,13 +15,14 @@ import numpy as np
 from hsloc.errors import OutputError
 from hsloc.log.messages.decode import PLANE
 from hsloc.log.transforms import Transform3
+from hsloc.model import Pose2
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from hsloc.model import OccupancyGrid, Pose2, Scan, Trajectory
+    from hsloc.model import OccupancyGrid, Scan, Trajectory
 
 ENCAPSULATION = b"\x00\x01\x00\x00"
 NANOSECONDS = 1_000_000_000
@@ -120,6 +121,17 @@ def odometry(
             _NO_COVARIANCE,
         )
     )
+
+
+_IMU = Struct("<37d")
+_NOT_MEASURED = (-1.0, *(0.0,) * 8)
+
+
+def imu(stamp_ns: int, theta: float, frame_id: str) -> bytes:
+    """sensor_msgs/Imu with an orientation alone (rad about the vertical axis)."""
+    orientation, nothing = Pose2(0.0, 0.0, theta).to_quaternion(), (0.0, 0.0, 0.0)
+    values = _IMU.pack(*orientation, *(0.0,) * 9, *nothing, *_NOT_MEASURED, *nothing, *_NOT_MEASURED)
+    return ENCAPSULATION + stamp_bytes(stamp_ns) + padded_string(frame_id, 8, 8) + values
 
 
 def transforms(stamp_ns: int, links: Sequence[tuple[str, str, Pose2 | Transform3]]) -> bytes:

@@ -118,11 +118,8 @@ def object_pose(message: Any) -> PoseMessage:
 FROM_OBJECT: dict[str, Callable[[Any], Any]] = {
     definitions.LASER_SCAN: object_laser_scan,
     definitions.MULTI_ECHO_LASER_SCAN: object_multi_echo_laser_scan,
-    definitions.ODOMETRY: object_odometry,
     definitions.TF_MESSAGE: object_transforms,
     definitions.OCCUPANCY_GRID: object_occupancy_grid,
-    definitions.POSE_STAMPED: object_pose,
-    definitions.POSE_WITH_COVARIANCE_STAMPED: object_pose,
 }
 
 

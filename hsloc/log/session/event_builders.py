@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import isfinite, pi
+from math import cos, isfinite, pi, sin
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -15,13 +15,14 @@ from hsloc.log.session.ordering import Arrivals
 from hsloc.log.session.scan_geometry import ScanFixes, ScanSurvey, TurnAssembler
 from hsloc.log.session.transform_topics import is_map_frame
 from hsloc.log.transforms import Transform3
-from hsloc.model import Odometry, Pose2, Scan, Truth
+from hsloc.model import IDENTITY, Heading, Odometry, Pose2, Scan, Truth, wrap_angle
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from hsloc.log.messages.cdr_batch_decode import PoseColumns
     from hsloc.log.messages.decode import LinkMessage, OdometryMessage, PoseMessage, ScanMessage
+    from hsloc.log.messages.odometry_kind import Motion, OdometryKind
     from hsloc.log.messages.point_cloud import CloudMessage
     from hsloc.log.session.extrinsics import Extrinsics
     from hsloc.log.session.ordering import TopicClock
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
     Stamped = tuple[TopicClock, Event]
 
+_LONGEST_S = 1.0
+"""A velocity holds for so long (s) at most: publishers that fall silent do so when the robot stands."""
 MAX_ABS = 1e7
 """Coordinates beyond (metres) are taken for damage; the Earth's circumference is 4e7."""
 
@@ -227,6 +230,57 @@ class PoseFeed(OdometryFeed):
         """As `OdometryFeed`."""
         super().__init__(clock, losses, is_truth, T_child_base)
         self.typename = typename
+
+
+class MotionFeed:
+    """Motions of any `OdometryKind`, summed up to Odometry, or to Heading where the kind has no position.
+
+    What runs backwards in time adds nothing.
+    """
+
+    def __init__(
+        self, clock: TopicClock, losses: Losses, kind: OdometryKind, motion: Motion, T_child_base: Pose2 | None = None
+    ) -> None:
+        """`T_child_base` as of `OdometryFeed`."""
+        self.topic = clock.topic
+        self.typename = kind.typename
+        self.clocks = (clock,)
+        self._clock = clock
+        self._losses = losses
+        self._has_position = kind.has_position
+        self._motion = motion
+        self._T_child_base = T_child_base
+        self._pose = IDENTITY
+        self._last_ns: int | None = None
+
+    def events(self, message: Any, log_time_ns: int) -> Iterable[Stamped]:
+        """One pose or heading; messages that are not about the motion give none."""
+        if not self._motion.concerns(message):
+            return ()
+        stamp = self._clock.stamp(message.stamp_ns, log_time_ns)
+        if stamp is None:
+            return ()
+        seconds = 0.0 if self._last_ns is None else (stamp - self._last_ns) / 1e9
+        step = self._motion.step(message, seconds if 0.0 < seconds <= _LONGEST_S else 0.0)
+        if step is None:
+            self._losses.invalid_messages[self.topic] += 1
+            return ()
+        if self._last_ns is None or not -_LONGEST_S <= seconds < 0.0:  # a clock that was set back starts anew
+            self._last_ns = stamp
+        self._pose = _along_arc(self._pose, *step)
+        if not self._has_position:
+            return ((self._clock, Heading(stamp, self._pose.theta)),)
+        pose = self._pose
+        if self._T_child_base is not None:
+            pose = self._T_child_base.inverse() @ pose @ self._T_child_base
+        return ((self._clock, Odometry(stamp, pose)),)
+
+
+def _along_arc(pose: Pose2, forwards: float, left: float, turn: float) -> Pose2:
+    """A pose after a motion (m, m, rad)."""
+    middle = pose.theta + 0.5 * turn
+    c, s = cos(middle), sin(middle)
+    return Pose2(pose.x + c * forwards - s * left, pose.y + s * forwards + c * left, wrap_angle(pose.theta + turn))
 
 
 class TransformFeed:

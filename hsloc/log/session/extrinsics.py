@@ -85,6 +85,11 @@ class Extrinsics:
         """T_target_source from all that the log knows, or None."""
         return self._lookup(target, source)[0]
 
+    def of_frame(self, frame: str) -> Transform3:
+        """T_base_frame of any frame as the log states it, the identity where it does not."""
+        found = None if self.base_frame is None else self.between(self.base_frame, frame)
+        return Transform3() if found is None else found
+
     def _lookup(self, target: str, source: str) -> tuple[Transform3 | None, FrameTree]:
         """T_target_source and the tree that says so; frames may lack their prefix."""
         for tree in (self._static, self._whole_tree):

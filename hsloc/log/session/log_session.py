@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hsloc.log.messages import definitions, foxglove
 from hsloc.log.messages.decoders import Undecodable, canonical_type, decoder_for, is_decodable
+from hsloc.log.messages.odometry_kinds import ODOMETRY_KINDS, POSE_TYPES, kind_among
 from hsloc.log.session.extrinsics import Extrinsics, calibrated_mountings
 from hsloc.log.session.scan_geometry import ScanFixes, ScanSurvey, survey
 from hsloc.log.session.split_recordings import check_parts
 from hsloc.log.session.topic_selection import (
-    ODOMETRY_TYPES,
     TF,
-    TRUTH_TYPES,
     choose_scans,
     choose_topics,
     has_name,
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
 
     from hsloc.log.container import Channel, Container
     from hsloc.log.messages.decoders import Decoder
+    from hsloc.log.messages.odometry_kind import OdometryKind
     from hsloc.model import Pose2
 
 CONVERTED = "hsloc.convert"
@@ -104,10 +104,10 @@ class LogSession:
         self._warnings += of_parts
         self.fixes = ScanFixes.parse(options.scan_fix)
         self.surveys = {topic: self._survey(topic) for topic in scans}
-        self.odom_type = self._pose_type(self.choice.odom)
-        self.odom = self._first(self.choice.odom, self.odom_type)
-        self.truth_type = self._pose_type(self.choice.truth)
-        self.truth = self._first(self.choice.truth, self.truth_type)
+        self.odom_kind = self._kind(self.choice.odom)
+        self.odom = self._first(self.choice.odom, self.odom_kind.typename)
+        self.truth_kind = self._kind(self.choice.truth)
+        self.truth = self._first(self.choice.truth, self.truth_kind.typename)
         assumed = {
             frame for c in containers for frame in c.metadata.get(CONVERTED, {}).get("assumed_mountings", "").split(",")
         }
@@ -161,12 +161,10 @@ class LogSession:
                 break
         return first
 
-    def _pose_type(self, topic: str | None) -> str:
-        """In which of the types of a pose a topic tells it."""
-        if topic is None or topic == TF:
-            return definitions.ODOMETRY
-        kinds = {canonical_type(channel.typename) for _, channel in self.channels(topic)}
-        return next((kind for kind in (*TRUTH_TYPES, *ODOMETRY_TYPES) if kind in kinds), definitions.ODOMETRY)
+    def _kind(self, topic: str | None) -> OdometryKind:
+        """The kind of odometry that a topic holds; that of poses where it holds none."""
+        types = {canonical_type(channel.typename) for _, channel in self.channels(topic)} if topic else set()
+        return kind_among(types) or ODOMETRY_KINDS[0]
 
     def _survey(self, topic: str) -> ScanSurvey:
         """A look at the first scans of a topic, with what the user overrides."""
@@ -247,7 +245,8 @@ class LogSession:
             origin_ns=self._origin(in_log_time=converted),
             topics=tuple(statistics),
             scan_topic=",".join(self.choice.scans) or None,
-            odom_topic=self._odometry_topic(),
+            odom_topic=self._odometry_topic() if self.odom_kind.has_position else None,
+            heading_topic=None if self.odom_kind.has_position else self.choice.odom,
             truth_topic=self.choice.truth,
             reference_candidates=self._candidates(),
             odom_frame=self._odom_frame(),
@@ -292,7 +291,7 @@ class LogSession:
         return found
 
     def _candidates(self) -> tuple[str, ...]:
-        poses = [topic for typename in TRUTH_TYPES[1:] for topic in of_type(self.active, typename)]
+        poses = [topic for typename in POSE_TYPES[1:] for topic in of_type(self.active, typename)]
         truths = [topic for topic in of_type(self.active, definitions.ODOMETRY) if is_truth_name(topic)]
         return tuple(
             dict.fromkeys(

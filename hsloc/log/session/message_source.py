@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING
 from hsloc.log.container import in_runs
 from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import Undecodable, canonical_type, column_decoder_for, is_decodable
-from hsloc.log.session.event_builders import CloudFeed, OdometryFeed, PoseFeed, ScanFeed, TransformFeed
+from hsloc.log.session.event_builders import CloudFeed, MotionFeed, OdometryFeed, PoseFeed, ScanFeed, TransformFeed
 from hsloc.log.session.log_session import FirstMessage, LogSession
 from hsloc.log.session.ordering import KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH, Arrivals, Reorder, TopicClock, one_by_one
 from hsloc.log.session.topic_selection import TF
 from hsloc.log.session.transform_topics import BASE_FRAMES
-from hsloc.log.session.velocity_odometry import VelocityFeed, WheelFeed
 from hsloc.log.source import Observation
 from hsloc.log.summary import NANOSECONDS, Losses
 from hsloc.model import Pose2
@@ -103,13 +102,12 @@ class RosSource:
             tf_odometry = self._clock(TF, KIND_ODOMETRY, None, losses)
         elif choice.odom is not None:
             clock = self._clock(choice.odom, KIND_ODOMETRY, survey.odom, losses)
-            wheels = survey.options.wheel_size()
-            if survey.odom_type == definitions.JOINT_STATE and wheels is not None:
-                feeds.append(WheelFeed(clock, losses, wheels, survey.T_child_base))
-            elif survey.odom_type in definitions.VELOCITY_TYPES:
-                feeds.append(VelocityFeed(clock, losses, survey.odom_type, survey.T_child_base))
+            kind = survey.odom_kind
+            if kind.motion is None:
+                feeds.append(_pose_feed(clock, losses, kind.typename, False, survey.T_child_base))
             else:
-                feeds.append(_pose_feed(clock, losses, survey.odom_type, False, survey.T_child_base))
+                motion = kind.motion(survey.options, survey.mountings.of_frame)
+                feeds.append(MotionFeed(clock, losses, kind, motion, survey.T_child_base))
         for topic, first in survey.scans.items():
             clock = self._clock(topic, KIND_SCAN, first, losses)
             if survey.scan_types[topic] == definitions.POINT_CLOUD2:
@@ -122,7 +120,7 @@ class RosSource:
             tf_truth = self._clock(TF, KIND_TRUTH, None, losses)
         elif choice.truth is not None:
             clock = self._clock(choice.truth, KIND_TRUTH, survey.truth, losses)
-            feeds.append(_pose_feed(clock, losses, survey.truth_type, True, survey.T_truth_base))
+            feeds.append(_pose_feed(clock, losses, survey.truth_kind.typename, True, survey.T_truth_base))
         if tf_odometry is not None or tf_truth is not None:
             frames = survey.tf_frames or (None, survey.mountings.base_frame or BASE_FRAMES[0])
             feeds.append(TransformFeed(TF, frames, tf_odometry, tf_truth, losses, survey.T_child_base))

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from hsloc.errors import TopicError
 from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import canonical_type, is_decodable
+from hsloc.log.messages.odometry_kind import Rank
+from hsloc.log.messages.odometry_kinds import ODOMETRY_KINDS, POSE_TYPES, kind_among
 from hsloc.log.session.transform_topics import is_static_topic, is_transform_topic, namespace
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -16,16 +18,13 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from hsloc.log.container import Channel
+    from hsloc.log.messages.odometry_kind import OdometryKind
     from hsloc.log.summary import ReadOptions
 
 TF, TF_STATIC = "/tf", "/tf_static"
 TF_NAMES = ("tf", "/tf")
 """How a user names transforms in place of a topic."""
-ODOMETRY_TYPES = (*definitions.VELOCITY_TYPES, definitions.JOINT_STATE)
-"""What odometry can be made of."""
-TRUTH_TYPES = (definitions.ODOMETRY, definitions.POSE_STAMPED, definitions.POSE_WITH_COVARIANCE_STAMPED)
 _TRUTH_NAME = re.compile(r"ground_?truth|(^|/)truth($|/)|(^|/)gt($|/)")
-_ODOMETRY_NAME = re.compile(r"(^|/)odom(etry)?($|/)")
 SCAN_TYPES = (definitions.LASER_SCAN, definitions.MULTI_ECHO_LASER_SCAN, definitions.POINT_CLOUD2)
 """What scans are made of, the plainest first."""
 _ECHOES = ("first", "most_intense", "last")
@@ -79,15 +78,15 @@ def choose_topics(
     else:
         others = [c for c in channels if c.topic != choice.truth and not is_truth_name(c.topic)]
         named = options.odom_topic is not None
-        candidates = _odometry_candidates(channels if named else others, named, options.wheels is not None)
-        if not named and tf_has_odometry and not candidates:
+        rank, candidates = _odometry_candidates(channels if named else others, options)
+        if not named and tf_has_odometry and rank > Rank.TRANSFORMS:
             choice.odom = TF
-        elif not (named or candidates) and (velocities := _velocities(others)):
-            choice.odom = velocities[0]
+        elif not named and candidates and (says := _kind_on(others, candidates[0]).says):
+            choice.odom = candidates[0]
             choice.warnings.append(
                 RunWarning(
                     WarningCode.ODOMETRY_FROM_VELOCITIES,
-                    f"there is no odometry; it is made of the velocities on {choice.odom}",
+                    says.format(choice.odom),
                     "choose another topic with --odom-topic, or go by the scans alone: --no-odom",
                 )
             )
@@ -99,7 +98,7 @@ def choose_topics(
                 definitions.ODOMETRY,
                 candidates,
                 options.odom_topic,
-                options.require_odometry,
+                options,
                 choice.warnings,
             )
     if choice.truth is not None and choice.truth == choice.odom != TF:
@@ -142,30 +141,25 @@ def choose_scans(
                 )
             )
             names = [first_echo]
-    chosen = [_pick(where, channels, "scan", first, candidates, name, options.require_scan, warnings) for name in names]
+    chosen = [_pick(where, channels, "scan", first, candidates, name, options, warnings) for name in names]
     return {topic: kinds[topic] for topic in chosen if topic is not None}
 
 
-def _velocities(channels: Sequence[Channel]) -> list[str]:
-    """Topics of velocities that were measured, by their names: what is commanded is not what was driven."""
-    types = (definitions.TWIST_STAMPED, definitions.TWIST_WITH_COVARIANCE_STAMPED)
-    return [topic for kind in types for topic in of_type(channels, kind) if "cmd" not in topic.lower()]
+def _odometry_candidates(channels: Sequence[Channel], options: ReadOptions) -> tuple[Rank, list[str]]:
+    """Topics of the lowest rank that the log has, and this; where the user names one, all that can be read."""
+    found: dict[Rank, list[str]] = {}
+    for kind in ODOMETRY_KINDS:
+        for topic in () if kind.missing(options) else of_type(channels, kind.typename):
+            found.setdefault(kind.rank_of(topic, options), []).append(topic)
+    if options.odom_topic is not None:
+        return Rank.NEVER, [topic for _, topics in sorted(found.items()) for topic in topics]
+    rank = min(found, default=Rank.NEVER)
+    return rank, [] if rank is Rank.NEVER else found[rank]
 
 
-def _odometry_candidates(channels: Sequence[Channel], named: bool, wheels: bool) -> list[str]:
-    """Topics of odometry; poses count if they are named, or if their name speaks and nothing else is there.
-
-    Velocities count if they are named, joint states where the size of the `wheels` is known, and then alone.
-    """
-    joints = of_type(channels, definitions.JOINT_STATE) if wheels else []
-    if joints and not named:
-        return joints
-    found = of_type(channels, definitions.ODOMETRY)
-    poses = [topic for typename in TRUTH_TYPES[1:] for topic in of_type(channels, typename)]
-    if named:
-        velocities = [topic for typename in definitions.VELOCITY_TYPES for topic in of_type(channels, typename)]
-        return found + sorted(poses) + sorted(velocities) + joints
-    return found or sorted(topic for topic in poses if _ODOMETRY_NAME.search(topic))
+def _kind_on(channels: Sequence[Channel], topic: str) -> OdometryKind:
+    """The kind that is read of a topic, one of the candidates."""
+    return kind_among({canonical_type(c.typename) for c in channels if c.topic == topic}) or ODOMETRY_KINDS[0]
 
 
 def _pick(
@@ -175,15 +169,16 @@ def _pick(
     typename: str,
     candidates: list[str],
     named: str | None,
-    required: bool,
+    options: ReadOptions,
     warnings: list[RunWarning],
 ) -> str | None:
     flag = f"--{kind}-topic"
+    required = options.require_odometry if kind == "odom" else options.require_scan
     if named is not None:
         found = [topic for topic in candidates if topic.lstrip("/") == named.lstrip("/")]
         if found:
             return found[0]
-        raise TopicError(_not_there(where, channels, named, typename, candidates, flag))
+        raise TopicError(_not_there(where, channels, named, typename, candidates, flag, options))
     if len(candidates) == 1:
         return candidates[0]
     what = {"scan": "scan", "odom": "odometry"}[kind]
@@ -195,8 +190,9 @@ def _pick(
         warning = RunWarning(WarningCode.TOPIC_AMBIGUOUS, text, remedy)
     else:
         remedy = "motion can be estimated from the scans alone: --no-odom" if kind == "odom" and required else ""
-        if remedy and of_type(channels, definitions.JOINT_STATE):
-            remedy += "; or it is made of joint states with --wheels RADIUS,TRACK"
+        for other in ODOMETRY_KINDS if remedy else ():
+            if other.missing(options) and (topics := of_type(channels, other.typename)):
+                remedy += f"; or it is made of {topics[0]} with {other.missing(options)}"
         if kind == "scan" and of_type(channels, definitions.POINT_CLOUD2):
             remedy = (
                 "point clouds are read as scans with --slice LOW,HIGH, the heights above the base [m] between which "
@@ -211,21 +207,28 @@ def _pick(
 
 
 def _not_there(
-    where: str, channels: Sequence[Channel], named: str, typename: str, candidates: list[str], flag: str
+    where: str,
+    channels: Sequence[Channel],
+    named: str,
+    typename: str,
+    candidates: list[str],
+    flag: str,
+    options: ReadOptions,
 ) -> str:
     other = next((c for c in channels if has_name(c, named)), None)
     if other is not None:
         trouble = f"{named} is {other.typename or 'of no type'} ({other.message_encoding}), not {typename}"
     else:
         trouble = f"no topic {named}"
-    if other is not None and canonical_type(other.typename) == definitions.JOINT_STATE:
-        return f"{where}: odometry is made of {named} with the size of the wheels: --wheels RADIUS,TRACK"
+    kind = None if other is None else kind_among({canonical_type(other.typename)})
+    if kind is not None and kind.missing(options):
+        return f"{where}: odometry is made of {named} with {kind.missing(options)}"
     remedy = f"{flag} may be {', '.join(candidates[:_LISTED])}" if candidates else f"it holds {listed(channels)}"
     return f"{where}: {trouble}; {remedy}"
 
 
 def _truth(where: str, channels: Sequence[Channel], options: ReadOptions) -> str | None:
-    candidates = sorted({topic for typename in TRUTH_TYPES for topic in of_type(channels, typename)})
+    candidates = sorted({topic for typename in POSE_TYPES for topic in of_type(channels, typename)})
     named = options.truth_topic
     if named is None:
         speaking = [topic for topic in candidates if is_truth_name(topic)]

@@ -17,8 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from hsloc.errors import LogFormatError
 from hsloc.log.container import Channel
 from hsloc.log.messages import decode, definitions, encode
-from hsloc.log.messages.decoders import Undecodable, decoder_for, is_decodable, is_known
-from hsloc.log.messages.from_objects import FROM_OBJECT
+from hsloc.log.messages.decoders import FROM_OBJECT, Undecodable, decoder_for, is_decodable, is_known
 from hsloc.log.session.scan_geometry import ScanFixes
 from hsloc.log.transforms import Transform3
 from hsloc.model import OccupancyGrid, Pose2

@@ -20,14 +20,14 @@ import numpy as np
 
 from hsloc.calibration.calibrate import calibrate
 from hsloc.calibration.estimator import NAMES
-from hsloc.log import LogWriter, ReadOptions, Transform3
+from hsloc.log import LogWriter, Transform3
 from hsloc.model import Odometry, Pose2, Scan
 from hsloc.model.calibration import OdometryCorrection, corrected_odometry
+from hsloc.request import RunRequest
 from hsloc.simulation.scenario import Scenario
 from hsloc.simulation.sensors import Lidar
 from hsloc.simulation.simulator import events
 from hsloc.simulation.world_files import load_world
-from hsloc.slam.parameters import GraphMapperParameters
 
 LIMITS = {
     "scale": 0.002, "rotation_scale": np.inf, "track": 0.005, "turn_per_metre": np.inf, "x": 0.005, "y": 0.005,
@@ -59,9 +59,9 @@ def write_log(path: Path, seed: int, seconds: float, world: str) -> dict[str, fl
     }  # fmt: skip
 
 
-def compare(path: Path, truth: dict[str, float]) -> dict[str, tuple[float, float]]:
+def compare(path: Path, truth: dict[str, float], given: Path | None = None) -> dict[str, tuple[float, float]]:
     """Error and half of the 95 % interval of each value."""
-    found = calibrate([path], ReadOptions(), GraphMapperParameters())
+    found = calibrate(RunRequest(logs=(path,), map_path=given))
     estimate = found.estimate
     values = dict(zip(NAMES, estimate.values.tolist(), strict=True))
     sigmas = dict(zip(NAMES, estimate.sigmas.tolist(), strict=True))

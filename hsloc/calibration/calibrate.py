@@ -12,24 +12,37 @@ import numpy as np
 
 from hsloc.calibration.estimator import Track, Undetermined, estimate
 from hsloc.errors import LogError, TopicError
+from hsloc.localisation.localiser import Localiser
 from hsloc.log import open_log
+from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.model.calibration import Calibration, LidarCalibration, corrected_odometry
+from hsloc.model.estimate import Status
 from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.options import AUTO
 from hsloc.preprocessing.odometry import ContinuousOdometry
 from hsloc.preprocessing.scans import pair
+from hsloc.replay.engine import replay
+from hsloc.replay.map_and_start import find_start, load_grid
+from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.time_offset import half_sweep_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Iterable, Iterator
+
+    from numpy.typing import NDArray
 
     from hsloc.calibration.estimator import Estimate
-    from hsloc.log import LogSummary, ReadOptions
+    from hsloc.config import Config
+    from hsloc.log import Log, LogSummary
     from hsloc.model.events import Event
-    from hsloc.slam.parameters import GraphMapperParameters
+    from hsloc.model.occupancy_grid import OccupancyGrid
+    from hsloc.request import RunRequest
+    from hsloc.warnings import RunWarning
+
+    Poses = tuple[NDArray[np.int64], NDArray[np.float64]]
+    """Stamps (n,) in nanoseconds and poses (n, 3)."""
 
 
 _MOST_PASSES = 6
@@ -54,6 +67,8 @@ class LogCalibration:
     nominal: Pose2
     summary: LogSummary
     passes: int
+    warnings: tuple[RunWarning, ...] = ()
+    """Of the log and the map."""
     wheels: tuple[float, float] | None = None
     """Radius and track (m) that were assumed, where the odometry is that of wheels."""
 
@@ -65,18 +80,16 @@ class LogCalibration:
         return Calibration(found.correction, ((self.topic, LidarCalibration(mounting, offset)),))
 
 
-def calibrate(
-    paths: Sequence[Path],
-    options: ReadOptions,
-    parameters: GraphMapperParameters,
-    progress: Callable[[int, float], None] | None = None,
-) -> LogCalibration:
+def calibrate(request: RunRequest, progress: Callable[[int, float], None] | None = None) -> LogCalibration:
     """Calibrate the odometry and the lidar of a log, the one of `scan_topic` where it has several.
 
-    `progress` is called with the pass, from 1, and the part of it that is done. Raises LogError where the log does not
-    hold what is compared, TopicError as `open_log`.
+    With a `map_path` the scans are localised on that map, else they are mapped. `progress` is called with the pass,
+    from 1, and the part of it that is done. Raises LogError where the log does not hold what is compared, TopicError
+    as `open_log`, MapError for a map or a start that cannot be used.
     """
-    summary = open_log(paths, options).summary
+    paths, options = request.logs, request.reading()
+    first = open_log(paths, options)
+    summary = first.summary
     topics = (summary.scan_topic or "").split(",")
     if len(topics) > 1:
         raise TopicError(
@@ -90,6 +103,7 @@ def calibrate(
     reading = replace(options, calibration=at_origin, laser_pose=None)
     begin, span = summary.start_ns, max(summary.end_ns - summary.start_ns, 1)
     nominal = options.laser_pose or summary.T_base_laser
+    on_map, of_map = _given_map(request, first, nominal)
     found: Estimate | None = None
     offset_s = 0.0
     for number in range(1, _MOST_PASSES + 1):
@@ -103,7 +117,7 @@ def calibrate(
             items.append(f"{topic}={offset_s!r}")
         log = open_log(paths, replace(reading, time_offset=",".join(items) or None))
         try:
-            seen = tracks(log.events(), parameters, found, report)
+            seen = tracks(log.events(), request.config, found, report, on_map)
             now = estimate(seen.laser, seen.odometry, nominal)
         except Undetermined as error:
             raise LogError(f"{paths[0]}: nothing can be calibrated: {error}") from None
@@ -116,7 +130,17 @@ def calibrate(
         offset_s -= float(now.values[6])
         if settled or not seen.is_swept:
             break
-    return LogCalibration(topic, now, offset_s, nominal, summary, number, options.wheel_size())
+    warnings = (*summary.warnings, *of_map)
+    return LogCalibration(topic, now, offset_s, nominal, summary, number, warnings, options.wheel_size())
+
+
+def _given_map(request: RunRequest, log: Log, nominal: Pose2) -> tuple[GivenMap | None, tuple[RunWarning, ...]]:
+    """The map that was named, if one was, where the laser begins on it, and warnings."""
+    if request.map_path is None:
+        return None, ()
+    grid, of_grid = load_grid(request.map_path)
+    start, of_start = find_start(request, log, grid)
+    return GivenMap(grid, None if start is None else start @ nominal), (*of_grid, *of_start)
 
 
 def _is_settled(before: Estimate, now: Estimate) -> bool:
@@ -127,8 +151,16 @@ def _is_settled(before: Estimate, now: Estimate) -> bool:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class GivenMap:
+    """A map in which the laser is localised, and where the laser is at the first event; None if that is unknown."""
+
+    grid: OccupancyGrid
+    T_map_laser: Pose2 | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """The laser's poses in a map of its own, and the odometry as the log has it.
+    """The laser's poses in a map, and the odometry as the log has it.
 
     The laser's stamps are those of the middle of each sweep, or, of deskewed scans, of the first beam. `is_swept` says
     whether the beams of a scan have times of their own.
@@ -141,37 +173,68 @@ class Tracks:
 
 def tracks(
     events: Iterable[Event],
-    parameters: GraphMapperParameters,
+    config: Config,
     known: Estimate | None = None,
     progress: Callable[[int], None] | None = None,
+    given: GivenMap | None = None,
 ) -> Tracks:
-    """Map a log without its odometry, in the frame of its laser: the scans of `events` must be mounted at the origin.
+    """Map a log without its odometry, or localise its scans in a map, in the frame of the laser.
 
-    `known` is a calibration by which scans are deskewed; its time offset is part of the stamps already. `progress` is
-    called with stamps (ns). Raises Undetermined where there is nothing to compare.
+    The scans of `events` must be mounted at the origin. `known` is a calibration by which scans are deskewed; its time
+    offset is part of the stamps already. `progress` is called with stamps (ns). Raises Undetermined where there is
+    nothing to compare.
     """
     odometry: list[tuple[int, float, float, float]] = []
-    mapper = Mapper(replace(parameters, use_odometry=False), np.random.default_rng(0))
     is_swept = False
     middles: dict[int, int] = {}
-    for event in _paired(_noted(events, odometry), known):
-        scan = event.scan
-        is_swept |= scan.time_increment != 0.0
-        middles[scan.stamp_ns] = scan.stamp_ns + (0 if scan.T_base_beam is not None else half_sweep_ns(scan))
-        mapper.update(event)
-        if progress is not None:
-            progress(scan.stamp_ns)
+
+    def scans() -> Iterator[PairedScan]:
+        nonlocal is_swept
+        for event in _paired(_noted(events, odometry), known):
+            scan = event.scan
+            is_swept |= scan.time_increment != 0.0
+            middles[scan.stamp_ns] = scan.stamp_ns + (0 if scan.T_base_beam is not None else half_sweep_ns(scan))
+            yield event
+            if progress is not None:
+                progress(scan.stamp_ns)
+
+    at, poses = _mapped(scans(), config) if given is None else _localised(scans(), config, given)
     if len(odometry) < 2:
         raise Undetermined("there is no odometry")
-    found = mapper.finish()
-    if len(found.keyscan_poses) < 2:
-        raise Undetermined("the scans show no motion")
-    stamps = np.array([middles[stamp] for stamp in found.keyscan_stamps_ns.tolist()], dtype=np.int64)
+    if len(poses) < 2:
+        raise Undetermined("the scans show no motion" if given is None else "the scans do not fit the map")
+    stamps = np.array([middles[stamp] for stamp in at.tolist()], dtype=np.int64)
     return Tracks(
-        Track.of(stamps, found.keyscan_poses),
+        Track.of(stamps, poses),
         Track.of(np.array([row[0] for row in odometry], dtype=np.int64), np.array([row[1:] for row in odometry])),
         is_swept,
     )
+
+
+def _mapped(scans: Iterable[PairedScan], config: Config) -> Poses:
+    """The keyscans of a map that is built of the scans alone."""
+    mapper = Mapper(replace(config.graph_mapper, use_odometry=False), np.random.default_rng(0))
+    for event in scans:
+        mapper.update(event)
+    found = mapper.finish()
+    return found.keyscan_stamps_ns, found.keyscan_poses
+
+
+def _localised(scans: Iterable[PairedScan], config: Config, given: GivenMap) -> Poses:
+    """The scans that were matched with the map, predicted from scan to scan."""
+    field = LikelihoodField.from_grid(given.grid, config.likelihood_field.sigma, config.likelihood_field.margin)
+    localiser = Localiser.from_parameters(
+        given.grid, field, config.make_matcher(), config.localiser, np.random.default_rng(0), given.T_map_laser
+    )
+    moving = with_laser_odometry(
+        (event.scan for event in scans), config.graph_mapper.front_end, np.random.default_rng(1)
+    )
+    rows = [
+        (estimate.stamp_ns, *estimate.T_map_base.to_array())
+        for event, estimate in replay(moving, localiser)
+        if isinstance(event, PairedScan) and estimate is not None and estimate.status is Status.MATCHED
+    ]
+    return np.array([row[0] for row in rows], dtype=np.int64), np.array([row[1:] for row in rows]).reshape(-1, 3)
 
 
 def _noted(events: Iterable[Event], odometry: list[tuple[int, float, float, float]]) -> Iterator[Event]:

@@ -13,6 +13,7 @@ from hsloc.calibration.estimator import NAMES, Track, Undetermined, estimate
 from hsloc.cli.main import main
 from hsloc.errors import ConfigError
 from hsloc.log import LogWriter, ReadOptions, Transform3, open_log, read_calibration
+from hsloc.maps import save_map
 from hsloc.model import Odometry, Pose2, Scan
 from hsloc.model.calibration import Calibration, LidarCalibration, OdometryCorrection, corrected_odometry
 from hsloc.model.pose2 import compose_poses
@@ -135,6 +136,21 @@ def test_from_a_log_to_a_replay(tmp_path: Path, capsys: pytest.CaptureFixture[st
     arguments = ["replay", str(log), "--mode", "slam", "--end", "3", "--calibration", str(out), "--out", str(result)]
     assert main(arguments) == 0
     assert f"--calibration={out}" in (result / "report.html").read_text()
+
+
+def test_on_a_given_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, out, world = write_log(tmp_path / "run.mcap"), tmp_path / "robot.yaml", load_world("office")
+    save_map(world.occupancy_grid(0.05), tmp_path / "map.yaml")
+    start = ",".join(str(value) for value in world.start().to_array())
+    arguments = ["calibrate", str(log), "--out", str(out), "--json", f"--initial-pose={start}"]
+    assert main(arguments) == 1
+    assert "give one with --map" in capsys.readouterr().err
+    assert main([*arguments, f"--map={tmp_path / 'map.yaml'}"]) == 0
+    values = {name: each["value"] for name, each in json.loads(capsys.readouterr().out)["parameters"].items()}
+    assert abs(values["scale"] - 1.02) < 0.01
+    assert abs(values["rotation_scale"] - 0.97) < 0.01
+    assert np.abs(np.array((values["x"], values["yaw"])) - (0.21, 3.0)).max() < 0.01
+    assert abs(values["time_offset"] + LAG_S) < 0.01
 
 
 def test_a_calibration_is_applied_when_a_log_is_read(tmp_path: Path) -> None:

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from hsloc.config import Config
+    from hsloc.sweep.parallel import Shard
     from hsloc.sweep.remote import RemoteLog, UrlFolder
     from hsloc.sweep.runs import Outcome, SweepRun
-    from hsloc.sweep.shards import Shard
 
 HELP = "replay many logs, configurations and seeds"
 EXAMPLES = """
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Sweep; 1 where a run failed, else 4 where one does not keep a limit, else 3 where part of an input was lost."""
     from hsloc.cli.main import EXIT_USAGE
     from hsloc.errors import OutputError
-    from hsloc.sweep.shards import merge, write_shard
+    from hsloc.sweep.parallel import merge, write_shard
     from hsloc.sweep.table import as_csv, as_json, as_markdown, as_parquet, as_text, rows
 
     folder: Path | UrlFolder = arguments.out
@@ -123,7 +123,7 @@ def _plan(arguments: argparse.Namespace) -> list[SweepRun]:
 
 def _sweep(arguments: argparse.Namespace, runs: list[SweepRun]) -> list[Outcome]:
     """Do the runs where the arguments say, with a line of progress."""
-    from hsloc.sweep.process_pool import sweep_in_processes, sweep_on_dask
+    from hsloc.sweep.parallel import sweep_in_processes, sweep_on_dask
 
     done = 0
     with ProgressLine(arguments.quiet or arguments.no_progress) as line:
@@ -229,7 +229,7 @@ def _positive(text: str) -> int:
 
 
 def _shard(text: str) -> Shard:
-    from hsloc.sweep.shards import parse_shard
+    from hsloc.sweep.parallel import parse_shard
 
     try:
         return parse_shard(text)

@@ -21,10 +21,10 @@ from ruamel.yaml import YAML
 from hsloc.cli.main import build_parser, main
 from hsloc.config import Config
 from hsloc.errors import HslocError, LogError, OutputError
-from hsloc.sweep import process_pool
+from hsloc.sweep import parallel
+from hsloc.sweep.parallel import Shard, merge, parse_shard, plan_hash, write_shard
 from hsloc.sweep.remote import RemoteLog, UrlFolder, remote_logs
 from hsloc.sweep.runs import DONE, FAILED, SKIPPED, Outcome, SweepRun, finished, plan, sweep
-from hsloc.sweep.shards import Shard, merge, parse_shard, plan_hash, write_shard
 from hsloc.sweep.table import as_parquet
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def in_threads(monkeypatch: pytest.MonkeyPatch) -> None:
         with ThreadPoolExecutor(jobs) as executor:
             return sweep(runs, folder, executor, progress)
 
-    monkeypatch.setattr(process_pool, "sweep_in_processes", sweep_in_threads)
+    monkeypatch.setattr(parallel, "sweep_in_processes", sweep_in_threads)
 
 
 def rows_of(path: Path) -> list[dict[str, Any]]:
@@ -265,10 +265,10 @@ def test_a_sweep_on_dask_is_that_on_one_machine(
 def test_where_no_scheduler_answers_it_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(process_pool, "DASK_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(parallel, "DASK_TIMEOUT_S", 0.5)
     pytest.importorskip("distributed", reason="DASK IS NOT TESTED: pip install distributed")
     with pytest.raises(HslocError, match=r"tcp://127.0.0.1:9: no Dask scheduler answers"):
-        process_pool.sweep_on_dask([], tmp_path, "tcp://127.0.0.1:9")
+        parallel.sweep_on_dask([], tmp_path, "tcp://127.0.0.1:9")
     with pytest.raises(SystemExit):
         main(["sweep", str(OFFICE), "--out", str(tmp_path), "--executor", "ray://x:1"])
     assert "'ray://x:1' is not dask://HOST:PORT" in capsys.readouterr().err

@@ -22,7 +22,7 @@ from hsloc.cli.main import main
 from hsloc.config import Config
 from hsloc.log import ReadOptions
 from hsloc.run_metrics import RunMetrics
-from hsloc.sweep.process_pool import sweep_in_processes
+from hsloc.sweep.parallel import sweep_in_processes
 from hsloc.sweep.runs import DONE, FAILED, SKIPPED, Outcome, SweepRun, plan, run_key, sweep
 from hsloc.sweep.table import COLUMNS, as_csv, as_json, as_markdown, as_text, rows
 

@@ -19,8 +19,7 @@ from hsloc.analysis.metrics import (
     scan_counts,
 )
 from hsloc.analysis.quality import offset_warnings, quality_warnings, verdict_reasons
-from hsloc.analysis.scan_overlay import ScanOverlayBuilder
-from hsloc.analysis.scan_statistics import ConvergenceSample, ExtrinsicsCheck, Residuals
+from hsloc.analysis.scan_statistics import ConvergenceSample, ExtrinsicsCheck, Residuals, ScanOverlayBuilder
 from hsloc.analysis.second_pass import posed_events
 from hsloc.errors import EvaluationError
 from hsloc.evaluation import evaluate_relations, read_relations
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hsloc.analysis.scan_overlay import ScanOverlay
+    from hsloc.analysis.scan_statistics import ScanOverlay
     from hsloc.analysis.second_pass import PosedEvent
     from hsloc.evaluation import Comparison, RelationsResult
     from hsloc.replay.run import Result

@@ -1,11 +1,11 @@
-"""Statistics over the scans of a finished run: fit to the map, mounting of each laser, convergence of the search.
+"""The scans of a finished run: fit to the map, mounting of each laser, convergence of the search, scans to be shown.
 
 Each class takes the scans whose pose is known, one by one with their poses, in bounded memory.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import degrees, hypot, radians
 from typing import TYPE_CHECKING
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from hsloc.matching.match import Matcher
     from hsloc.model.events import Scan
     from hsloc.model.occupancy_grid import OccupancyGrid
+
+    Floats = NDArray[np.float64]
 
 _BIN_M = 0.005
 _MAX_DISTANCE_M = 5.0
@@ -48,6 +50,13 @@ _MIN_SIGMAS = 4.0
 CONVERGENCE_SCANS = 25
 CONVERGENCE_HALF_M, CONVERGENCE_HALF_RAD = 0.5, radians(20.0)
 """Half-widths of the window: that of a search after a rejected match."""
+
+SHOWN_SCANS = 300
+"""About this many scans, spread over the run, keep their points."""
+SHOWN_NOT_MATCHED = 200
+"""At most this many of the scans that were not matched keep them as well."""
+SHOWN_POINTS = 120
+"""Points of a scan that are kept, about."""
 
 
 class Residuals:
@@ -236,3 +245,61 @@ class ConvergenceSample:
         middle = np.median([curve[:length] for curve in self._curves], axis=0)
         window = f"±{CONVERGENCE_HALF_M:g} m, ±{degrees(CONVERGENCE_HALF_RAD):.0f}°"
         return {f"{name}, {len(self._curves)} scans, {window}": (np.arange(1.0, length + 1.0), middle)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanOverlay:
+    """All n scans in the order of the log; of k of them the points."""
+
+    stamps_ns: NDArray[np.int64]
+    """Stamps (n,)."""
+    poses: Floats
+    """Pose of the base in the map (n, 3) at each."""
+    far: Floats
+    """Distance to the nearest wall of the map (n,) that nine of ten points stay below [m]; NaN without a point."""
+    rows: NDArray[np.int64]
+    """Rows (k,) of the scans with points."""
+    points: tuple[Floats, ...]
+    """Their points in the base frame, each (m, 2) [m]."""
+    distances: tuple[Floats, ...]
+    """Distance of each of these points to the nearest wall (m,) [m]."""
+
+
+class ScanOverlayBuilder:
+    """Collects a `ScanOverlay`; memory is bounded but for three numbers and a stamp for each scan."""
+
+    def __init__(self, scans: int, not_matched_ns: NDArray[np.int64]) -> None:
+        """`scans` is the number of scans to come, `not_matched_ns` the stamps of those that were not matched."""
+        self._every = max(scans // SHOWN_SCANS, 1)
+        step = max(-(-len(not_matched_ns) // SHOWN_NOT_MATCHED), 1)
+        self._wanted = set(not_matched_ns[::step].tolist())
+        self._stamps: list[int] = []
+        self._poses: list[tuple[float, float, float]] = []
+        self._far: list[float] = []
+        self._rows: list[int] = []
+        self._points: list[Floats] = []
+        self._distances: list[Floats] = []
+
+    def add(self, scan: Scan, T_map_base: Pose2, distance: NDArray[np.float32]) -> None:
+        """A scan, the pose of the base at its stamp (maybe a guess), and the points' distances (n,) to the map [m]."""
+        n = len(distance)
+        if (len(self._stamps) % self._every == 0 or scan.stamp_ns in self._wanted) and n:
+            step = max(n // SHOWN_POINTS, 1)
+            self._rows.append(len(self._stamps))
+            self._points.append(scan.points_base()[::step])
+            self._distances.append(distance[::step].astype(np.float64))
+        self._stamps.append(scan.stamp_ns)
+        self._poses.append((T_map_base.x, T_map_base.y, T_map_base.theta))
+        nine_of_ten = min(int(0.9 * n), n - 1)
+        self._far.append(float(np.partition(distance, nine_of_ten)[nine_of_ten]) if n else float("nan"))
+
+    def overlay(self) -> ScanOverlay:
+        """What was collected."""
+        return ScanOverlay(
+            stamps_ns=np.array(self._stamps, dtype=np.int64),
+            poses=np.array(self._poses, dtype=np.float64).reshape(-1, 3),
+            far=np.array(self._far, dtype=np.float64),
+            rows=np.array(self._rows, dtype=np.int64),
+            points=tuple(self._points),
+            distances=tuple(self._distances),
+        )

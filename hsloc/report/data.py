@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hsloc.analysis.scan_overlay import ScanOverlay
+    from hsloc.analysis.scan_statistics import ScanOverlay
     from hsloc.evaluation import Comparison
     from hsloc.model import OccupancyGrid, ScanDiagnostics, Trajectory
     from hsloc.run_metrics import RunMetrics

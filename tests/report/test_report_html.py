@@ -16,7 +16,7 @@ from evaluation_paths import diagnostics_of
 from PIL import Image
 from report_parts import NOTHING, parts, view_in
 
-from hsloc.analysis.scan_overlay import ScanOverlay
+from hsloc.analysis.scan_statistics import ScanOverlay
 from hsloc.errors import OutputError
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
 from hsloc.model.verdict import Verdict, VerdictReason

@@ -66,6 +66,11 @@ def mirrored(grid: OccupancyGrid) -> OccupancyGrid:
     return replace(grid, cells=np.ascontiguousarray(grid.cells[:, ::-1]))
 
 
+def scaled(by: float) -> Change:
+    """A resolution that is wrong: the cells grow from the corner."""
+    return lambda grid: replace(grid, resolution=by * grid.resolution)
+
+
 def map_of(world: str) -> Change:
     return lambda _: built_in(world).occupancy_grid(0.05)
 
@@ -84,6 +89,9 @@ CASES: dict[str, tuple[Scenario, Change, float]] = {
     "loop, mirrored": (LOOP, mirrored, 0.0),
     "office, kidnapped": (replace(OFFICE, kidnaps=(Kidnap(30.0, 21.0),)), same, 0.0),
     "loop, kidnapped": (replace(LOOP, kidnaps=(Kidnap(30.0, 25.0),)), same, 0.0),
+    "office, scaled by 1.02": (OFFICE, scaled(1.02), 0.0),
+    "loop, scaled by 1.02": (LOOP, scaled(1.02), 0.0),
+    "hall, scaled by 0.98": (HALL, scaled(0.98), 0.0),
     "symmetric": (SYMMETRIC, same, 0.0),
     "symmetric, kidnapped": (replace(SYMMETRIC, kidnaps=(Kidnap(20.0, 12.0),)), same, 0.0),
     "plain corridor": (PLAIN_DRIVE, same, 0.0),
@@ -133,7 +141,7 @@ def measure(name: str, seed: int, is_known: bool) -> str:
             if np.hypot(off[0], off[1]) < 0.25:
                 squared.append(off @ np.linalg.solve(estimate.covariance, off))
     trajectory, _ = history.trajectory()
-    states, reference = history.states(), history.reference()
+    states, reference = history.states(localiser.map_scale), history.reference()
     assert states is not None
     assert reference is not None
     off = trajectory.poses - reference.poses

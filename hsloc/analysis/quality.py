@@ -31,6 +31,7 @@ _VERDICTS = {
     WarningCode.EXTRINSICS_DISAGREE: Verdict.CHECK,
     WarningCode.ODOMETRY_JUMPS: Verdict.CHECK,
     WarningCode.CLOCK_OFFSET_LARGE: Verdict.CHECK,
+    WarningCode.MAP_SCALE: Verdict.CHECK,
 }
 """Warnings that concern the whole result, with the verdict that each alone gives."""
 
@@ -39,20 +40,40 @@ _FAILING = {"failed": (Verdict.FAILED,), "check": (Verdict.FAILED, Verdict.CHECK
 
 
 def quality_warnings(result: Result) -> list[RunWarning]:
-    """Localisation: most scans were rejected or left the pose open. A pose found once may then be a chance fit."""
+    """Localisation: the map has another scale than the lidar; or most scans were rejected or left the pose open.
+
+    A pose found once may then be a chance fit.
+    """
     if result.mode != "localise":
         return []
+    of_scale = _scale_warnings(result)
     status = Counter(result.diagnostics.status)
     without, scans = status["searching"] + status["rejected"], len(result.diagnostics)
     if without <= _MAX_WITHOUT_PLACE * scans:
-        return []
+        return of_scale
     share = _share(result)
     meaning = "every pose is a guess" if share == 0.0 else f"the {100 * share:.0f} % localised poses may be wrong"
     return [
+        *of_scale,
         RunWarning(
             WarningCode.SCANS_WITHOUT_PLACE,
             f"{without} of {scans} scans found no place on the map, so {meaning}",
             "check map, mounting (--laser-pose) and odometry (hsloc check), or give the start (--initial-pose)",
+        ),
+    ]
+
+
+def _scale_warnings(result: Result) -> list[RunWarning]:
+    scale, cell = result.map_scale, result.grid.resolution
+    if scale is None or not scale.is_significant:
+        return []
+    size = "larger" if scale.value > 1.0 else "smaller"
+    return [
+        RunWarning(
+            WarningCode.MAP_SCALE,
+            f"the map is {100 * abs(scale.value - 1.0):.1f} % {size} than the lidar measures: scale {scale.value:.4f} "
+            f"+- {scale.sigma:.4f}, so poses are off by {abs(scale.value - 1.0):.3f} m per metre from the map's corner",
+            f"if the ranges are right, set resolution: {cell / scale.value:.5g} in the map's YAML (it is {cell:g})",
         )
     ]
 

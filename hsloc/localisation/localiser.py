@@ -14,6 +14,7 @@ import numpy as np
 
 from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate
 from hsloc.localisation.kalman_filter import fuse_match, normalised_innovation, predict_covariance
+from hsloc.localisation.map_scale import MapScale, MapScaleEstimator
 from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, OdometryNoise, OmnidirectionalNoise
 from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
@@ -139,7 +140,9 @@ class Localiser:
         initial_pose: Pose2 | None = None,
         *,
         place_check: PlaceCheck | None = None,
+        map_scale: MapScaleEstimator | None = None,
     ) -> None:
+        self._map_scale = map_scale
         self._monitor = None if place_check is None else TrackMonitor(place_check)
         self._field = likelihood
         self._matcher = matcher
@@ -180,12 +183,20 @@ class Localiser:
         search = Relocaliser(
             grid, likelihood, heuristic(matcher), parameters.relocaliser, noise, rng, place_check=check
         )
-        return cls(likelihood, matcher, search, noise, parameters, rng, initial_pose, place_check=check)
+        scale = MapScaleEstimator(likelihood, (grid.origin.x, grid.origin.y))
+        return cls(
+            likelihood, matcher, search, noise, parameters, rng, initial_pose, place_check=check, map_scale=scale
+        )
 
     @property
     def T_map_odom(self) -> Pose2:
         """The transform that a ROS localiser would publish."""
         return self._T_map_odom
+
+    @property
+    def map_scale(self) -> MapScale | None:
+        """Length on the map by length as the lidar measures it; None while too little is seen, or without estimator."""
+        return None if self._map_scale is None else self._map_scale.estimate()
 
     def update(self, event: Odometry | PairedScan) -> Estimate:
         """Take an event; the estimate at its stamp."""
@@ -218,8 +229,9 @@ class Localiser:
         noise = self._motion_model.covariance(motion)
         covariance = predict_covariance(self._covariance, self._T_map_match, motion, noise)
         points = paired.points_base()
-        if self._monitor is not None:
-            self._monitor.move(hypot(motion.x, motion.y))
+        for each in (self._monitor, self._map_scale):
+            if each is not None:
+                each.move(hypot(motion.x, motion.y))
         if len(points) < p.min_points:
             self._take(predicted, covariance, T_odom_base)
             reason = f"{len(points)} returns"
@@ -240,6 +252,8 @@ class Localiser:
         self._match_gate.accept(match.fitness)
         self._take(pose, covariance, T_odom_base)
         evidence = None if self._monitor is None else self._monitor.matched(paired, pose, points)
+        if self._map_scale is not None:
+            self._map_scale.matched(paired, pose)
         status, reason = Status.MATCHED, ""
         if self._monitor is not None and evidence is not None and self._monitor.is_astray(evidence, p.lost_probability):
             status = Status.SEARCHING

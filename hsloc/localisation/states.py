@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +28,8 @@ MAX_SIGMA = 0.1
 """Largest standard deviation of a localised pose in any direction (m): 2.5 of them are 0.25 m."""
 MAX_SIGMA_ANGLE = np.radians(2.0)
 """And of its heading (rad): 2.5 of them are 5 deg."""
+_WITHIN = 2.5
+"""Standard deviations that an error of a localised pose stays within."""
 _POOR_FIT = 0.92
 """Explained fitness by the usual one below which a doubted pose is taken for off the map."""
 _SETTLED = 5
@@ -71,6 +73,19 @@ class StateRows:
     def is_localised(self) -> NDArray[np.bool_]:
         """Which rows are localised, shape (n,)."""
         return np.array([state is State.LOCALISED for state in self.state], dtype=np.bool_)
+
+
+def with_position_errors(rows: StateRows, errors: F64, reason: str) -> StateRows:
+    """The rows with further errors (n, 2) of x and y (m); where they exceed what is localised a pose is predicted.
+
+    They are known in size and no standard deviations: beside 2.5 of those they have to stay within 0.25 m.
+    """
+    noise, sigma = rows.sigma[:, :2].max(axis=1), rows.sigma.copy()
+    sigma[:, :2] = np.hypot(sigma[:, :2], errors)
+    vague = rows.is_localised() & (np.hypot(*errors.T) > _WITHIN * (MAX_SIGMA - noise))
+    states = tuple(State.PREDICTED if each else state for each, state in zip(vague, rows.state, strict=True))
+    reasons = tuple(reason if each else before for each, before in zip(vague, rows.reason, strict=True))
+    return replace(rows, state=states, sigma=sigma, reason=reasons)
 
 
 class StateLog:

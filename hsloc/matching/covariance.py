@@ -53,11 +53,11 @@ def match_covariance(information: F64, n_points: int, fitness: float, field: Lik
     return 0.5 * (covariance + covariance.T)
 
 
-_POINT_SIGMA = 0.02
+POINT_SIGMA = 0.02
 """Standard deviation of a point from its wall (m): the range noise of indoor lidars, 1 to 3 cm by their data sheets."""
 _LEAST_ON_WALLS = 0.5
 """Share of points on walls below which the world is one of points, or the lidar too coarse to show walls."""
-_MAX_GAP = 0.2
+MAX_GAP = 0.2
 """Neighbouring points of one wall lie as near as this (m), and farther apart with distance."""
 
 
@@ -74,7 +74,7 @@ def match_information(points: F64, field: LikelihoodField, pose: Pose2) -> F64 |
     scores = np.empty(len(points), dtype=np.float32)
     point_scores(field.packed, field.scale(points), cells[0], cells[1], cells[2], scores)
     normals = np.empty_like(points)
-    wall_normals(points, _MAX_GAP, _POINT_SIGMA**2, normals)
+    wall_normals(points, MAX_GAP, POINT_SIGMA**2, normals)
     if np.count_nonzero(np.abs(normals).sum(axis=1)) < _LEAST_ON_WALLS * len(points):
         return None
     metres = cells * (field.resolution, field.resolution, 1.0)
@@ -82,7 +82,7 @@ def match_information(points: F64, field: LikelihoodField, pose: Pose2) -> F64 |
     wall_rows(points, normals, metres, field.resolution, rows)
     order = np.argsort(rows, kind="stable")
     cell_variance = field.resolution**2 / 12.0
-    variances = np.array((_POINT_SIGMA**2 + cell_variance, cell_variance))
+    variances = np.array((POINT_SIGMA**2 + cell_variance, cell_variance))
     information = wall_information(
         points, normals, scores.astype(np.float64), metres, field.resolution, variances, rows, order
     )

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.localisation.localiser import Localiser
+    from hsloc.localisation.map_scale import MapScale
     from hsloc.localisation.states import StateRows
     from hsloc.log import Log
     from hsloc.matching.match import Matcher
@@ -71,6 +73,7 @@ class Result:
     `true_grid` is the one that the log carries, if any. `likelihood` is the field that was matched on, of a given map.
     `states` are the states of the poses of a localiser that weighs evidence; `localised` are those in this state,
     `tracked` the poses that were not searched for, whether their scans fit or not.
+    `map_scale` is the size of a given map by what the lidar measures.
     With `lidar_only` no odometry of the log was used: a localiser's `odometry` is then that of the scans. `deskewed`
     says whether the beams were moved to where the robot was when each was measured.
     """
@@ -93,6 +96,7 @@ class Result:
     likelihood: LikelihoodField | None = None
     states: StateRows | None = None
     tracked: NDArray[np.bool_] | None = None
+    map_scale: MapScale | None = None
     lidar_only: bool = False
     deskewed: bool = False
 
@@ -197,10 +201,11 @@ def _run_with(
         likelihood = LikelihoodField.from_grid(
             require_map(grid), request.config.likelihood_field.sigma, request.config.likelihood_field.margin
         )
-        estimator: Estimator = _localiser(request, require_map(grid), likelihood, start)
+        localiser = _localiser(request, require_map(grid), likelihood, start)
+        estimator: Estimator = localiser
     else:
         require_matcher(request)
-        likelihood, estimator = None, _mapper(request, state, lidar_only)
+        localiser, likelihood, estimator = None, None, _mapper(request, state, lidar_only)
     first = None if lidar_only else first_odometry(log.events())
     prepared = time.perf_counter()
     history = RunHistory(request.config.localiser.smoothing_model() if localise else None)
@@ -227,7 +232,8 @@ def _run_with(
     elif isinstance(estimator, PointMapper):
         grid = estimator.grid()
     trajectory, localised = history.trajectory() if mapping is None else _mapped(history, mapping)
-    states = history.states() if localise else None
+    scale = None if localiser is None else localiser.map_scale
+    states = history.states(scale) if localise else None
     tracked = localised
     if states is not None:
         localised = states.is_localised()
@@ -250,6 +256,7 @@ def _run_with(
         likelihood=likelihood,
         states=states,
         tracked=tracked,
+        map_scale=scale,
         lidar_only=lidar_only,
         deskewed=deskew,
     )
@@ -346,7 +353,7 @@ def _mapper(request: RunRequest, state: MapState | None, lidar_only: bool) -> Ma
     )
 
 
-def _localiser(request: RunRequest, grid: OccupancyGrid, likelihood: LikelihoodField, start: Pose2 | None) -> Estimator:
+def _localiser(request: RunRequest, grid: OccupancyGrid, likelihood: LikelihoodField, start: Pose2 | None) -> Localiser:
     from hsloc.localisation.localiser import Localiser
 
     rng = np.random.default_rng(request.seed)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.localisation.kalman_filter import Anchor, between_matches, predict_covariance, smooth_matches
-from hsloc.localisation.states import StateLog
+from hsloc.localisation.states import StateLog, with_position_errors
 from hsloc.model.estimate import ScanDiagnostics, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
 from hsloc.model.pose2 import Pose2, compose_poses
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.localisation.map_scale import MapScale
     from hsloc.localisation.motion_models import MotionModel
     from hsloc.localisation.states import StateRows
     from hsloc.model.certificate import Certificate
@@ -142,9 +143,18 @@ class RunHistory:
                 localised[first:last] = True
         return Trajectory(estimated.stamps_ns, poses), localised
 
-    def states(self) -> StateRows | None:
-        """The state of each pose of the trajectory in hindsight; None for an estimator that weighs no evidence."""
-        return self._states.at_odometry(len(self._odometry_stamps)) if len(self._states) else None
+    def states(self, scale: MapScale | None = None) -> StateRows | None:
+        """The state of each pose of the trajectory in hindsight; None for an estimator that weighs no evidence.
+
+        Where the map has another `scale` than the lidar, poses are as uncertain as that makes them.
+        """
+        if len(self._states) == 0:
+            return None
+        rows = self._states.at_odometry(len(self._odometry_stamps))
+        if scale is None or not scale.is_significant:
+            return rows
+        errors = scale.position_errors(self.trajectory()[0].poses)
+        return with_position_errors(rows, errors, f"the scale of the map is {scale.value:.3f}")
 
     def diagnostics(self) -> ScanDiagnostics:
         """One row for each scan."""

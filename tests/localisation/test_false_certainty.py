@@ -45,7 +45,7 @@ def judge(
     for event, estimate in replay(drive, localiser):
         history.add(event, estimate)
     trajectory, _ = history.trajectory()
-    truth, states = history.reference(), history.states()
+    truth, states = history.reference(), history.states(localiser.map_scale)
     assert truth is not None
     assert states is not None
     off = trajectory.poses - truth.poses
@@ -68,6 +68,14 @@ def test_on_its_map_every_pose_is_localised(known: bool) -> None:
     world = built_in("office")
     false, doubted, _ = judge(office_drive(), world.occupancy_grid(0.05), world.start() if known else None)
     assert (false, doubted) == (0.0, 0.0)
+
+
+def test_on_a_map_of_a_wrong_resolution_poses_are_as_uncertain_as_they_are_wrong() -> None:
+    world = built_in("office")
+    grid = world.occupancy_grid(0.05)
+    false, _, states = judge(office_drive(), replace(grid, resolution=1.02 * grid.resolution), world.start())
+    assert false == 0.0
+    assert states == {State.LOCALISED, State.PREDICTED}
 
 
 @pytest.mark.parametrize("known", [True, False])

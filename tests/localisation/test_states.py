@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hsloc.export.results_folder import STATES_HEADER, write_states
-from hsloc.localisation.states import StateLog, StateRows, localisation_reasons
+from hsloc.localisation.states import StateLog, StateRows, localisation_reasons, with_position_errors
 from hsloc.model import Estimate, Evidence, Pose2, State, Status, Trajectory
 from hsloc.model.verdict import Verdict, verdict_of
 
@@ -129,3 +129,12 @@ def test_states_csv_has_a_line_for_each_pose(tmp_path: Path) -> None:
         "1.500000000,localised,0.9900,0.0100,0.0200,0.00300,0.900,",
         '2.000000000,lost,0.0000,nan,nan,nan,nan,"found, or not"',
     ]
+
+
+def test_poses_on_a_map_of_a_wrong_scale_are_predicted_where_the_error_matters() -> None:
+    states = judged(*(estimate(k) for k in range(4)))
+    errors = np.array([(0.0, 0.0), (0.15, 0.0), (0.15, 0.15), (0.3, 0.0)] * 2)
+    found = with_position_errors(states, errors, "the scale")
+    assert [state is State.LOCALISED for state in found.state] == [True, True, False, False] * 2
+    assert found.reason[3] == "the scale"
+    np.testing.assert_allclose(found.sigma[2], (np.hypot(0.02, 0.15), np.hypot(0.02, 0.15), 0.005))

@@ -1,0 +1,190 @@
+"""Whether the map is larger or smaller than what the lidar measures: a wrong resolution in its YAML, a stretched plan.
+
+Ranges are in metres; cells of the map are so only if its resolution is right. A map that is 2 % too large still fits
+every scan, with walls a little behind the points, and poses are wrong by 2 % of their distance from its corner.
+
+Each scan that was matched gives the distances of its points from the walls of the map along the walls' normals. They
+are explained by five unknowns: the pose, the scale, and an offset of the range, because a wall is drawn as whole cells,
+whose centres lie behind its surface. Pose and offset are eliminated; what is left is the information about the scale.
+Odometry plays no part, for its scale is unknown itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import hypot, inf, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.kernels.fitness import point_scores
+from hsloc.kernels.wall_information import wall_normals
+from hsloc.matching.covariance import MAX_GAP, POINT_SIGMA
+from hsloc.matching.local_refinement import refine
+from hsloc.matching.window import Window
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hsloc.matching.likelihood_field import LikelihoodField
+    from hsloc.model.events import PairedScan
+    from hsloc.model.pose2 import Pose2
+
+    F64 = NDArray[np.float64]
+
+_SPACING_M = 2.0
+"""Path length between two scans that are used (m): nearer ones see the same walls."""
+_BLOCK_M = 6.0
+"""Path length of a block (m): what it sees is taken for independent of the others."""
+_FEWEST_BLOCKS = 5
+"""Blocks below which nothing is said: their scatter is not known."""
+_MOST_WALLS = 16
+"""Independent walls that the errors of their drawing average over, at most: a building is drawn in one way."""
+_LEAST_POINTS = 20
+"""Points on walls of a scan that is used, at least."""
+_WINDOW = (0.3, 0.3, 0.1)
+"""Half-widths (m, m, rad) in which the pose is found again at the scale that is known so far."""
+_REACH_M, _LEAST_STEP_M = 0.3, 0.05
+"""Walls are looked for within this distance of a point, in steps of a cell, but not of less than the second (m)."""
+_ON_WALL = 0.6
+"""Score that a point reaches where it is moved onto a wall, at least."""
+_ROBUST_M = 0.1
+"""Distance from the wall at which a point counts by half (m): Cauchy's weight."""
+_LARGEST_PRIOR = 0.1
+"""Standard deviation of the scale before anything is known; larger ones are not followed by the localiser."""
+_CORRELATED = 30.0
+"""Number of points that count as one, as in the covariance of a match."""
+_SIGMAS, _LEAST = 3.0, 0.005
+"""A scale is significant if it is off 1 by so many standard deviations, and by this much: 5 cm in 10 m."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapScale:
+    """Length on the map by length as the lidar measures it, its standard deviation, and the map's corner (m)."""
+
+    value: float
+    sigma: float
+    corner: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the map is too large or too small beyond doubt, and by enough to matter."""
+        return abs(self.value - 1.0) > max(_SIGMAS * self.sigma, _LEAST)
+
+    def position_errors(self, poses: F64) -> F64:
+        """Errors (n, 2) in x and y of poses (n, 3) that come from the scale (m): the cells grow from the corner.
+
+        0 where the scale is not significant.
+        """
+        if not self.is_significant:
+            return np.zeros((len(poses), 2))
+        errors: F64 = np.abs(self.value - 1.0) * np.abs(poses[:, :2] - self.corner)
+        return errors
+
+
+class MapScaleEstimator:
+    """State: for each block of the path the information about scale and offset."""
+
+    def __init__(self, likelihood: LikelihoodField, corner: tuple[float, float]) -> None:
+        self._field = likelihood
+        self._corner = corner
+        self._path_length = 0.0
+        self._used_at = -inf
+        self._information: dict[int, F64] = {}
+        self._vector: dict[int, F64] = {}
+        self._weight = 0.0
+        self._squares = 0.0
+
+    def move(self, distance: float) -> None:
+        """The robot moved on (m)."""
+        self._path_length += distance
+
+    def matched(self, paired: PairedScan, pose: Pose2) -> None:
+        """A scan was matched at `pose`, T_map_base; it is used if the last one is far enough behind."""
+        if self._path_length - self._used_at < _SPACING_M:
+            return
+        points = np.ascontiguousarray(paired.scan.points_base())
+        if len(points) < _LEAST_POINTS:
+            return
+        laser = paired.scan.T_base_laser
+        beams = points - (laser.x, laser.y)
+        ranges = np.maximum(np.hypot(beams[:, 0], beams[:, 1]), 1e-6)
+        normals = np.empty_like(points)
+        wall_normals(points, MAX_GAP, POINT_SIGMA**2, normals)
+        on_walls = np.abs(normals).sum(axis=1) > 0.0
+        if np.count_nonzero(on_walls) < _LEAST_POINTS:
+            return
+        self._used_at = self._path_length
+        known = self._solve()
+        scaled = points + beams * known[0] + beams * (known[1] / ranges)[:, None]
+        pose = refine(scaled, self._field, Window(pose, *_WINDOW)).pose
+        scaled, normals = scaled[on_walls], normals[on_walls]
+        beams, ranges = beams[on_walls], ranges[on_walls]
+        distance, found = self._distances(scaled, normals, pose)
+        step = np.hypot(*np.diff(scaled, axis=0, prepend=scaled[:1]).T)
+        weight = np.minimum(step / self._field.resolution, 1.0) * found / (1.0 + (distance / _ROBUST_M) ** 2)
+        across = (normals * beams).sum(axis=1)
+        turned = normals[:, 1] * scaled[:, 0] - normals[:, 0] * scaled[:, 1]
+        by = np.column_stack((normals, turned, across, across / ranges))
+        full, right = by.T @ (weight[:, None] * by), by.T @ (weight * distance)
+        # The pose is eliminated; directions that no wall holds say nothing of the scale.
+        gain = np.linalg.solve(full[:3, :3] + 1e-3 * np.eye(3), full[:3, 3:])
+        information = full[3:, 3:] - full[3:, :3] @ gain
+        vector = right[3:] - gain.T @ right[:3] + information @ known
+        block = int(self._path_length / _BLOCK_M)
+        self._information[block] = self._information.get(block, np.zeros((2, 2))) + information
+        self._vector[block] = self._vector.get(block, np.zeros(2)) + vector
+        self._weight += float(weight.sum())
+        self._squares += float(weight @ distance**2)
+
+    def _distances(self, points: F64, normals: F64, pose: Pose2) -> tuple[F64, NDArray[np.bool_]]:
+        """Signed distance (n,) of each point from the nearest wall along its normal (m), and whether there is one."""
+        field = self._field
+        step = max(field.resolution, _LEAST_STEP_M)
+        reach = max(int(_REACH_M / step), 2)
+        moves = np.arange(-reach, reach + 1)
+        scores = np.empty((len(moves), len(points)), dtype=np.float32)
+        x, y, theta = field.to_cells(pose)
+        for row, k in zip(scores, moves, strict=True):
+            point_scores(field.packed, field.scale(points + k * step * normals), x, y, theta, row)
+        inner = scores[1:-1]
+        is_peak = (inner >= scores[:-2]) & (inner >= scores[2:]) & (inner > _ON_WALL)
+        # The nearest of them: both faces of a wall are drawn in a good map. Of two as near the one that scores more.
+        far = np.where(is_peak, np.abs(moves[1:-1])[:, None] - 0.1 * inner, np.inf)
+        best = far.argmin(axis=0) + 1
+        rows = np.arange(len(points))
+        logs = np.log(np.maximum(scores.astype(np.float64), 1e-9))
+        # A score is exp(-d / sigma): its logarithms on both sides of a wall show where between the steps it lies.
+        between = 0.5 * field.sigma * (logs[best + 1, rows] - logs[best - 1, rows])
+        return moves[best] * step + np.clip(between, -step, step), np.isfinite(far.min(axis=0))
+
+    def _prior(self) -> F64:
+        """Information (2, 2) about scale and offset before the first scan, in the unit of the sums."""
+        variance = _CORRELATED * (self._squares / self._weight if self._weight > 0.0 else POINT_SIGMA**2)
+        return np.diag((variance / _LARGEST_PRIOR**2, variance / self._field.resolution**2))
+
+    def _solve(self) -> F64:
+        """Scale less 1, and offset (m), of all scans so far."""
+        if not self._information:
+            return np.zeros(2)
+        total = sum(self._information.values(), self._prior())
+        return np.asarray(np.linalg.solve(total, sum(self._vector.values(), np.zeros(2))))
+
+    def estimate(self) -> MapScale | None:
+        """The scale and its standard deviation; None before `_FEWEST_BLOCKS` blocks of path were seen.
+
+        Two errors: the scatter of the blocks (jackknife), and that of how walls are drawn, which is the same wherever
+        a wall is seen: a cell's uniform distribution by the spread of the ranges that tells scale from offset.
+        """
+        n = len(self._information)
+        if n < _FEWEST_BLOCKS:
+            return None
+        information, vector = np.array(list(self._information.values())), np.array(list(self._vector.values()))
+        total, sums = information.sum(axis=0) + self._prior(), vector.sum(axis=0)
+        value = np.linalg.solve(total, sums)[0]
+        without = np.linalg.solve(total - information, (sums - vector)[:, :, None])[:, 0, 0]
+        scatter = sqrt((n - 1) / n * float(((without - without.mean()) ** 2).sum()))
+        left = total[0, 0] - total[0, 1] ** 2 / total[1, 1]
+        spread = sqrt(max(float(left), 1e-12) / max(self._weight, 1e-12))
+        drawn = self._field.resolution / sqrt(12.0) / spread / sqrt(min(n, _MOST_WALLS))
+        return MapScale(1.0 + float(value), hypot(scatter, drawn), self._corner)

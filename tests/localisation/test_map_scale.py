@@ -1,0 +1,62 @@
+"""The scale of a map by what the lidar measures, in rooms whose map is too large, too small or right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from room_scans import DEGREE, room_scan
+
+from hsloc.localisation.map_scale import MapScale, MapScaleEstimator
+from hsloc.matching import LikelihoodField
+from hsloc.model import PairedScan, Pose2
+from hsloc.simulation.world import World
+
+CORNERS = [(0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (0.0, 4.0)]
+ROOM = World(
+    "room",
+    np.array([(*CORNERS[k], *CORNERS[k - 3]) for k in range(4)]),
+    np.array([(1.0, 1.0), (5.0, 3.0)]),
+)
+PLACES = [Pose2(1.0 + 0.2 * k, 2.0 + np.sin(0.7 * k), 0.9 * k) for k in range(20)]
+
+
+def estimator(scale: float, places: list[Pose2] = PLACES) -> MapScaleEstimator:
+    """After scans 3 m of path apart, each matched 3 cm off its place on the map."""
+    grid = ROOM.occupancy_grid(0.05)
+    origin = Pose2(scale * grid.origin.x, scale * grid.origin.y, 0.0)
+    field = LikelihoodField.from_grid(replace(grid, resolution=scale * grid.resolution, origin=origin))
+    found = MapScaleEstimator(field, (origin.x, origin.y))
+    for k, place in enumerate(places):
+        scan = room_scan(place, beams=360, noise=0.01, seed=k, increment=DEGREE)
+        found.move(3.0)
+        found.matched(PairedScan(scan, place), Pose2(scale * place.x + 0.03, scale * place.y, place.theta))
+    return found
+
+
+@pytest.mark.parametrize("scale", [0.97, 1.0, 1.03])
+def test_the_scale_is_found(scale: float) -> None:
+    found = estimator(scale).estimate()
+    assert found is not None
+    assert found.value == pytest.approx(scale, abs=0.004)
+    assert found.is_significant == (scale != 1.0)
+    assert found.sigma < 0.01
+
+
+def test_a_few_scans_say_nothing() -> None:
+    assert estimator(1.02, PLACES[:5]).estimate() is None
+
+
+def test_scans_of_one_place_count_once() -> None:
+    found = estimator(1.02, PLACES[:5])
+    for place in PLACES[5:]:
+        found.matched(PairedScan(room_scan(place, beams=360), place), place)
+    assert found.estimate() is None
+
+
+def test_positions_are_off_by_their_distance_from_the_corner() -> None:
+    poses = np.array([(1.0, 2.0, 0.0), (11.0, -8.0, 1.0)])
+    significant = MapScale(1.02, 0.001, (1.0, 2.0))
+    np.testing.assert_allclose(significant.position_errors(poses), [(0.0, 0.0), (0.2, 0.2)])
+    np.testing.assert_array_equal(MapScale(1.02, 0.01).position_errors(poses), np.zeros((2, 2)))

@@ -23,7 +23,7 @@ import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from hsloc.errors import HslocError
+from hsloc.errors import HslocError, no_such
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -87,6 +87,8 @@ class Client:
                 file.seek(0)
                 while part := file.read(1 << 20):
                     digest.update(part)
+        except FileNotFoundError as error:
+            raise ClientError(no_such(path)) from error
         except OSError as error:
             raise ClientError(f"{path}: cannot be read: {error.strerror or error}") from error
         ident = place.rsplit("/", 1)[1]

@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from hsloc.errors import ConfigError
+from hsloc.errors import ConfigError, no_such
 from hsloc.localisation.localiser import LocaliserParameters
 from hsloc.localisation.place_check import PlaceCheckParameters
 from hsloc.matching.exact import Exact
@@ -277,6 +277,8 @@ def read_values(path: Path, warnings: list[str] | None = None) -> dict[str, Any]
 
     try:
         values = YAML(typ="safe", pure=True).load(path)
+    except FileNotFoundError as error:
+        raise ConfigError(no_such(path)) from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (YAMLError, UnicodeDecodeError) as error:

@@ -16,6 +16,12 @@ A failed match is not an error: it is an `Estimate` whose status says so.
 
 from __future__ import annotations
 
+from difflib import get_close_matches
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
 
 class HslocError(Exception):
     """Base of all errors that hsloc raises on purpose."""
@@ -47,3 +53,13 @@ class EvaluationError(HslocError):
 
 class OutputError(HslocError):
     """Results cannot be written."""
+
+
+def no_such(path: Path, what: str = "file", remedy: str = "; check the path") -> str:
+    """The message for a path that does not exist: names a similar file beside it, else the remedy."""
+    try:
+        names = [each.name for each in path.parent.iterdir()]
+    except OSError:
+        names = []
+    close = get_close_matches(path.name, names, 1)
+    return f"{path}: no such {what}" + (f"; did you mean {path.parent / close[0]}?" if close else remedy)

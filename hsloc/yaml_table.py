@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from hsloc.errors import ConfigError, HslocError
+from hsloc.errors import ConfigError, HslocError, no_such
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -29,7 +29,7 @@ def load_table(path: Path, what: str, remedy: str = "", *, kind: type[HslocError
             raise kind(f"{path}: has a YAML alias (*name); write the value in its place")
         values = YAML(typ="safe", pure=True).load(text)
     except FileNotFoundError as error:
-        raise kind(f"{path}: no such {what}{remedy}") from error
+        raise kind(no_such(path, what, remedy or "; check the path")) from error
     except OSError as error:
         raise kind(f"{path}: cannot be read ({error.strerror or error}){remedy}") from error
     except (YAMLError, ValueError, RecursionError, AttributeError) as error:

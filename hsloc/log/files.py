@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, BinaryIO, NamedTuple, cast
 
-from hsloc.errors import LogError, LogFormatError
+from hsloc.errors import LogError, LogFormatError, no_such
 from hsloc.log.mcap.records import MAGIC
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def expand(path: Path, scratch: Scratch, shown: Path | None = None) -> list[LogF
     shown = path if shown is None else shown
     try:
         if not path.exists():
-            raise LogError(f"{shown}: no such file or folder")
+            raise LogError(no_such(shown, "file or folder"))
         if path.name == "metadata.yaml":  # What a bag's folder is known by.
             path = path.parent
         if not path.is_dir():

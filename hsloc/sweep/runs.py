@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.analysis.quality import exceeded_limits
 from hsloc.config import to_dict
-from hsloc.errors import HslocError
+from hsloc.errors import HslocError, no_such
 from hsloc.export.results_folder import write_results
 from hsloc.log import open_log
 from hsloc.options import OPTIONS
@@ -280,6 +280,8 @@ def _digest(path: Path, hashes: dict[Path, str]) -> str:
         try:
             with path.open("rb") as stream:
                 hashes[path] = hashlib.file_digest(stream, "sha256").hexdigest()
+        except FileNotFoundError as error:
+            raise HslocError(no_such(path)) from error
         except OSError as error:
             raise HslocError(f"{path}: cannot be read: {error.strerror or error}") from error
     return hashes[path]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.atomic_write import write_atomically
-from hsloc.errors import EvaluationError
+from hsloc.errors import EvaluationError, no_such
 from hsloc.model import Trajectory
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def _text(path: Path) -> str:
         raw = path.read_bytes()
         text = (gzip.decompress(raw) if path.suffix == ".gz" else raw).decode("utf-8-sig")
     except FileNotFoundError:
-        raise EvaluationError(f"{path}: no such file") from None
+        raise EvaluationError(no_such(path)) from None
     except UnicodeDecodeError:
         raise EvaluationError(f"{path}: not a text file; expected lines of numbers") from None
     except (OSError, EOFError, zlib.error) as error:

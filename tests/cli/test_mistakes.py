@@ -78,11 +78,12 @@ def test_a_name_that_is_no_text_is_read_and_reported(here: Path, capsys: pytest.
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
-        (["nowhere.mcap"], "nowhere.mcap: no such file"),
+        (["nowhere.mcap"], "nowhere.mcap: no such file or folder; check the path"),
+        ([OFFICE.replace("office", "ofice")], f"no such file or folder; did you mean {OFFICE}?"),
         ([OFFICE, "--map", "nowhere.yaml"], "nowhere.yaml"),
         ([OFFICE, "--scan-topic", "/lidar"], "/lidar"),
         ([OFFICE, "--odom-topic", "/wheels"], "/wheels"),
-        ([OFFICE, "--config", "nowhere.yaml"], "nowhere.yaml: cannot be read"),
+        ([OFFICE, "--config", "nowhere.yaml"], "nowhere.yaml: no such file; check the path"),
         ([OFFICE, "--start", "5000"], "no scan between --start and --end"),
     ],
 )

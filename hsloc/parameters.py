@@ -118,11 +118,13 @@ def plain(hint: Any) -> Any:
 
 def check(value: object, hint: Any, where: str) -> None:
     """Raise ConfigError, naming `where`, the value and the range, for a value outside the range of its type."""
-    if isinstance(hint, types.UnionType):
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
         if value is None:
             return
-        hint = next(kind for kind in hint.__args__ if kind is not type(None))
+        hint = next(kind for kind in typing.get_args(hint) if kind is not type(None))
     if typing.get_origin(hint) is tuple:
+        if constraint(hint) is None:
+            return
         if not value:
             raise ConfigError(f"{where} is empty; it must hold at least one value")
         for item in typing.cast("tuple[object, ...]", value):

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import atan2, cos, hypot, radians, sin, sqrt
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 import numpy as np
 
 from hsloc.model import IDENTITY, Pose2, wrap_angle
+from hsloc.parameters import NonNegative, Parameters, Range
 from hsloc.simulation.lattice import STEP, short, snap, snap_pose
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ class MotionNoise(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class OdometryNoise:
+class OdometryNoise(Parameters):
     """The four alphas of *Probabilistic Robotics*, Table 5.6: variances are
 
         rot1:  alpha1 rot1^2 + alpha2 trans^2
@@ -50,11 +51,16 @@ class OdometryNoise:
     spread evenly over its messages. `interval_s = 0` is the book's model on every message.
     """
 
-    alpha1: float = 1e-4
-    alpha2: float = 6e-6
-    alpha3: float = 2e-4
-    alpha4: float = 1e-4
-    interval_s: float = 1.0
+    alpha1: NonNegative = 1e-4
+    """Variance of a rotation per squared rotation [rad^2 / rad^2]."""
+    alpha2: NonNegative = 6e-6
+    """Variance of a rotation per squared translation [rad^2 / m^2]."""
+    alpha3: NonNegative = 2e-4
+    """Variance of a translation per squared translation [m^2 / m^2]."""
+    alpha4: NonNegative = 1e-4
+    """Variance of a translation per squared rotation [m^2 / rad^2]."""
+    interval_s: NonNegative = 1.0
+    """Time for which a sample of the noise is kept [s]; 0: one sample for each message."""
 
     def deviations(self, rot1: float, trans: float, rot2: float, step_s: float) -> tuple[float, float, float]:
         """See `MotionNoise`."""
@@ -66,15 +72,18 @@ class OdometryNoise:
 
 
 @dataclass(frozen=True, slots=True)
-class SteeringNoise:
+class SteeringNoise(Parameters):
     """The noise of [P] V on speed (m/s) and steering angle (rad), sampled at every step.
 
     A step of the course report's vehicle is rot1 = g, trans = v dt, rot2 = 0, so it is noise on rot1 and trans.
     """
 
-    speed: float = 0.1
-    steering: float = radians(0.5)
-    interval_s: float = 0.0
+    speed: NonNegative = 0.1
+    """Standard deviation of the speed [m/s]."""
+    steering: NonNegative = radians(0.5)
+    """Standard deviation of the steering angle [rad]."""
+    interval_s: NonNegative = 0.0
+    """Time for which a sample of the noise is kept [s]; 0: one sample for each message."""
 
     def deviations(self, rot1: float, trans: float, rot2: float, step_s: float) -> tuple[float, float, float]:
         """See `MotionNoise`."""
@@ -82,17 +91,21 @@ class SteeringNoise:
 
 
 @dataclass(frozen=True, slots=True)
-class Slip:
+class Slip(Parameters):
     """Wheels that lose their grip from `at_s` on, for `duration_s` seconds.
 
     The odometry counts `factor` times the distance that was driven, and a turn of `turn_rate` rad/s that was not. It
     does not know: its covariance stays as it would be.
     """
 
-    at_s: float
-    duration_s: float = 1.5
-    factor: float = 1.5
-    turn_rate: float = 0.0
+    at_s: NonNegative
+    """Begin of the slip after the start [s]."""
+    duration_s: NonNegative = 1.5
+    """Duration of the slip [s]."""
+    factor: Annotated[float, Range(-100, 100)] = 1.5
+    """Distance that the odometry counts, as a ratio to the distance driven."""
+    turn_rate: Annotated[float, Range(-100, 100)] = 0.0
+    """Rate of a turn that the odometry counts and the robot does not make [rad/s]."""
 
     def is_on(self, time_s: float) -> bool:
         """Whether the wheels slip at `time_s` seconds after the start."""

@@ -7,17 +7,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import atan2, ceil, cos, hypot, radians, sin, sqrt
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Annotated, Protocol, TypeAlias
 
 import numpy as np
 
 from hsloc.model import Pose2, wrap_angle
+from hsloc.parameters import NonNegative, Parameters, Range
 from hsloc.simulation.lattice import snap_pose
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
+
+
+Limit: TypeAlias = Annotated[float, Range(1e-3, 100)]
+"""Speeds and accelerations: with smaller ones a path never ends."""
 
 
 class Robot(Protocol):
@@ -29,7 +34,7 @@ class Robot(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class DifferentialDrive:
+class DifferentialDrive(Parameters):
     """Two driven wheels; steered by pure pursuit of a point ahead on the path: by `lookahead` metres and what it
     drives in `foresight_s` seconds.
 
@@ -38,13 +43,20 @@ class DifferentialDrive:
     seconds before it starts.
     """
 
-    speed: float = 0.9
-    turn_rate: float = 1.2
-    acceleration: float = 0.8
-    turn_acceleration: float = 3.0
-    lookahead: float = 0.45
-    foresight_s: float = 0.3
-    pause_s: float = 1.0
+    speed: Limit = 0.9
+    """Largest speed [m/s]."""
+    turn_rate: Limit = 1.2
+    """Largest rate of turn [rad/s]."""
+    acceleration: Limit = 0.8
+    """Largest acceleration and deceleration [m/s^2]."""
+    turn_acceleration: Limit = 3.0
+    """Largest angular acceleration [rad/s^2]."""
+    lookahead: Limit = 0.45
+    """Distance of the pursued point on the path at standstill [m]."""
+    foresight_s: NonNegative = 0.3
+    """Time of driving that is added to that distance [s]."""
+    pause_s: Annotated[float, Range(0, 1e6)] = 1.0
+    """Time for which the robot stands before it starts [s]."""
 
     def drive(self, start: Pose2, path: NDArray[np.float64], step_s: float) -> Iterator[Pose2]:
         """See `Robot`."""
@@ -82,7 +94,7 @@ class DifferentialDrive:
 
 
 @dataclass(frozen=True, slots=True)
-class SteeredVehicle:
+class SteeredVehicle(Parameters):
     """The vehicle of [P] V: constant speed, heading `g + theta`, x += v dt cos(g + theta), theta += g.
 
     Reading: [P] limits g "to a rate of 20 deg/s". Taken as g = the bearing of the next waypoint, clipped to
@@ -91,9 +103,12 @@ class SteeredVehicle:
     theta += g, the heading swings about its aim and the figures are 119.3 s and 358.0 m.)
     """
 
-    speed: float = 3.0
-    turn_rate: float = radians(20.0)
-    reached: float = 1.0
+    speed: Limit = 3.0
+    """Speed [m/s]."""
+    turn_rate: Limit = radians(20.0)
+    """Largest rate of turn [rad/s]."""
+    reached: Limit = 1.0
+    """Distance from a waypoint within which it counts as reached [m]."""
 
     def drive(self, start: Pose2, path: NDArray[np.float64], step_s: float) -> Iterator[Pose2]:
         """See `Robot`."""

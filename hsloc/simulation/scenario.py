@@ -3,32 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, is_dataclass
-from math import ceil, tau
-from typing import TYPE_CHECKING, Any
+from math import ceil
+from typing import TYPE_CHECKING, Annotated, Any
 
 from hsloc.errors import ConfigError
 from hsloc.model import Pose2
+from hsloc.parameters import NonNegative, Parameters, Range
 from hsloc.simulation.odometer import OdometryNoise, Slip, SteeringNoise
 from hsloc.simulation.robot import DifferentialDrive, SteeredVehicle
 from hsloc.simulation.sensors import Lidar, PointSensor
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping
 
 
 @dataclass(frozen=True, slots=True)
-class Kidnap:
+class Kidnap(Parameters):
     """At `at_s` seconds the robot is picked up and set down where it would have been `skip_s` seconds later.
 
     The world's pose jumps, the odometry does not notice.
     """
 
-    at_s: float
-    skip_s: float = 20.0
+    at_s: NonNegative
+    """Time of the kidnapping after the start [s]."""
+    skip_s: NonNegative = 20.0
+    """Time of driving after which the robot would have been where it is set down [s]."""
 
 
 @dataclass(frozen=True, slots=True)
-class Scenario:
+class Scenario(Parameters):
     """A robot with its sensors, a world by name, and what goes wrong.
 
     The recording ends after `duration_s` seconds or, where that is None, with the path of `laps` laps. Odometry
@@ -37,55 +40,35 @@ class Scenario:
     """
 
     world: str
-    seed: int = 0
+    """Name of the world."""
+    seed: Annotated[int, Range(0, 2**63)] = 0
+    """Seed of all noise."""
     robot: DifferentialDrive | SteeredVehicle = field(default_factory=DifferentialDrive)
+    """The robot and its limits."""
     sensor: Lidar | PointSensor = field(default_factory=Lidar)
+    """The sensor and its noise."""
     odometry: OdometryNoise | SteeringNoise = field(default_factory=OdometryNoise)
-    odometry_rate_hz: float = 50.0
-    scan_rate_hz: float = 10.0
-    scan_offset_s: float = 0.0
-    laps: float = 1.0
-    duration_s: float | None = None
-    people: int = 0
+    """The noise of the odometry."""
+    odometry_rate_hz: Annotated[float, Range(0.1, 10_000)] = 50.0
+    """Rate of the odometry [Hz]."""
+    scan_rate_hz: Annotated[float, Range(0.01, 10_000)] = 10.0
+    """Rate of the scans [Hz]."""
+    scan_offset_s: Annotated[float, Range(0, 1e6)] = 0.0
+    """Time of the first scan after the start [s]."""
+    laps: Annotated[float, Range(1e-3, 10_000)] = 1.0
+    """Number of laps of the path, where `duration_s` is None."""
+    duration_s: Annotated[float, Range(1e-3, 1e6)] | None = None
+    """Duration of the recording [s]; None: until the end of the path."""
+    people: Annotated[int, Range(0, 1000)] = 0
+    """Number of people who walk about."""
     slips: tuple[Slip, ...] = ()
+    """Times at which the wheels slip."""
     kidnaps: tuple[Kidnap, ...] = ()
-    map_resolution: float = 0.05
-    start_stamp_ns: int = 1_700_000_000_000_000_000
-
-    def __post_init__(self) -> None:
-        """Raises ConfigError for what cannot be driven or measured."""
-        for name, value, low, high in self._limits():
-            if value is not None and not low <= value <= high:
-                raise ConfigError(f"scenario: {name} is {value}; it must lie between {low:g} and {high:g}")
-
-    def _limits(self) -> Iterator[tuple[str, float | None, float, float]]:
-        """(name, value, least, most) of every number that has limits."""
-        yield "seed", self.seed, 0, 2**63
-        yield "odometry_rate_hz", self.odometry_rate_hz, 0.1, 10_000
-        yield "scan_rate_hz", self.scan_rate_hz, 0.01, 10_000
-        yield "scan_offset_s", self.scan_offset_s, 0, 1e6
-        yield "laps", self.laps, 1e-3, 10_000
-        yield "duration_s", self.duration_s, 1e-3, 1e6
-        yield "people", self.people, 0, 1000
-        yield "map_resolution", self.map_resolution, 1e-3, 100
-        yield "start_stamp_ns", self.start_stamp_ns, 0, 2**31 * 10**9
-        yield "robot.speed", self.robot.speed, 1e-3, 100
-        yield "robot.turn_rate", self.robot.turn_rate, 1e-3, 100
-        yield "sensor.beams", self.sensor.beams, 1, 100_000
-        yield "sensor.range_max", self.sensor.range_max, 1e-3, 1e6
-        if isinstance(self.sensor, Lidar):
-            yield "sensor.field_of_view", self.sensor.field_of_view, 1e-3, tau
-            yield "sensor.dropout", self.sensor.dropout, 0, 1
-            yield "sensor.range_noise", self.sensor.range_noise, 0, 100
-        for item in fields(self.odometry):
-            yield f"odometry.{item.name}", getattr(self.odometry, item.name), 0, 1e6
-        for number, slip in enumerate(self.slips, 1):
-            yield f"slip {number}: at_s", slip.at_s, 0, 1e6
-            yield f"slip {number}: duration_s", slip.duration_s, 0, 1e6
-            yield f"slip {number}: factor", slip.factor, -100, 100
-        for number, kidnap in enumerate(self.kidnaps, 1):
-            yield f"kidnap {number}: at_s", kidnap.at_s, 0, 1e6
-            yield f"kidnap {number}: skip_s", kidnap.skip_s, 0, 1e6
+    """Times at which the robot is kidnapped."""
+    map_resolution: Annotated[float, Range(1e-3, 100)] = 0.05
+    """Side of a cell of the recorded map [m]."""
+    start_stamp_ns: Annotated[int, Range(0, 2**31 * 10**9)] = 1_700_000_000_000_000_000
+    """Stamp of the first message [ns]."""
 
     @property
     def odometry_period_ns(self) -> int:

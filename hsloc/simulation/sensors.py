@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import tau
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Annotated, Protocol, TypeAlias
 
 import numpy as np
 
 from hsloc.kernels.raycasting import cast_rays
 from hsloc.model import IDENTITY, Pose2, Scan
 from hsloc.model.pose2 import compose_poses
+from hsloc.parameters import NonNegative, Parameters, Range, Ratio
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 RANGE_STEP = 2.0**-10
 """Metres: as fine as the millimetres of a real lidar. Short binary numbers take a fifth off a compressed log."""
+Beams: TypeAlias = Annotated[int, Range(1, 100_000)]
+Length: TypeAlias = Annotated[float, Range(1e-6, 1e6)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +66,7 @@ class Sensor(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Lidar:
+class Lidar(Parameters):
     """A scanning 2D lidar; lengths in metres, angles in radians.
 
     `field_of_view` is centred ahead of the laser's frame; a full turn does not measure its first direction twice.
@@ -73,18 +76,30 @@ class Lidar:
     spread over the whole period of the scan (`time_increment`), else all are measured at its stamp.
     """
 
-    beams: int = 360
-    field_of_view: float = tau
-    range_min: float = 0.1
-    range_max: float = 15.0
-    range_noise: float = 0.01
-    range_step: float = RANGE_STEP
-    dropout: float = 0.0
+    beams: Beams = 360
+    """Number of beams of a scan."""
+    field_of_view: Annotated[float, Range(1e-3, tau)] = tau
+    """Angle from the first beam to the last [rad]."""
+    range_min: NonNegative = 0.1
+    """Smallest range that is measured [m]."""
+    range_max: Length = 15.0
+    """Largest range that is measured [m]."""
+    range_noise: NonNegative = 0.01
+    """Standard deviation of a range [m]."""
+    range_step: Length = RANGE_STEP
+    """Step to which ranges are rounded [m]."""
+    dropout: Ratio = 0.0
+    """Ratio of the readings that are lost."""
     dropout_as_inf: bool = False
+    """Whether a lost reading is +inf instead of NaN."""
     mounting: Pose2 = IDENTITY
+    """Pose of the laser in the base frame."""
     upside_down: bool = False
+    """Whether the laser is mounted upside down."""
     motion_distortion: bool = False
+    """Whether each beam is measured at its own time during the sweep."""
     frame_id: str = "laser"
+    """Name of the laser's frame."""
 
     def measure(
         self, world: World, stamp_ns: int, period_s: float, poses: Array, circles: Array, noise: SensorNoise
@@ -132,7 +147,7 @@ class Lidar:
 
 
 @dataclass(frozen=True, slots=True)
-class PointSensor:
+class PointSensor(Parameters):
     """The course report's sensor [P V]: every point of the world within range, seen through walls, free of noise.
 
     A scan message has evenly spaced beams, the points have not: each is put into the nearest of `beams`
@@ -140,11 +155,16 @@ class PointSensor:
     0.6 cm rms. Of two points in one direction the nearer counts.
     """
 
-    beams: int = 14_400
-    range_max: float = 50.0
-    range_step: float = RANGE_STEP
+    beams: Beams = 14_400
+    """Number of directions of a scan."""
+    range_max: Length = 50.0
+    """Largest range that is measured [m]."""
+    range_step: Length = RANGE_STEP
+    """Step to which ranges are rounded [m]."""
     mounting: Pose2 = IDENTITY
+    """Pose of the sensor in the base frame."""
     frame_id: str = "laser"
+    """Name of the sensor's frame."""
 
     upside_down = False
     motion_distortion = False

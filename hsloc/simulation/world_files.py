@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hsloc.errors import ConfigError
+from hsloc.errors import ConfigError, no_such
 from hsloc.kernels.raycasting import cast_rays
 from hsloc.maps import read_map
 from hsloc.simulation.built_in import WORLDS, built_in
@@ -165,6 +165,8 @@ def read_rows(path: Path, columns: tuple[int, ...]) -> Array:
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError as error:
+        raise ConfigError(no_such(path)) from error
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read as text ({error}); give a file of numbers") from error
     rows: list[list[float]] = []

@@ -98,11 +98,12 @@ def test_list_names_worlds_and_scenarios(capsys: pytest.CaptureFixture[str]) -> 
         (["--scenario", "moon"], "scenario 'moon' is unknown; choose from office"),
         (["--world", "paper", "--fov", "90"], "--fov does not apply here: the PointSensor has no field_of_view"),
         (["--scenario", "paper", "--alpha1", "0.1"], "--alpha1 does not apply here"),
-        (["--world", "office", "--dropout", "2"], "sensor.dropout is 2.0; it must lie between 0 and 1"),
-        (["--world", "office", "--beams", "0"], "sensor.beams is 0"),
+        (["--world", "office", "--dropout", "2"], "Lidar.dropout is 2.0; it must be from 0 to 1"),
+        (["--world", "office", "--beams", "0"], "Lidar.beams is 0"),
         (["--world", "office", "--duration", "nan"], "duration_s is nan"),
+        (["--world", "office", "--speed", "0"], "DifferentialDrive.speed is 0.0; it must be from 0.001 to 100"),
         (["--world", "office", "--map-resolution", "0.001"], "map_resolution 0.001 makes a map of"),
-        (["--world", "office", "--waypoints", "nowhere.csv"], "nowhere.csv: cannot be read"),
+        (["--world", "office", "--waypoints", "nowhere.csv"], "nowhere.csv: no such file"),
     ],
 )
 def test_mistakes_are_one_line_and_leave_nothing(tmp_path: Path, words: list[str], message: str) -> None:

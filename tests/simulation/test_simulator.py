@@ -140,12 +140,17 @@ def test_scenarios_survive_json(name: str) -> None:
         ({"world": "office", "colour": 1}, "Scenario has no 'colour'"),
         ({"world": "office", "sensor": {"kind": "Sonar"}}, "kind 'Sonar' is unknown"),
         ({"world": "office", "sensor": {"kind": "Lidar", "beam": 3}}, "Lidar has no 'beam'"),
-        ({"world": "office", "scan_rate_hz": 0}, "scan_rate_hz is 0; it must lie between 0.01 and 10000"),
+        ({"world": "office", "scan_rate_hz": 0}, "scan_rate_hz is 0; it must be from 0.01 to 10000"),
         ({"world": "office", "duration_s": float("nan")}, "duration_s is nan"),
         ({"world": "office", "laps": float("inf")}, "laps is inf"),
-        ({"world": "office", "kidnaps": [{"at_s": 1, "skip_s": -1}]}, "kidnap 1: skip_s is -1"),
-        ({"world": "office", "seed": -1}, "seed is -1; it must lie"),
-        ({"world": "office", "odometry": {"kind": "OdometryNoise", "alpha1": -1}}, r"odometry\.alpha1 is -1"),
+        ({"world": "office", "kidnaps": [{"at_s": 1, "skip_s": -1}]}, "Kidnap.skip_s is -1"),
+        ({"world": "office", "seed": -1}, "seed is -1; it must be from 0"),
+        (
+            {"world": "office", "robot": {"kind": "DifferentialDrive", "acceleration": 0}},
+            "acceleration is 0; it must be",
+        ),
+        ({"world": "office", "sensor": {"kind": "Lidar", "range_step": float("nan")}}, r"Lidar\.range_step is nan"),
+        ({"world": "office", "odometry": {"kind": "OdometryNoise", "alpha1": -1}}, r"OdometryNoise\.alpha1 is -1"),
     ],
 )
 def test_scenarios_that_make_no_sense_are_refused(values: dict[str, Any], message: str) -> None:

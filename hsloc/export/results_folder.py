@@ -20,6 +20,7 @@ from hsloc.atomic_write import whole_folder
 from hsloc.dataclass_json import to_json
 from hsloc.errors import OutputError
 from hsloc.evaluation import write_json, write_tum
+from hsloc.export.lichtblick import LAYOUT_FILE, write_layout
 from hsloc.export.provenance import config_text, provenance
 from hsloc.export.run_mcap import RunRecording
 from hsloc.maps import save_map
@@ -101,6 +102,7 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
     with RunRecording(result, folder / "run.mcap") as recording:
         analysis = analyse(result, observer=recording.add, progress=progress)
         recording.add_analysis(analysis)
+    write_layout(folder / LAYOUT_FILE)
     seconds = {"analyse": time.perf_counter() - begin - recording.seconds, "run_mcap": recording.seconds}
     begin = time.perf_counter()
     write_tum(folder / "trajectory.tum", result.trajectory)

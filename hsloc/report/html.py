@@ -31,11 +31,23 @@ if TYPE_CHECKING:
     from hsloc.run_metrics import LaserMetrics, RunMetrics
 
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "sse", "count")
-VIEWER_SCRIPTS = ("input.js", "charts.js", "view.js")
+VIEWER_SCRIPTS = ("input.js", "charts.js", "layers.js", "export.js", "view.js")
 """Files of hsloc/report/viewer, in the order in which they are needed."""
 
 _DATA = re.compile(r'<script type="application/json" id="data">(.*?)</script>', re.DOTALL)
-_OF_THE_FIRST = ("map", "scans", "points", "loops", "ellipses", "marks", "events", "status", "odometry", "reference")
+_OF_THE_FIRST = (
+    "map",
+    "scans",
+    "points",
+    "loops",
+    "graph",
+    "ellipses",
+    "marks",
+    "events",
+    "status",
+    "odometry",
+    "reference",
+)
 """Parts of a view that are drawn of the first run alone."""
 
 

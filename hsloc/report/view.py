@@ -38,6 +38,8 @@ MOST_POINTS = 1500
 MOST_MARKS = 1000
 """Scans of one status that are marked."""
 MOST_ELLIPSES = 300
+MOST_EDGES = 4000
+"""Edges of the pose graph that are drawn."""
 MOST_PIXELS = 4000
 """Longest side of the map's picture."""
 _CM = 100.0
@@ -78,6 +80,7 @@ def view_of(parts: ReportParts, data: ReportData | None = None) -> ReportView:
         "scans": _scans(parts, data.start_ns),
         "marks": [] if scans is None else _marks(scans),
         "loops": loops,
+        "graph": None if parts.mapping is None else _graph(parts.mapping),
         "ellipses": _ellipses(parts, data.start_ns),
         "events": _events(parts, data, loops),
         "status": [] if scans is None else _status_rows(scans),
@@ -212,6 +215,18 @@ def _loops(mapping: MappingResult, start_ns: int) -> dict[str, Any]:
         "accepted": [bool(loop.accepted) for loop in loops],
         "reason": [loop.reason for loop in loops],
     }
+
+
+def _graph(mapping: MappingResult) -> dict[str, Any] | None:
+    """Keyscans and the edges between them; of many edges the longest, which say most, and how many there are."""
+    poses, pairs = mapping.graph.poses, mapping.graph.edges.pairs
+    if not len(pairs):
+        return None
+    length = np.hypot(*(poses[pairs[:, 0], :2] - poses[pairs[:, 1], :2]).T)
+    rows = np.sort(np.argsort(-length, kind="stable")[:MOST_EDGES])
+    nodes, ends = np.unique(pairs[rows], return_inverse=True)
+    columns = _columns(x=poses[nodes, 0], y=poses[nodes, 1], decimals=3)
+    return {**columns, "edges": ends.reshape(-1, 2).tolist(), "total": len(pairs)}
 
 
 def _ellipses(parts: ReportParts, start_ns: int) -> dict[str, Any] | None:

@@ -64,6 +64,8 @@ def test_rosbags_decodes_every_message(results: Path) -> None:
                 np.testing.assert_array_equal(cells, open_log(HALL).map().cells)
     scans = json.loads((results / "metrics.json").read_text())["scans"]["total"]
     of_each = {"/scan": scans, "/pose": len(trajectory), "/tf": len(trajectory)}
+    layout = json.loads((results / "lichtblick.json").read_text())
+    assert set(layout["configById"]["3D!map"]["topics"]) <= set(found)
     known = found.pop("/pose_with_covariance")
     assert 0 < known <= scans
     paths = {"/path": 1, "/reference_path": 1, "/odometry_path": 1}

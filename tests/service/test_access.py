@@ -57,6 +57,7 @@ WRITE = {
     ("delete", "/v1/tus/{file_id}"),
     ("patch", "/v1/tus/{file_id}"),
     ("post", "/v1/files"),
+    ("post", "/v1/files/sample"),
     ("post", "/v1/jobs"),
     ("post", "/v1/jobs/{job_id}/cancel"),
     ("post", "/v1/jobs/{job_id}/rerun"),

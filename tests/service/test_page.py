@@ -12,6 +12,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
+from xml.etree import ElementTree
 
 from live_service import upload
 from paths import RECORDINGS
@@ -242,9 +243,30 @@ def look_around_by_mouse(page: Any) -> None:
     now = page.text_content(".rv-now")
     page.locator("#charts .rv-plot").first.click()  # a click on a curve seeks
     assert page.text_content(".rv-now") != now
-    with page.expect_download() as download:
-        page.click("#view [data-do=picture]")
-    assert download.value.suggested_filename.endswith(".png")
+    for button, ending in (("picture", ".png"), ("drawing", ".svg")):
+        with page.expect_download() as download:
+            page.click(f"#view [data-do={button}]")
+        assert download.value.suggested_filename.endswith(ending)
+    drawing = ElementTree.parse(download.value.path()).getroot()
+    assert drawing.findall(".//{*}path[@stroke-width]")
+    assert [each.text for each in drawing.findall(".//{*}text")][:2] == ["end", "start"]
+    seen = drawn(page)
+    page.check("#view [data-layer=heat]")
+    assert drawn(page) != seen
+    page.uncheck("#view [data-layer=heat]")
+    drag_a_start_pose(page, x, y)
+
+
+def drag_a_start_pose(page: Any, x: float, y: float) -> None:
+    """An arrow on the map: its tail is the position, its direction the heading."""
+    page.click("#view [data-do=pose]")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x, y - 60)
+    page.mouse.up()
+    assert re.search(r"start at x -?\d+\.\d\d m, y -?\d+\.\d\d m, 90\.0°", page.text_content("#start-here") or "")
+    page.click("#start-here >> text=Cancel")
+    assert page.is_hidden("#start-here")
 
 
 def look_on_a_phone_in_the_dark(page: Any) -> None:
@@ -296,6 +318,9 @@ def test_a_token_is_asked_for(make_live: Callable[..., Live], open_page: Callabl
     page.keyboard.press("Enter")
     page.wait_for_function("() => document.querySelector('#server').textContent.includes('version')")
     assert page.is_hidden("#token-form")
+    page.click("#try-sample")  # with one click, and nothing of one's own
+    page.wait_for_selector("#job-state .succeeded")
+    assert page.text_content("#job-title") == "office.mcap"
 
 
 def test_an_upload_survives_a_server_that_drops_it(

@@ -110,7 +110,7 @@ def test_the_files_say_what_the_result_says(tmp_path: Path) -> None:
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {
         "trajectory.tum", "odometry.tum", "reference.tum", "metrics.json", "timings.json", "config.yaml",
-        "report.png", "report.html", "run.mcap", "states.csv",
+        "report.png", "report.html", "run.mcap", "states.csv", "lichtblick.json",
     }  # fmt: skip
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     written = read_tum(tmp_path / "out" / "trajectory.tum")

@@ -30,19 +30,6 @@ globalThis.listenToView = (view) => {
     const k = nearest(px, py);
     if (k !== null) view.seek(view.data.trajectory.t[k]);
   }
-  function save() {
-    const canvas = document.createElement("canvas"), c = canvas.getContext("2d");
-    canvas.width = view.$base.width; canvas.height = view.$base.height;
-    c.fillStyle = view.ink("ground"); c.fillRect(0, 0, canvas.width, canvas.height);
-    c.drawImage(view.$base, 0, 0); c.drawImage(view.$over, 0, 0);
-    canvas.toBlob((blob) => {
-      const link = document.createElement("a");
-      link.href = URL.createObjectURL(blob);
-      link.download = `${view.data.title || "map"}.png`;
-      link.click();
-      setTimeout(() => URL.revokeObjectURL(link.href), 10000);
-    });
-  }
   const { signal } = view.listening, over = view.$over, place = (event) => [event.offsetX * view.ratio, event.offsetY * view.ratio];
   over.addEventListener("wheel", (event) => {
     // An untouched map lets the page scroll by.
@@ -58,6 +45,7 @@ globalThis.listenToView = (view) => {
   });
   over.addEventListener("pointermove", (event) => {
     const was = view.fingers.get(event.pointerId), now = place(event);
+    if (was && view.posing) { view.setPose([view.metres(...view.pressed), view.metres(...now)]); return; }
     if (!was) { hover(...now); return; }
     const others = [...view.fingers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
     if (others.length === 1) {
@@ -68,6 +56,14 @@ globalThis.listenToView = (view) => {
   });
   over.addEventListener("pointerup", (event) => {
     const now = place(event);
+    if (view.posing && view.fingers.size === 1) {
+      view.fingers.clear();
+      const [[x, y], [tx, ty]] = view.arrow ?? [[0, 0], [0, 0]];
+      if (tx === x && ty === y) return; // a click has no heading
+      pose();
+      view.root.dispatchEvent(new CustomEvent("pose", { detail: [x + view.ox, y + view.oy, Math.atan2(ty - y, tx - x)] }));
+      return;
+    }
     if (view.fingers.size === 1 && view.pressed && Math.hypot(now[0] - view.pressed[0], now[1] - view.pressed[1]) < 4 * view.ratio) click(...now);
     view.fingers.delete(event.pointerId);
   });
@@ -75,7 +71,14 @@ globalThis.listenToView = (view) => {
   over.addEventListener("pointerleave", () => { view.$place.textContent = ""; view.charts.cursor(view.time); });
   over.addEventListener("dblclick", (event) => view.zoom(2, ...place(event)));
   const measure = () => { view.measure = view.measure ? null : []; over.classList.toggle("rv-measuring", Boolean(view.measure)); view.drawOver(); };
-  const actions = { in: () => view.zoom(1.5), out: () => view.zoom(1 / 1.5), all: () => view.all(), measure, picture: () => save(),
+  const pose = () => {
+    view.posing = !view.posing;
+    view.arrow = view.posing ? null : view.arrow;
+    over.classList.toggle("rv-measuring", view.posing);
+    view.root.querySelector("[data-do=pose]").setAttribute("aria-pressed", String(view.posing));
+    view.drawOver();
+  };
+  const actions = { pose, in: () => view.zoom(1.5), out: () => view.zoom(1 / 1.5), all: () => view.all(), measure, picture: () => globalThis.saveView.picture(view), drawing: () => globalThis.saveView.drawing(view),
     play: () => view.play(), less: () => view.step(-1), more: () => view.step(1), back: () => view.jump(false), next: () => view.jump(true) };
   view.root.addEventListener("click", (event) => actions[event.target.closest?.("button[data-do]")?.dataset.do]?.(), { signal });
   view.root.addEventListener("change", (event) => {

@@ -1,20 +1,12 @@
 "use strict";
 // A result on its map: one file for report.html and the service's page. The value that it draws is made by
-// hsloc/report/view.py. Text from the run goes in as text, never as markup. Needs charts.js and input.js, and view.css.
+// hsloc/report/view.py. Text from the run goes in as text, never as markup. Needs charts.js, layers.js, export.js
+// and input.js, and view.css.
 (() => {
-  const STATES = { localised: "blue", predicted: "sky", ambiguous: "orange", off_map: "vermillion", lost: "purple" };
-  // Viridis at eight places (S. van der Walt and N. Smith, 2015): even in lightness, readable for the colour-blind.
-  const SCALE = ["#440154", "#46327e", "#365c8d", "#277f8e", "#1fa187", "#4ac16d", "#a0da39", "#fde725"];
+  const { MARKS, Path, make } = globalThis.ResultLayers;
   const NEAR_CM = 5, FAR_CM = 15;
-  const MARKS = { rejected: "✕", no_returns: "▼", relocalised: "★" };
   const KINDS = [["", "any event"], ["warning", "warning"], ["loss", "loss"], ["loop", "loop"], ["rejected", "refused scan"]];
 
-  const make = (tag, attributes = {}, ...children) => {
-    const made = document.createElement(tag);
-    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-    made.append(...children);
-    return made;
-  };
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   const length = globalThis.lengthText;
   // The last row whose time is not after t.
@@ -49,6 +41,12 @@
       this.seek(0);
     }
 
+    // A tool by which an arrow is dragged: the event `pose` has [x, y, yaw] in the frame of the map (m, rad).
+    offerPose(title) {
+      this.$tools.append(make("button", { type: "button", "data-do": "pose", title, "aria-label": title, "aria-pressed": "false" }, "⇗"));
+    }
+    setPose(arrow) { this.arrow = arrow; this.drawOver(); }
+
     // Frees what the page holds beyond the element.
     end() {
       this.stop();
@@ -75,9 +73,9 @@
         "Map with the trajectory. Arrow keys move, plus and minus zoom, 0 shows all, comma and full stop step by scan, n and p go to the next and previous event." });
       this.$place = make("div", { class: "rv-place" });
       this.$scale = make("div", { class: "rv-scale" }, make("i"), make("span"));
-      const tools = make("div", { class: "rv-tools" }, button("in", "+", "zoom in"), button("out", "−", "zoom out"),
-        button("all", "⤢", "show all"), button("measure", "↔", "measure a distance"), button("picture", "PNG", "save the map as a picture"));
-      this.$frame = make("div", { class: "rv-frame" }, this.$base, this.$over, this.$place, this.$scale, tools);
+      this.$tools = make("div", { class: "rv-tools" }, button("in", "+", "zoom in"), button("out", "−", "zoom out"),
+        button("all", "⤢", "show all"), button("measure", "↔", "measure a distance"), button("picture", "PNG", "save the map as a picture"), button("drawing", "SVG", "save the map as a drawing"));
+      this.$frame = make("div", { class: "rv-frame" }, this.$base, this.$over, this.$place, this.$scale, this.$tools);
       const [x0, y0, x1, y1] = this.data.extent;
       this.$frame.style.setProperty("--rv-aspect", String(Math.min(Math.max((x1 - x0) / (y1 - y0), 0.8), 3)));
       this.$time = make("input", { type: "range", min: "0", max: String(this.data.end || 1), step: "any", value: "0", "aria-label": "time" });
@@ -108,7 +106,8 @@
         ["reference", "reference", d.reference, true], ["odometry", "odometry alone", d.odometry, true],
         ["scan", "scan at the cursor", d.scans, true], ["scans", "all scans", d.scans, false],
         ["loops", `loops (${d.loops ? d.loops.accepted.length - refused : 0})`, d.loops && d.loops.accepted.length > refused, true],
-        ["refused", `refused loops (${refused})`, refused, false], ["ellipses", "2σ ellipses", d.ellipses, false],
+        ["refused", `refused loops (${refused})`, refused, false], ["graph", `pose graph (${d.graph?.total} edges)`, d.graph, false], ["ellipses", "2σ ellipses", d.ellipses, false],
+        ["heat", "distance of scans to the map", d.scans && d.map, false],
         ...d.marks.map((mark) => [mark.status, `scan ${mark.label} (${mark.t.length})`, true, true]),
       ];
       this.shown = new Set();
@@ -116,7 +115,7 @@
         if (!there) continue;
         const box = make("input", { type: "checkbox", "data-layer": name, ...(on ? { checked: "" } : {}) });
         if (on) this.shown.add(name);
-        box.addEventListener("change", () => { if (box.checked) this.shown.add(name); else this.shown.delete(name); this.draw(); });
+        box.addEventListener("change", () => { if (box.checked) this.shown.add(name); else this.shown.delete(name); this.$heat.hidden = !this.shown.has("heat"); this.draw(); });
         const key = make("i", { class: `rv-key rv-${name}` }, MARKS[name] || "");
         if (ink) key.style.borderColor = `var(--rv-${ink})`;
         this.$layers.append(make("label", {}, box, key, text));
@@ -128,7 +127,8 @@
       this.colourBy = d.trajectory.states.some((state) => state !== "localised") ? "state" : "plain";
       select.value = this.colourBy;
       this.$legend = make("span", { class: "rv-legend" });
-      this.$layers.append(make("label", {}, "colour by ", select), this.$legend);
+      this.$heat = this.heatLegend();
+      this.$layers.append(make("label", {}, "colour by ", select), this.$legend, this.$heat);
     }
 
     // --- view: metres (x, y) from the middle at the centre of the canvas, and pixels a metre ---------------------------
@@ -181,32 +181,16 @@
       this.ink("ink");
       this.paths ??= this.makePaths();
       const px = this.ratio / this.scale, stroke = (path, colour, width, dash = []) => {
-        c.strokeStyle = colour; c.lineWidth = width * px; c.setLineDash(dash.map((n) => n * px)); c.stroke(path); c.setLineDash([]);
+        c.strokeStyle = colour; c.lineWidth = width * px; c.setLineDash(dash.map((n) => n * px)); c.stroke(path.canvas); c.setLineDash([]);
       };
       c.lineJoin = c.lineCap = "round";
+      if (this.shown.has("heat")) this.drawHeat(c);
       if (this.shown.has("scans")) for (const k of d.scans.t.keys()) this.drawScan(c, k, 1.2 * px);
       if (this.shown.has("points")) this.dots(c, d.points, this.ink("ink"), 3 * px);
-      if (this.shown.has("odometry")) stroke(this.paths.odometry, this.ink("vermillion"), 1.3, [2, 4]);
-      if (this.shown.has("refused")) stroke(this.paths.refused, this.ink("vermillion"), 1, [3, 4]);
-      if (this.shown.has("loops")) stroke(this.paths.loops, this.ink("green"), 1.6);
-      if (this.shown.has("trajectory")) for (const [colour, path] of this.paths.trajectory) stroke(path, colour, 2.6);
-      this.paths.others.forEach((path, k) => { if (this.shown.has(`other${k}`)) stroke(path, this.ink(d.others[k].ink), 2); });
-      if (this.shown.has("reference")) stroke(this.paths.reference, this.ink("ink"), 1.1, [6, 4]);
-      if (this.shown.has("ellipses")) stroke(this.paths.ellipses, this.ink("purple"), 1.2);
+      for (const each of this.strokes()) stroke(...each);
       this.drawAxes(c);
       this.drawMarks(c);
       this.drawScale();
-    }
-    // Where the frame of the map has its origin, and its axes.
-    drawAxes(c) {
-      c.setTransform(1, 0, 0, 1, 0, 0);
-      const [px, py] = this.pixels(...this.local(0, 0)), r = this.ratio;
-      c.font = `${11 * r}px system-ui, sans-serif`; c.textAlign = "center"; c.textBaseline = "middle"; c.lineWidth = 1.6 * r;
-      for (const [dx, dy, name, colour] of [[28, 0, "x", "vermillion"], [0, -28, "y", "green"]]) {
-        c.strokeStyle = c.fillStyle = this.ink(colour);
-        c.beginPath(); c.moveTo(px, py); c.lineTo(px + dx * r, py + dy * r); c.stroke();
-        c.fillText(name, px + 1.3 * dx * r, py + 1.3 * dy * r);
-      }
     }
     drawMap(c) {
       if (!this.image || !this.data.map) return;
@@ -233,7 +217,7 @@
       for (const k of columns.x.keys()) { const [x, y] = this.local(columns.x[k], columns.y[k]); c.fillRect(x - size / 2, y - size / 2, size, size); }
     }
     polyline(columns) {
-      const path = new Path2D(), breaks = new Set(columns?.breaks);
+      const path = new Path(), breaks = new Set(columns?.breaks);
       for (const k of columns ? columns.x.keys() : []) {
         const at = this.local(columns.x[k], columns.y[k]);
         if (k && !breaks.has(k)) path.lineTo(...at); else path.moveTo(...at);
@@ -242,11 +226,15 @@
     }
     makePaths() {
       const d = this.data, paths = { odometry: this.polyline(d.odometry), reference: this.polyline(d.reference), trajectory: this.coloured(),
-        others: (d.others ?? []).map((other) => this.polyline(other)), loops: new Path2D(), refused: new Path2D(), ellipses: new Path2D() };
+        others: (d.others ?? []).map((other) => this.polyline(other)), loops: new Path(), refused: new Path(), ellipses: new Path(), graph: new Path() };
       if (d.loops) for (const k of d.loops.t.keys()) {
         const path = d.loops.accepted[k] ? paths.loops : paths.refused;
         path.moveTo(...this.local(d.loops.x0[k], d.loops.y0[k]));
         path.lineTo(...this.local(d.loops.x1[k], d.loops.y1[k]));
+      }
+      if (d.graph) for (const [i, j] of d.graph.edges) {
+        paths.graph.moveTo(...this.local(d.graph.x[i], d.graph.y[i]));
+        paths.graph.lineTo(...this.local(d.graph.x[j], d.graph.y[j]));
       }
       if (d.ellipses) for (const k of d.ellipses.t.keys()) {
         const { xx, xy, yy } = Object.fromEntries(["xx", "xy", "yy"].map((name) => [name, d.ellipses[name][k]]));
@@ -257,65 +245,14 @@
       }
       return paths;
     }
-    // One path for each colour; the legend says what the colours mean.
-    coloured() {
-      const path = this.data.trajectory, breaks = new Set(path.breaks), found = new Map(), by = this.colourBy;
-      let colour = () => this.ink("blue");
-      this.$legend.replaceChildren();
-      const entry = (ink, text) => { const key = make("i", { class: "rv-key" }); key.style.borderColor = ink; this.$legend.append(key, `${text} `); };
-      if (by === "state") {
-        const inks = path.states.map((state) => this.ink(STATES[state] || "ink"));
-        colour = (k) => inks[path.state[k]];
-        path.states.forEach((state, k) => entry(inks[k], state.replaceAll("_", " ")));
-      } else if (by !== "plain") {
-        const values = by === "time" ? path.t : path[by], known = values.filter((v) => v !== null).sort((a, b) => a - b);
-        const low = by === "time" ? 0 : Math.min(known[0] ?? 0, 0), high = (by === "time" ? known.at(-1) : known[Math.floor(0.98 * (known.length - 1))]) || 1;
-        colour = (k) => values[k] === null ? this.ink("muted") : SCALE[Math.min(Math.max(Math.floor(SCALE.length * (values[k] - low) / (high - low)), 0), SCALE.length - 1)];
-        const text = (v) => by === "time" ? `${v.toFixed(0)} s` : length(v);
-        entry(SCALE[0], text(low)); entry(SCALE[4], text((low + high) / 2)); entry(SCALE[7], by === "time" ? text(high) : `${text(high)} and more`);
-      }
-      let last = null;
-      for (const k of path.x.keys()) {
-        const ink = colour(k), at = this.local(path.x[k], path.y[k]);
-        if (!found.has(ink)) found.set(ink, new Path2D());
-        const target = found.get(ink);
-        if (k === 0 || breaks.has(k)) target.moveTo(...at);
-        else { if (last !== ink) target.moveTo(...this.local(path.x[k - 1], path.y[k - 1])); target.lineTo(...at); }
-        last = ink;
-      }
-      return found;
-    }
-    drawMarks(c) {
-      c.setTransform(1, 0, 0, 1, 0, 0);
-      c.textAlign = "center"; c.textBaseline = "middle";
-      for (const mark of this.data.marks) {
-        if (!this.shown.has(mark.status)) continue;
-        c.font = `${(mark.status === "relocalised" ? 20 : 12) * this.ratio}px system-ui, sans-serif`;
-        c.fillStyle = this.ink(mark.status === "rejected" ? "vermillion" : "orange");
-        for (const k of mark.t.keys()) c.fillText(MARKS[mark.status], ...this.pixels(...this.local(mark.x[k], mark.y[k])));
-      }
-      const path = this.data.trajectory, n = path.x.length, end = (k, name, colour) => {
-        const [px, py] = this.pixels(...this.local(path.x[k], path.y[k])), r = 6 * this.ratio;
-        c.beginPath(); c.arc(px, py, r, 0, 2 * Math.PI); c.fillStyle = this.ink(colour); c.fill();
-        c.strokeStyle = this.ink("halo"); c.lineWidth = 2 * this.ratio; c.stroke();
-        c.font = `600 ${13 * this.ratio}px system-ui, sans-serif`; c.textAlign = "left"; c.lineWidth = 3 * this.ratio;
-        c.strokeText(name, px + 1.5 * r, py - 1.5 * r); c.fillStyle = this.ink("ink"); c.fillText(name, px + 1.5 * r, py - 1.5 * r);
-      };
-      if (n && this.shown.has("trajectory")) { end(n - 1, "end", "vermillion"); end(0, "start", "green"); }
-    }
+    pointInk(i) { return this.ink(this.near[i] <= NEAR_CM ? "green" : this.near[i] <= FAR_CM ? "orange" : "vermillion"); }
     drawScan(c, k, size) {
       const { x, y, theta, count } = this.data.scans, cos = Math.cos(theta[k]), sin = Math.sin(theta[k]), [px, py] = this.local(x[k], y[k]);
       for (let i = this.first[k]; i < this.first[k] + count[k]; i += 1) {
-        const bx = this.xy[2 * i], by = this.xy[2 * i + 1], near = this.near[i];
-        c.fillStyle = this.ink(near <= NEAR_CM ? "green" : near <= FAR_CM ? "orange" : "vermillion");
+        const bx = this.xy[2 * i], by = this.xy[2 * i + 1];
+        c.fillStyle = this.pointInk(i);
         c.fillRect(px + cos * bx - sin * by - size / 2, py + sin * bx + cos * by - size / 2, size, size);
       }
-    }
-    drawScale() {
-      const rough = 110 * this.ratio / this.scale, power = 10 ** Math.floor(Math.log10(rough));
-      const metres = [5, 2, 1].map((step) => step * power).find((step) => step <= rough * 1.000001) || power;
-      this.$scale.firstChild.style.width = `${metres * this.scale / this.ratio}px`;
-      this.$scale.lastChild.textContent = metres >= 1000 ? `${metres / 1000} km` : metres >= 1 ? `${metres} m` : `${Number((100 * metres).toPrecision(3))} cm`;
     }
     drawOver() {
       const c = this.$over.getContext("2d"), path = this.data.trajectory, scans = this.data.scans, px = this.ratio / this.scale;
@@ -332,6 +269,7 @@
         c.strokeStyle = this.ink("halo"); c.lineWidth = 1.2 * px; c.stroke();
         c.restore();
       }
+      if (this.arrow) this.drawArrow(c, px);
       if (this.measure?.length) {
         const [a, b = a] = this.measure;
         c.strokeStyle = c.fillStyle = this.ink("robot"); c.lineWidth = 2 * px;
@@ -393,5 +331,6 @@
       this.playing = requestAnimationFrame(step);
     }
   }
+  Object.assign(ResultView.prototype, globalThis.ResultLayers.methods);
   globalThis.ResultView = ResultView;
 })();

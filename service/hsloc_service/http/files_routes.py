@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import re
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from anyio import to_thread
 from fastapi import APIRouter, Header, Path, Query, Request, Response
@@ -17,6 +17,10 @@ from hsloc_service.http import metrics
 from hsloc_service.http.context import Context, Ctx, Reader, Writer, problems
 from hsloc_service.http.schemas import UUID_PATTERN, FileList, FileView
 from hsloc_service.http.views import file_view
+from hsloc_service.uploads.sample import sample_log
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
 
 router = APIRouter(prefix="/v1/files", tags=["files"])
 FileId = Annotated[str, Path(pattern=UUID_PATTERN, description="id of an upload")]
@@ -42,6 +46,19 @@ async def upload(request: Request, ctx: Ctx, who: Writer, name: Name = "log", re
     wanted = parse_digest(repr_digest)
     row = await to_thread.run_sync(ctx.files.create, who, name, _length(request))
     return file_view(await _take(request, ctx, who, row, wanted))
+
+
+@router.post("/sample", status_code=201, responses=problems(413, 507))
+async def sample(ctx: Ctx, who: Writer) -> FileView:
+    """A log to try the service with, as an upload of yours: a minute of a simulated office, with its map."""
+    path = await to_thread.run_sync(sample_log, ctx.storage)
+    row = await to_thread.run_sync(ctx.files.create, who, "office.mcap", path.stat().st_size)
+
+    async def body() -> AsyncIterator[bytes]:
+        yield await to_thread.run_sync(path.read_bytes)
+
+    with ctx.receiver.writer(row.id):
+        return file_view(await ctx.receiver.append(who, row.id, 0, body()))
 
 
 @router.put("/{file_id}", status_code=201, openapi_extra=_BODY, responses=problems(404, 409, 413, 423, 460, 507))

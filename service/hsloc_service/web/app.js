@@ -1,7 +1,7 @@
 // The page: which part of it is shown, by the address. #job=ID&t=SECONDS, #shared=SECRET&t=SECONDS, #compare=ID,ID,
 // #files, #label=TEXT; else the jobs.
 
-import { get, hasToken, onToken, useToken } from "./api.js";
+import { get, hasToken, onToken, post, useToken } from "./api.js";
 import { $, bytes, guarded, notice } from "./dom.js";
 import * as files from "./files.js";
 import * as form from "./form.js";
@@ -76,6 +76,13 @@ jobs.listen();
 files.listen(useAgain);
 labels.listen(result.renamed);
 share.listen();
+$("try-sample").addEventListener("click", () => guarded(async () => {
+  $("try-sample").disabled = true;
+  try {
+    const job = await post("/v1/jobs", { log: (await post("/v1/files/sample")).id });
+    location.hash = `job=${job.id}`;
+  } finally { $("try-sample").disabled = false; }
+}));
 addEventListener("hashchange", route);
 if (!location.hash.startsWith("#shared=")) about();
 route();

@@ -7,6 +7,7 @@ import * as share from "./share.js";
 
 let watching = null; // AbortController of the job that is shown
 let view = null;
+let shownJob = null; // its id
 let addressing = null; // timer after which the address holds the time that is shown
 
 export function leave() {
@@ -22,6 +23,7 @@ export function leave() {
 // `time` (s) is where the result is opened, as in a link that somebody sent.
 export async function show(id, focus, time = 0) {
   const mine = begin();
+  shownJob = id;
   const job = await guarded(() => get(`/v1/jobs/${id}`));
   if (!job || mine.aborted) return;
   render(job);
@@ -46,7 +48,7 @@ export async function showShared(secret, time = 0) {
 function begin() {
   leave();
   watching = new AbortController();
-  $("result").hidden = $("job-log").hidden = true;
+  $("result").hidden = $("job-log").hidden = $("start-here").hidden = true;
   $("job-log").lastElementChild.textContent = $("job-notes").textContent = "";
   return watching.signal;
 }
@@ -140,8 +142,20 @@ async function showResult(job, base, mine, time) {
   if (!loaded || mine.aborted) return;
   summary(job, loaded.data.summary);
   view = new globalThis.ResultView($("view"), loaded.data, loaded.image, $("charts"));
+  if (!isShared && job.summary?.mode !== "slam" && job.summary?.metrics?.run?.mode !== "slam") view.offerPose("run again from a start pose: drag an arrow");
   if (time > 0) view.seek(time);
 }
+
+// An arrow was dragged on the map: where the robot stood when the log begins.
+$("view").addEventListener("pose", ({ detail: pose }) => {
+  const bar = $("start-here"), [x, y, yaw] = pose;
+  bar.hidden = false;
+  bar.firstElementChild.textContent = `start at x ${x.toFixed(2)} m, y ${y.toFixed(2)} m, ${(180 * yaw / Math.PI).toFixed(1)}°`;
+  const id = shownJob;
+  bar.replaceChildren(bar.firstElementChild, button("Run again from here", async () => {
+    location.hash = `job=${(await post(`/v1/jobs/${id}/rerun`, { initial_pose: pose, unknown_start: false })).id}`;
+  }, "primary"), button("Cancel", () => { bar.hidden = true; view?.setPose(null); }));
+});
 
 // The address holds the time that is shown, so that it can be sent.
 $("view").addEventListener("seek", (event) => {

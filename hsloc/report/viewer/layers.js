@@ -1,0 +1,153 @@
+"use strict";
+// What lies on the map of a result: lines, marks, axes, heat map. Methods of `ResultView`, which is in view.js.
+(() => {
+  const STATES = { localised: "blue", predicted: "sky", ambiguous: "orange", off_map: "vermillion", lost: "purple" };
+  // Viridis at eight places (S. van der Walt and N. Smith, 2015): even in lightness, readable for the colour-blind.
+  const SCALE = ["#440154", "#46327e", "#365c8d", "#277f8e", "#1fa187", "#4ac16d", "#a0da39", "#fde725"];
+  const MARKS = { rejected: "✕", no_returns: "▼", relocalised: "★" };
+  const HEAT_M = 0.3, HEAT_CELLS = 240; // where the scale ends; cells along the longer side of the extent
+  const make = (tag, attributes = {}, ...children) => {
+    const made = document.createElement(tag);
+    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+    made.append(...children);
+    return made;
+  };
+  const length = globalThis.lengthText;
+
+  // A path for a canvas, and the same as text for a drawing.
+  class Path {
+    constructor() { this.canvas = new Path2D(); this.parts = []; }
+    moveTo(x, y) { this.canvas.moveTo(x, y); this.parts.push("M", x, y); }
+    lineTo(x, y) { this.canvas.lineTo(x, y); this.parts.push("L", x, y); }
+    ellipse(x, y, a, b, angle, from, to) {
+      this.canvas.ellipse(x, y, a, b, angle, from, to);
+      const dx = a * Math.cos(angle), dy = a * Math.sin(angle), turn = 180 * angle / Math.PI;
+      this.parts.push("M", x + dx, y + dy, "A", a, b, turn, 1, 1, x - dx, y - dy, "A", a, b, turn, 1, 1, x + dx, y + dy);
+    }
+    toString() { return this.parts.map((part) => typeof part === "number" ? Number(part.toFixed(4)) : part).join(" "); }
+  }
+
+  const methods = {
+    // All lines that are shown, the lowest first: path, colour, width and dashes in pixels of the page.
+    strokes() {
+      const paths = this.paths, on = (name) => this.shown.has(name), found = [];
+      if (on("odometry")) found.push([paths.odometry, this.ink("vermillion"), 1.3, [2, 4]]);
+      if (on("graph")) found.push([paths.graph, this.ink("sky"), 1]);
+      if (on("refused")) found.push([paths.refused, this.ink("vermillion"), 1, [3, 4]]);
+      if (on("loops")) found.push([paths.loops, this.ink("green"), 1.6]);
+      if (on("trajectory")) for (const [colour, path] of paths.trajectory) found.push([path, colour, 2.6]);
+      paths.others.forEach((path, k) => { if (on(`other${k}`)) found.push([path, this.ink(this.data.others[k].ink), 2]); });
+      if (on("reference")) found.push([paths.reference, this.ink("ink"), 1.1, [6, 4]]);
+      if (on("ellipses")) found.push([paths.ellipses, this.ink("purple"), 1.2]);
+      return found;
+    },
+    // Mean distance to the map of the scans' points in each cell; made once.
+    heat() {
+      if (this.cells) return this.cells;
+      const { x, y, theta, count } = this.data.scans, [x0, y0, x1, y1] = this.data.extent, side = Math.max(x1 - x0, y1 - y0) / HEAT_CELLS;
+      const width = Math.ceil((x1 - x0) / side), sums = new Map();
+      for (const k of x.keys()) {
+        const cos = Math.cos(theta[k]), sin = Math.sin(theta[k]);
+        for (let i = this.first[k]; i < this.first[k] + count[k]; i += 1) {
+          const bx = this.xy[2 * i], by = this.xy[2 * i + 1];
+          const column = Math.floor((x[k] + cos * bx - sin * by - x0) / side), row = Math.floor((y[k] + sin * bx + cos * by - y0) / side);
+          if (column < 0 || row < 0 || column >= width) continue;
+          const cell = sums.get(row * width + column) ?? [0, 0];
+          cell[0] += this.near[i] / 100; cell[1] += 1;
+          sums.set(row * width + column, cell);
+        }
+      }
+      this.cells = { side, cells: [...sums].map(([at, [sum, n]]) => [...this.local(x0 + (at % width) * side, y0 + Math.floor(at / width) * side), sum / n]) };
+      return this.cells;
+    },
+    heatInk: (mean) => SCALE[Math.min(Math.floor(SCALE.length * mean / HEAT_M), SCALE.length - 1)],
+    drawHeat(c) {
+      const { side, cells } = this.heat(), edge = Math.max(side, 3 * this.ratio / this.scale);
+      for (const [x, y, mean] of cells) { c.fillStyle = this.heatInk(mean); c.fillRect(x, y, edge, edge); }
+    },
+    heatLegend() {
+      const made = make("span", { class: "rv-legend", hidden: "" }, "mean distance to the map ");
+      for (let k = 0; k < SCALE.length; k += 2) {
+        const key = make("i", { class: "rv-key" });
+        key.style.borderColor = SCALE[k];
+        made.append(key, `${k ? length(HEAT_M * k / SCALE.length) : "0"} `);
+      }
+      made.append("and more");
+      return made;
+    },
+    // Where the frame of the map has its origin, and its axes.
+    drawAxes(c) {
+      c.setTransform(1, 0, 0, 1, 0, 0);
+      const [px, py] = this.pixels(...this.local(0, 0)), r = this.ratio;
+      c.font = `${11 * r}px system-ui, sans-serif`; c.textAlign = "center"; c.textBaseline = "middle"; c.lineWidth = 1.6 * r;
+      for (const [dx, dy, name, colour] of [[28, 0, "x", "vermillion"], [0, -28, "y", "green"]]) {
+        c.strokeStyle = c.fillStyle = this.ink(colour);
+        c.beginPath(); c.moveTo(px, py); c.lineTo(px + dx * r, py + dy * r); c.stroke();
+        c.fillText(name, px + 1.3 * dx * r, py + 1.3 * dy * r);
+      }
+    },
+    // One path for each colour; the legend says what the colours mean.
+    coloured() {
+      const path = this.data.trajectory, breaks = new Set(path.breaks), found = new Map(), by = this.colourBy;
+      let colour = () => this.ink("blue");
+      this.$legend.replaceChildren();
+      const entry = (ink, text) => { const key = make("i", { class: "rv-key" }); key.style.borderColor = ink; this.$legend.append(key, `${text} `); };
+      if (by === "state") {
+        const inks = path.states.map((state) => this.ink(STATES[state] || "ink"));
+        colour = (k) => inks[path.state[k]];
+        path.states.forEach((state, k) => entry(inks[k], state.replaceAll("_", " ")));
+      } else if (by !== "plain") {
+        const values = by === "time" ? path.t : path[by], known = values.filter((v) => v !== null).sort((a, b) => a - b);
+        const low = by === "time" ? 0 : Math.min(known[0] ?? 0, 0), high = (by === "time" ? known.at(-1) : known[Math.floor(0.98 * (known.length - 1))]) || 1;
+        colour = (k) => values[k] === null ? this.ink("muted") : SCALE[Math.min(Math.max(Math.floor(SCALE.length * (values[k] - low) / (high - low)), 0), SCALE.length - 1)];
+        const text = (v) => by === "time" ? `${v.toFixed(0)} s` : length(v);
+        entry(SCALE[0], text(low)); entry(SCALE[4], text((low + high) / 2)); entry(SCALE[7], by === "time" ? text(high) : `${text(high)} and more`);
+      }
+      let last = null;
+      for (const k of path.x.keys()) {
+        const ink = colour(k), at = this.local(path.x[k], path.y[k]);
+        if (!found.has(ink)) found.set(ink, new Path());
+        const target = found.get(ink);
+        if (k === 0 || breaks.has(k)) target.moveTo(...at);
+        else { if (last !== ink) target.moveTo(...this.local(path.x[k - 1], path.y[k - 1])); target.lineTo(...at); }
+        last = ink;
+      }
+      return found;
+    },
+    drawMarks(c) {
+      c.setTransform(1, 0, 0, 1, 0, 0);
+      c.textAlign = "center"; c.textBaseline = "middle";
+      for (const mark of this.data.marks) {
+        if (!this.shown.has(mark.status)) continue;
+        c.font = `${(mark.status === "relocalised" ? 20 : 12) * this.ratio}px system-ui, sans-serif`;
+        c.fillStyle = this.ink(mark.status === "rejected" ? "vermillion" : "orange");
+        for (const k of mark.t.keys()) c.fillText(MARKS[mark.status], ...this.pixels(...this.local(mark.x[k], mark.y[k])));
+      }
+      const path = this.data.trajectory, n = path.x.length, end = (k, name, colour) => {
+        const [px, py] = this.pixels(...this.local(path.x[k], path.y[k])), r = 6 * this.ratio;
+        c.beginPath(); c.arc(px, py, r, 0, 2 * Math.PI); c.fillStyle = this.ink(colour); c.fill();
+        c.strokeStyle = this.ink("halo"); c.lineWidth = 2 * this.ratio; c.stroke();
+        c.font = `600 ${13 * this.ratio}px system-ui, sans-serif`; c.textAlign = "left"; c.lineWidth = 3 * this.ratio;
+        c.strokeText(name, px + 1.5 * r, py - 1.5 * r); c.fillStyle = this.ink("ink"); c.fillText(name, px + 1.5 * r, py - 1.5 * r);
+      };
+      if (n && this.shown.has("trajectory")) { end(n - 1, "end", "vermillion"); end(0, "start", "green"); }
+    },
+    drawScale() {
+      const rough = 110 * this.ratio / this.scale, power = 10 ** Math.floor(Math.log10(rough));
+      const metres = [5, 2, 1].map((step) => step * power).find((step) => step <= rough * 1.000001) || power;
+      this.$scale.firstChild.style.width = `${metres * this.scale / this.ratio}px`;
+      this.$scale.lastChild.textContent = metres >= 1000 ? `${metres / 1000} km` : metres >= 1 ? `${metres} m` : `${Number((100 * metres).toPrecision(3))} cm`;
+    },
+    drawArrow(c, px) {
+      const [[x, y], [tx, ty]] = this.arrow, length = Math.hypot(tx - x, ty - y), head = Math.min(14 * px, length / 2);
+      c.save();
+      c.translate(x, y); c.rotate(Math.atan2(ty - y, tx - x));
+      c.strokeStyle = c.fillStyle = this.ink("robot"); c.lineWidth = 3 * px;
+      c.beginPath(); c.arc(0, 0, 5 * px, 0, 2 * Math.PI); c.fill();
+      c.beginPath(); c.moveTo(0, 0); c.lineTo(length - head, 0); c.stroke();
+      c.beginPath(); c.moveTo(length, 0); c.lineTo(length - head, head / 2); c.lineTo(length - head, -head / 2); c.closePath(); c.fill();
+      c.restore();
+    },
+  };
+  globalThis.ResultLayers = { MARKS, Path, make, methods };
+})();

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from hsloc.model import OccupancyGrid
     from hsloc.report.charts import Chart
     from hsloc.report.data import Errors, ReportData, ReportParts, Scans
+    from hsloc.slam.pose_graph import PoseGraph
     from hsloc.slam.result import MappingResult
 
     Floats = NDArray[np.float64]
@@ -80,7 +81,7 @@ def view_of(parts: ReportParts, data: ReportData | None = None) -> ReportView:
         "scans": _scans(parts, data.start_ns),
         "marks": [] if scans is None else _marks(scans),
         "loops": loops,
-        "graph": None if parts.mapping is None else _graph(parts.mapping),
+        "graph": None if parts.mapping is None else graph_view(parts.mapping.graph),
         "ellipses": _ellipses(parts, data.start_ns),
         "events": _events(parts, data, loops),
         "status": [] if scans is None else _status_rows(scans),
@@ -217,9 +218,9 @@ def _loops(mapping: MappingResult, start_ns: int) -> dict[str, Any]:
     }
 
 
-def _graph(mapping: MappingResult) -> dict[str, Any] | None:
-    """Keyscans and the edges between them; of many edges the longest, which say most, and how many there are."""
-    poses, pairs = mapping.graph.poses, mapping.graph.edges.pairs
+def graph_view(graph: PoseGraph) -> dict[str, Any] | None:
+    """Nodes and the edges between them; of many edges the longest, which say most, and how many there are."""
+    poses, pairs = graph.poses, graph.edges.pairs
     if not len(pairs):
         return None
     length = np.hypot(*(poses[pairs[:, 0], :2] - poses[pairs[:, 1], :2]).T)

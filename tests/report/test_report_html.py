@@ -23,7 +23,8 @@ from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.report.charts import run_charts
 from hsloc.report.data import Provenance, ReportParts
 from hsloc.report.html import write_report_html
-from hsloc.report.view import MOST_MARKS, MOST_POSES, runs, view_of
+from hsloc.report.view import MOST_EDGES, MOST_MARKS, MOST_POSES, graph_view, runs, view_of
+from hsloc.slam.pose_graph import Edges, PoseGraph
 from hsloc.warnings import RunWarning
 
 if TYPE_CHECKING:
@@ -255,6 +256,18 @@ def test_a_view_is_drawn_once_and_stays_as_it_is(run: dict[str, Any], tmp_path: 
 def test_where_it_cannot_be_written(run: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot be written"):
         write_report_html(tmp_path / "no" / "report.html", ReportParts(title="a", trajectory=run["trajectory"]))
+
+
+def test_of_many_edges_the_longest_are_drawn() -> None:
+    n = MOST_EDGES + 3
+    poses = np.column_stack((np.arange(n) ** 1.01, np.zeros(n), np.zeros(n)))
+    chain = np.stack((np.arange(n - 1), np.arange(1, n)), axis=1)
+    edges = Edges(chain, np.zeros((n - 1, 3)), np.zeros((n - 1, 3, 3)), np.zeros(n - 1))
+    found = graph_view(PoseGraph(np.arange(n), poses, edges))
+    assert found is not None
+    assert (len(found["edges"]), found["total"], found["x"][0]) == (MOST_EDGES, n - 1, 2.014)  # the first two are gone
+    assert found["edges"][0] == [0, 1]
+    assert graph_view(PoseGraph(np.arange(n), poses, Edges.none())) is None
 
 
 def test_runs_and_logarithms_by_hand(run: Any) -> None:

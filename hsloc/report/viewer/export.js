@@ -17,7 +17,7 @@
     canvas.toBlob((blob) => save(view, blob, "png"));
   }
 
-  const NAMESPACE = "http://www.w3.org/2000/svg";
+  const NAMESPACE = new DOMParser().parseFromString("<svg></svg>", "text/html").querySelector("svg").namespaceURI;
   const node = (name, attributes, ...children) => {
     const made = document.createElementNS(NAMESPACE, name);
     for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, String(value));
@@ -60,7 +60,7 @@
     if (data.scans && on("scan")) dots(view, view.scanAt(view.time), clouds);
     for (const [ink, parts] of clouds) stroke(parts.join(""), ink, 1.6);
     for (const [path, ink, pixels, dash] of view.strokes()) stroke(String(path), ink, pixels, dash);
-    const page = node("svg", { xmlns: NAMESPACE, viewBox: `0 0 ${width} ${height}`, width: width / ratio, height: height / ratio, "font-family": "system-ui, sans-serif" },
+    const page = node("svg", { viewBox: `0 0 ${width} ${height}`, width: width / ratio, height: height / ratio, "font-family": "system-ui, sans-serif" },
       node("title", {}, data.title), node("rect", { width, height, fill: view.ink("ground") }), world);
     const text = (words, x, y, ink, size, anchor = "middle") => page.append(node("text", { x: fixed(x), y: fixed(y), fill: ink, "font-size": size * ratio,
       "text-anchor": anchor, "dominant-baseline": "central", "paint-order": "stroke", stroke: view.ink("halo"), "stroke-width": 2 * ratio }, words));

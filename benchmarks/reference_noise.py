@@ -1,0 +1,77 @@
+"""Noise of a reference, from sample to sample: no estimate can have a smaller error against it.
+
+    python benchmarks/reference_noise.py results/run [--t-offset S]
+
+`results/run` is a folder with `odometry.tum` and `reference.tum`. Over a second odometry errs by millimetres:
+it is fitted to the reference in short windows, without the sample in their middle, and what that sample is off is
+the reference's noise, and a little of the odometry's. `--t-offset` is added to the reference's stamps; without it the
+offset is searched for at which they agree best.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.trajectory_io.reader import read_trajectory
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    F64 = NDArray[np.float64]
+
+OFFSETS_S = np.arange(-0.3, 0.305, 0.01)
+
+
+def fitted(source: F64, target: F64, point: F64) -> F64:
+    """A point (2,) moved as `source` (n, 2) fits `target` (n, 2) best: rotation and translation, least squares."""
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    angle = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
+    c, s = np.cos(angle), np.sin(angle)
+    moved: F64 = np.array(((c, -s), (s, c))) @ (point - source.mean(axis=0)) + target.mean(axis=0)
+    return moved
+
+
+def residuals(odometry: F64, reference: F64, half: int) -> F64:
+    """Distances (m) of the samples in the middle of windows of `2 half + 1` samples."""
+    found = []
+    for k in range(half, len(reference) - half):
+        others = np.r_[k - half : k, k + 1 : k + half + 1]
+        found.append(fitted(odometry[others], reference[others], odometry[k]) - reference[k])
+    return np.hypot(*np.array(found).T)
+
+
+def main() -> None:
+    """Print the noise in windows of several lengths."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("results", type=Path)
+    parser.add_argument("--t-offset", type=float)
+    arguments = parser.parse_args()
+    odometry, reference = (
+        read_trajectory(arguments.results / f"{name}.tum").trajectory for name in ("odometry", "reference")
+    )
+    t, t_reference = odometry.stamps_ns / 1e9, reference.stamps_ns / 1e9
+
+    def sampled(offset_s: float) -> tuple[F64, F64]:
+        at = t_reference + offset_s
+        inside = (at >= t[0]) & (at <= t[-1])
+        both = [np.interp(at[inside], t, odometry.poses[:, k]) for k in (0, 1)]
+        return np.column_stack(both), reference.poses[inside, :2]
+
+    offset = arguments.t_offset
+    if offset is None:
+        offset = min(OFFSETS_S.tolist(), key=lambda each: float(np.mean(residuals(*sampled(each), 16) ** 2)))
+    print(f"offset {offset:+.2f} s, {len(reference)} samples, one in {np.median(np.diff(t_reference)):.3f} s")
+    for half in (4, 8, 16):
+        apart = residuals(*sampled(offset), half)
+        rms = float(np.sqrt(np.mean(apart**2)))
+        # Of n samples that are as noisy the fit of three numbers leaves a noise of its own.
+        noise = rms / np.sqrt(1.0 + 1.5 / (2 * half))
+        print(f"windows of {2 * half + 1:>2} samples: off by {1000 * rms:.1f} mm rms, noise {1000 * noise:.1f} mm")
+
+
+if __name__ == "__main__":
+    main()

@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from hsloc.errors import ConfigError, no_such
+from hsloc.errors import ConfigError
 from hsloc.localisation.localiser import LocaliserParameters
 from hsloc.localisation.place_check import PlaceCheckParameters
 from hsloc.matching.exact import Exact
@@ -22,6 +22,7 @@ from hsloc.options import MAPPERS, MATCHER_ALIASES, MATCHERS, PRESETS
 from hsloc.parameters import LARGEST, NonNegative, OneOf, Parameters, Positive, check, hints, plain
 from hsloc.slam.parameters import GraphMapperParameters
 from hsloc.slam.point_mapper import PointMapperParameters
+from hsloc.yaml_table import load_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -272,24 +273,12 @@ def load(path: Path, base: Config | None = None, warnings: list[str] | None = No
 
 def read_values(path: Path, warnings: list[str] | None = None) -> dict[str, Any]:
     """Keys and values of a YAML or ROS 2 parameter file, as `load` takes them, not yet checked."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    try:
-        values = YAML(typ="safe", pure=True).load(path)
-    except FileNotFoundError as error:
-        raise ConfigError(no_such(path)) from error
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
+    values = load_table(path, "configuration", may_be_empty=True)
     if is_ros_parameters(values):
         values, ignored = from_ros_parameters(values)
         if warnings is not None:
             warnings += [f"{path}: {text}" for text in ignored]
-    if values is not None and not isinstance(values, dict):
-        raise ConfigError(f"{path}: is {values!r:.80}; it must be a table of keys and values")
-    return values or {}
+    return values
 
 
 _ROS = "ros__parameters"

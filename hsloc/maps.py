@@ -6,7 +6,6 @@ import os
 import warnings
 from contextlib import suppress
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +15,7 @@ from hsloc.errors import MapError, OutputError
 from hsloc.model import OccupancyGrid, Pose2
 from hsloc.model.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from hsloc.warnings import RunWarning, WarningCode
-from hsloc.yaml_table import load_table
+from hsloc.yaml_table import is_number, load_table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -97,7 +96,7 @@ def _value(path: Path, values: dict[str, Any], key: str) -> Any:
 
 def _number(path: Path, values: dict[str, Any], key: str) -> float:
     value = _value(path, values, key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not isfinite(value):
+    if not is_number(value):
         raise MapError(f"{path}: {key} must be a number, not {value!r}")
     return float(value)
 
@@ -105,9 +104,7 @@ def _number(path: Path, values: dict[str, Any], key: str) -> float:
 def _origin(path: Path, values: dict[str, Any]) -> Pose2:
     value = _value(path, values, "origin")
     numbers = value if isinstance(value, list) else []
-    if len(numbers) != 3 or not all(
-        isinstance(n, (int, float)) and not isinstance(n, bool) and isfinite(n) for n in numbers
-    ):
+    if len(numbers) != 3 or not all(map(is_number, numbers)):
         raise MapError(f"{path}: origin must be [x, y, yaw] in metres and radians, not {value!r}")
     return Pose2(*(float(number) for number in numbers))
 

@@ -12,13 +12,12 @@ Metres, radians and seconds; `time_offset` is added to the stamps of the topic. 
 
 from __future__ import annotations
 
-from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import ConfigError
 from hsloc.model import Pose2, wrap_angle
 from hsloc.model.calibration import Calibration, LidarCalibration, OdometryCorrection
-from hsloc.yaml_table import load_table
+from hsloc.yaml_table import is_number, load_table
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -57,7 +56,6 @@ def _numbers(path: Path, where: str, values: Any, limits: dict[str, tuple[float,
         if name not in limits:
             raise ConfigError(f"{path}: {where}: unknown key {name!r}; they are {', '.join(limits)}")
         low, high = limits[name]
-        is_number = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
-        if not is_number or not low <= value <= high:
+        if not is_number(value) or not low <= value <= high:
             raise ConfigError(f"{path}: {where}: {name} is {value!r}; it must be a number from {low:g} to {high:g}")
     return {name: float(value) for name, value in values.items()}

@@ -178,6 +178,7 @@ def test_a_calibration_is_applied_when_a_log_is_read(tmp_path: Path) -> None:
         ("odometry: {scle: 1}\n", "unknown key 'scle'"),
         ("odometry: 3\n", "must be a table"),
         ("lidars: [1]\n", "must be a table of topics"),
+        (f"odometry: {{scale: {10**400}}}\n", "from 0.5 to 2"),
         ("lidars: {/scan: {x: 1}}\n", "x, y and yaw together"),
         ("a: &a 1\nb: *a\n", "alias"),
         ("- 1\n", "is not a calibration"),

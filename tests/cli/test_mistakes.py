@@ -83,7 +83,7 @@ def test_a_name_that_is_no_text_is_read_and_reported(here: Path, capsys: pytest.
         ([OFFICE, "--map", "nowhere.yaml"], "nowhere.yaml"),
         ([OFFICE, "--scan-topic", "/lidar"], "/lidar"),
         ([OFFICE, "--odom-topic", "/wheels"], "/wheels"),
-        ([OFFICE, "--config", "nowhere.yaml"], "nowhere.yaml: no such file; check the path"),
+        ([OFFICE, "--config", "nowhere.yaml"], "nowhere.yaml: no such configuration; check the path"),
         ([OFFICE, "--start", "5000"], "no scan between --start and --end"),
     ],
 )
@@ -150,7 +150,10 @@ def test_localising_without_a_map_asks_for_one(here: Path, capsys: pytest.Captur
         ("hide: {budget: -1}\n", "budget is -1"),
         ("matcher: magic\n", "matcher is 'magic'"),
         ("hide: [1, 2]\n", "config.hide is [1, 2]"),
-        ("{unclosed\n", "not valid YAML"),
+        ("{unclosed\n", "is not YAML"),
+        ("- 1\n", "holds no keys"),
+        ("a: &a [1, 1]\nb: [*a, *a]\n", "alias"),
+        ("#" * 70_000, "more than 64 kB"),
         ("likelihood_field: {sigma: .nan}\n", "sigma is nan"),
     ],
 )

@@ -201,7 +201,7 @@ def test_the_command_varies_what_it_is_told_to(tmp_path: Path, capsys: pytest.Ca
         (["--vary", "hide.budgets=1"], 1, "there is no parameter hide.budgets; did you mean hide.budget?"),
         (["--vary", "hide.budget=many"], 1, "must be of type int"),
         (["--vary", "hide.budget"], 1, "is not KEY=V1,V2"),
-        (["--config", "nowhere.yaml"], 1, "nowhere.yaml: cannot be read"),
+        (["--config", "nowhere.yaml"], 1, "nowhere.yaml: no such configuration"),
     ],
 )
 def test_mistakes_are_one_line(

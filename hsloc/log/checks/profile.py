@@ -16,12 +16,12 @@ Rates in Hz as [least, most], gaps, offset and duration in seconds.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import inf, isfinite
+from math import inf
 from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import ConfigError
 from hsloc.log.messages.definitions import long_name
-from hsloc.yaml_table import load_table
+from hsloc.yaml_table import is_number, load_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -165,7 +165,7 @@ def _known(path: Path, where: str, values: dict[str, Any], keys: tuple[str, ...]
 def _number(path: Path, where: str, value: Any) -> float | None:
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value) or value < 0.0:
+    if not is_number(value) or value < 0.0:
         raise ConfigError(f"{path}: {where} is {value!r}; it must be a number of 0 or more")
     return float(value)
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from hsloc.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from hsloc.log.calibration_file import read_calibration
     from hsloc.log.checks.checker import CheckReport, check_log
     from hsloc.log.checks.findings import Finding, Severity
     from hsloc.log.checks.profile import Profile, read_profile, violations
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from hsloc.log.convert import Conversion, convert_log
     from hsloc.log.messages.decode import LinkMessage
     from hsloc.log.reader import Log, is_log, open_log
+    from hsloc.log.session.extrinsics import read_calibration
     from hsloc.log.session.topic_selection import TF, TF_NAMES
     from hsloc.log.session.transform_topics import is_static_topic
     from hsloc.log.summary import LaserSummary, LogSummary, Losses, ReadOptions
@@ -56,7 +56,6 @@ __all__ = [
 ]
 
 _MODULES = {
-    "calibration_file": ("read_calibration",),
     "checks.checker": ("CheckReport", "check_log"),
     "checks.findings": ("Finding", "Severity"),
     "checks.profile": ("Profile", "read_profile", "violations"),
@@ -64,6 +63,7 @@ _MODULES = {
     "convert": ("Conversion", "convert_log"),
     "messages.decode": ("LinkMessage",),
     "reader": ("Log", "is_log", "open_log"),
+    "session.extrinsics": ("read_calibration",),
     "session.topic_selection": ("TF", "TF_NAMES"),
     "session.transform_topics": ("is_static_topic",),
     "summary": ("LaserSummary", "LogSummary", "Losses", "ReadOptions"),

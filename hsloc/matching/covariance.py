@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.kernels.beams import wall_information, wall_normals, wall_rows
 from hsloc.kernels.fitness import point_scores
-from hsloc.kernels.wall_information import wall_information, wall_normals, wall_rows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

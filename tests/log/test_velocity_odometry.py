@@ -13,10 +13,8 @@ from mcap.records import Channel, Schema
 
 from hsloc.errors import ConfigError, TopicError
 from hsloc.log import LogWriter, ReadOptions, convert_log, open_log
-from hsloc.log.messages import definitions, velocities
-from hsloc.log.messages.imu import ImuMessage, ImuMotion
-from hsloc.log.messages.joint_states import wheels_of
-from hsloc.log.messages.velocities import VelocityMessage
+from hsloc.log.messages import definitions, odometry_kinds
+from hsloc.log.messages.odometry_kinds import ImuMessage, ImuMotion, VelocityMessage, wheels_of
 from hsloc.log.session.event_builders import MotionFeed
 from hsloc.log.session.ordering import KIND_ODOMETRY, TopicClock
 from hsloc.log.summary import Losses
@@ -103,7 +101,7 @@ def assert_circle(path: Path, options: ReadOptions) -> None:
 
 
 @pytest.mark.parametrize("text", [True, False])
-@pytest.mark.parametrize("typename", [kind.typename for kind in velocities.KINDS])
+@pytest.mark.parametrize("typename", [kind.typename for kind in odometry_kinds.VELOCITY_KINDS])
 def test_velocities_are_summed_up(tmp_path: Path, typename: str, text: bool) -> None:
     path = write_log(tmp_path / "run.mcap", "/velocity", typename, text=text)
     assert_circle(path, ReadOptions(odom_topic="/velocity"))
@@ -118,9 +116,9 @@ def test_velocities_are_summed_up(tmp_path: Path, typename: str, text: bool) -> 
 )
 def test_time_that_runs_backwards_is_counted_once(seconds: tuple[float, ...], metres: float) -> None:
     losses = Losses()
-    kind = velocities.KINDS[0]
+    kind = odometry_kinds.VELOCITY_KINDS[0]
     clock = TopicClock("/velocity", KIND_ODOMETRY, losses)
-    feed = MotionFeed(clock, losses, kind, velocities.VelocityMotion())
+    feed = MotionFeed(clock, losses, kind, odometry_kinds.VelocityMotion())
     poses = []
     for second in seconds:
         stamp = round(second * SECOND)

@@ -1,7 +1,7 @@
 """A kind of odometry: one type of message, how it is read, when it is chosen, and what it says of the motion.
 
-To read another type as odometry, write a module with an `OdometryKind` beside this one and add it to the table of
-`odometry_kinds`; its fields belong into `definitions.FIELDS`. Topic selection, warnings, decoders and events follow
+To read another type as odometry, write an `OdometryKind` in `odometry_kinds` and add it to the table there; its fields
+belong into `definitions.FIELDS`. Topic selection, warnings, decoders and events follow
 from the table.
 """
 

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.kernels.beams import wall_normals
 from hsloc.kernels.fitness import point_scores
-from hsloc.kernels.wall_information import wall_normals
 from hsloc.matching.covariance import MAX_GAP, POINT_SIGMA
 from hsloc.matching.local_refinement import refine
 from hsloc.matching.window import Window

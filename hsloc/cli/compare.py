@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.cli.output import print_lines
     from hsloc.errors import OutputError
     from hsloc.evaluation.metrics import format_json
-    from hsloc.report.html import comparison_rows, read_runs, write_comparison
+    from hsloc.report.html import comparison_rows, over_seeds, read_runs, write_comparison
     from hsloc.text_table import table
 
     out: Path | None = arguments.out
@@ -42,6 +42,9 @@ def run(arguments: argparse.Namespace) -> int:
         print(format_json({run.name: list(run.figures.values()) for run in runs}), end="")
     else:
         print_lines(table(("", *(run.name for run in runs)), comparison_rows(runs)))
+        if (seeds := over_seeds(runs)) is not None:
+            print_lines(("", "over seeds: mean ± standard deviation [95 % interval of the mean, by bootstrap]"))
+            print_lines(table(("", *seeds["names"]), seeds["rows"]))
     if out is not None:
         write_comparison(out, runs)
         if not arguments.json:

@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING
 from hsloc.errors import EvaluationError
 
 if TYPE_CHECKING:
-    from hsloc.evaluation.metrics import Evaluation
+    from collections.abc import Mapping
+
+    from hsloc.evaluation.metrics import Comparison, Evaluation
     from hsloc.evaluation.relations import Relations, RelationsResult
     from hsloc.evaluation.rpe import Delta
     from hsloc.evaluation.statistics import Statistics
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
 HELP = "compare trajectories with a reference"
 EXAMPLES = """
-  hsloc eval reference.tum trajectory.tum --alignment se2
+  hsloc eval reference.tum trajectory.tum --alignment se2 --save-plot error.png
   hsloc eval results/a results/b --json
   hsloc eval trajectory.tum --relations intel.relations --no-reference
 """
@@ -68,6 +70,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--save-results", type=Path, metavar="DIR", help="Write result files for evo_res there, a zip for each measure."
     )
+    parser.add_argument("--plot", "-p", action="store_true", help="Show paths and errors over time in a window.")
+    parser.add_argument(
+        "--save-plot", type=Path, metavar="FILE", help="Write the same picture: a name that ends in .png, .svg or .pdf."
+    )
     parser.add_argument("--json", action="store_true", help="Print JSON.")
 
 
@@ -105,11 +111,16 @@ def run(arguments: argparse.Namespace) -> int:
     }
     for warning in dict.fromkeys(warnings):
         print(f"hsloc: warning: {warning}", file=sys.stderr)
-    if arguments.save_results is not None:
+    wanted = [name for name in ("save_results", "plot", "save_plot") if getattr(arguments, name)]
+    if wanted:
         if alone:
-            print("hsloc eval: error: --save-results needs a reference to take errors from", file=sys.stderr)
+            option = f"--{wanted[0].replace('_', '-')}"
+            print(f"hsloc eval: error: {option} needs a reference to take errors from", file=sys.stderr)
             return 2
-        _save(arguments, list(results), None if own else files[0], delta)
+        comparisons = {path: _compared(arguments, path, None if own else files[0]) for path in results}
+        _draw(arguments, comparisons)
+        if arguments.save_results is not None:
+            _save(arguments, comparisons, None if own else files[0], delta)
     if arguments.json:
         document = {
             "reference": None if alone or own else files[0],
@@ -165,31 +176,48 @@ def _evaluate(
         raise EvaluationError(f"{path}: {error}") from error
 
 
-def _save(arguments: argparse.Namespace, paths: list[str], reference: str | None, delta: Delta) -> None:
+def _compared(arguments: argparse.Namespace, path: str, reference: str | None) -> Comparison:
+    """The poses of an estimate, paired with the reference; None: with that in its own folder of results."""
+    from hsloc.evaluation.metrics import compare
+    from hsloc.replay.references import read_reference
+
+    return compare(
+        read_reference(_inside(path, "trajectory.tum")),
+        read_reference(_inside(path, "reference.tum") if reference is None else reference),
+        alignment=arguments.alignment,
+        max_difference_s=arguments.t_max_diff,
+        association=arguments.association,
+        offset_s=arguments.t_offset,
+    )
+
+
+def _draw(arguments: argparse.Namespace, comparisons: Mapping[str, Comparison]) -> None:
+    """Save the plot, and show it, where that is asked for."""
+    from hsloc.report.eval_plot import save_plot, show_plot
+
+    if arguments.save_plot is not None:
+        save_plot(arguments.save_plot, comparisons)
+    if arguments.plot:
+        show_plot(comparisons)
+
+
+def _save(
+    arguments: argparse.Namespace, comparisons: Mapping[str, Comparison], reference: str | None, delta: Delta
+) -> None:
     """Write the result files of each estimate, named after it, into the folder of --save-results."""
     from hsloc.errors import OutputError
     from hsloc.evaluation.alignment import parse_alignment
     from hsloc.evaluation.evo_results import write_evo_results
-    from hsloc.evaluation.metrics import compare
-    from hsloc.replay.references import read_reference
 
     folder: Path = arguments.save_results
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be made ({error.strerror or error}); choose another folder") from error
-    short = [Path(path).resolve().with_suffix("").name for path in paths]
+    short = [Path(path).resolve().with_suffix("").name for path in comparisons]
     unique = len(set(short)) == len(short)
-    for path, name in zip(paths, short, strict=True):
+    for (path, comparison), name in zip(comparisons.items(), short, strict=True):
         truth = _inside(path, "reference.tum") if reference is None else reference
-        comparison = compare(
-            read_reference(_inside(path, "trajectory.tum")),
-            read_reference(truth),
-            alignment=arguments.alignment,
-            max_difference_s=arguments.t_max_diff,
-            association=arguments.association,
-            offset_s=arguments.t_offset,
-        )
         whole = "_".join(part for part in Path(path).with_suffix("").parts if part not in ("/", "..", "."))
         write_evo_results(
             folder, name if unique else whole, comparison, parse_alignment(arguments.alignment), delta, (truth, path)

@@ -78,6 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Sweep; 1 where a run failed, else 4 where one does not keep a limit, else 3 where part of an input was lost."""
     from hsloc.cli.main import EXIT_USAGE
     from hsloc.errors import OutputError
+    from hsloc.report.sweep_page import sweep_page
     from hsloc.sweep.parallel import merge, write_shard
     from hsloc.sweep.table import as_csv, as_json, as_markdown, as_parquet, as_text, rows
 
@@ -101,6 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
             (folder / "sweep.csv").write_text(as_csv(table), encoding="utf-8")
             (folder / "sweep.json").write_text(as_json(table), encoding="utf-8")
             (folder / "sweep.md").write_text(as_markdown(table), encoding="utf-8")
+            (folder / "sweep.html").write_text(sweep_page(table), encoding="utf-8")
             if (content := as_parquet(table)) is not None:
                 (folder / "sweep.parquet").write_bytes(content)
     except OSError as error:

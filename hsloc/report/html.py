@@ -18,6 +18,7 @@ from hsloc.atomic_write import write_text_atomically
 from hsloc.errors import EvaluationError
 from hsloc.evaluation.metrics import format_json
 from hsloc.report.data import prepare, reason_counts
+from hsloc.report.seeds import seed_groups, seed_rows
 from hsloc.report.summary import ResultSummary
 from hsloc.report.table import DASH, STATUS_WORDS, error_statistics
 from hsloc.report.view import data_url, view_of
@@ -77,14 +78,15 @@ def write_report_html(path: str | Path, parts: ReportParts, view: ReportView | N
 def write_page(path: Path, name: str, fragments: Mapping[str, str], data: Mapping[str, object], *more: str) -> None:
     """Write templates/<name>.html, filled, with `data` and the scripts that draw it, as one file that loads nothing."""
     scripts = [*(f"viewer/{each}" for each in (*VIEWER_SCRIPTS, *more)), f"templates/{name}.js"]
-    page = {
-        "title": fragments["title"],
-        "style": _resource("viewer/view.css") + _resource("templates/report.css"),
-        "body": _fill(_resource(f"templates/{name}.html"), fragments),
-        "data": _script_json(data),
-        "script": "".join(map(_resource, scripts)),
-    }
-    write_text_atomically(path, _fill(_resource("templates/page.html"), page))
+    body = _fill(_resource(f"templates/{name}.html"), fragments)
+    write_text_atomically(path, page_text(fragments["title"], body, data, "".join(map(_resource, scripts))))
+
+
+def page_text(title: str, body: str, data: Mapping[str, object] | None = None, script: str = "") -> str:
+    """A page in the style of the reports; `title` and `body` are escaped already."""
+    style = _resource("viewer/view.css") + _resource("templates/report.css")
+    page = {"title": title, "style": style, "body": body, "data": _script_json(data or {}), "script": script}
+    return _fill(_resource("templates/page.html"), page)
 
 
 def _head(summary: ResultSummary) -> str:
@@ -297,7 +299,15 @@ def write_comparison(path: Path, runs: Sequence[ComparedRun]) -> None:
     """Write the comparison as one HTML file that loads nothing. Raises OutputError where it cannot be written."""
     shown = [{"name": run.name, "data": _thinned(run.view) if k else run.view} for k, run in enumerate(runs)]
     title = escape(f"Comparison of {', '.join(run.name for run in runs)}")
-    write_page(path, "compare", {"title": title}, {"runs": shown}, "compare.js")
+    write_page(path, "compare", {"title": title}, {"runs": shown, "seeds": over_seeds(runs)}, "compare.js")
+
+
+def over_seeds(runs: Sequence[ComparedRun]) -> dict[str, Any] | None:
+    """Names of groups of runs that differ in their seed alone, and rows of their figures; None without such a group."""
+    groups = seed_groups([(run.name, run.view) for run in runs])
+    if all(len(group.views) < 2 for group in groups):
+        return None
+    return {"names": [group.name for group in groups], "rows": [list(row) for row in seed_rows(groups)]}
 
 
 def _thinned(view: dict[str, Any]) -> dict[str, Any]:

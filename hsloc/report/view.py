@@ -6,7 +6,10 @@ bounded length, however long the run was.
 
 from __future__ import annotations
 
+import hashlib
+import re
 from base64 import b64encode
+from dataclasses import replace
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -25,7 +28,8 @@ if TYPE_CHECKING:
 
     from hsloc.model import OccupancyGrid
     from hsloc.report.charts import Chart
-    from hsloc.report.data import Errors, ReportData, ReportParts, Scans
+    from hsloc.report.data import Errors, Provenance, ReportData, ReportParts, Scans
+    from hsloc.run_metrics import RunMetrics
     from hsloc.slam.pose_graph import PoseGraph
     from hsloc.slam.result import MappingResult
 
@@ -70,6 +74,7 @@ def view_of(parts: ReportParts, data: ReportData | None = None) -> ReportView:
     values = {
         "title": parts.title,
         "summary": None if summary is None else summary.to_json(),
+        "run": None if parts.metrics is None else _run(parts.metrics, parts.provenance),
         "map": frame,
         "extent": [_round(value) for value in (extent.x0, extent.y0, extent.x1, extent.y1)],
         "end": _round(_end(data)),
@@ -88,6 +93,15 @@ def view_of(parts: ReportParts, data: ReportData | None = None) -> ReportView:
         "charts": [_chart(chart) for chart in (*run_charts(data), *convergence_charts(parts.convergence))],
     }
     return ReportView(values, png)
+
+
+def _run(metrics: RunMetrics, provenance: Provenance) -> dict[str, Any]:
+    """The seed of the run, and a hash of all else that decides its result: log, options and configuration."""
+    command = re.sub(r" --seed[= ]\d+", "", provenance.command)
+    config = [line for line in provenance.config.splitlines() if not line.startswith("#")]
+    identity = replace(metrics.run, seed=0)
+    digest = hashlib.sha256("\n".join((repr(identity), command, *config)).encode("utf-8", "surrogateescape"))
+    return {"seed": metrics.run.seed, "group": digest.hexdigest()[:16]}
 
 
 def _end(data: ReportData) -> float:

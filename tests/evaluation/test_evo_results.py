@@ -9,11 +9,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import matplotlib
 import numpy as np
 import pytest
 from evaluation_paths import disturb, make_path
 
 from hsloc.cli.main import main
+from hsloc.report.eval_plot import FORMATS
 from hsloc.trajectory_io.tum import write_tum
 
 if TYPE_CHECKING:
@@ -60,8 +62,17 @@ def test_the_files_hold_what_evo_would_have_saved(
 def test_evo_res_prints_the_same_statistics(
     files: None, evo: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["eval", "reference.tum", "good.tum", "bad.tum", "--save-results", "out"]) == 0
-    table = capsys.readouterr().out.split("APE translation (m)\n")[1].splitlines()
+    plots = [f"errors{ending}" for ending in FORMATS]
+    for name in plots:
+        assert main(["eval", "reference.tum", "good.tum", "bad.tum", "--save-results", "out", "--save-plot", name]) == 0
+    assert Path("errors.png").read_bytes()[:4] == b"\x89PNG"
+    assert "good.tum" in Path("errors.svg").read_text()
+    assert main(["eval", "reference.tum", "good.tum", "--save-plot", "errors.bmp"]) == 1
+    matplotlib.use("agg")  # as where there is no display
+    assert main(["eval", "reference.tum", "good.tum", "--plot"]) == 1
+    printed = capsys.readouterr()
+    assert "use --save-plot" in printed.err
+    table = printed.out.split("APE translation (m)\n")[1].splitlines()
     expected = {row.split()[0]: [float(value) for value in row.split()[1:8]] for row in table[:2]}
     command = [
         str(Path(sys.executable).with_name("evo_res")),
@@ -71,11 +82,11 @@ def test_evo_res_prints_the_same_statistics(
     done = subprocess.run(
         command, capture_output=True, text=True, check=True, env={**os.environ, "HOME": str(evo.home)}
     )
-    printed = re.sub(r"\x1b\[\d*m", "", done.stdout)
-    assert "APE w.r.t. translation part (m)" in printed
-    header = next(line.split() for line in printed.splitlines() if "rmse" in line)
+    text = re.sub(r"\x1b\[\d*m", "", done.stdout)
+    assert "APE w.r.t. translation part (m)" in text
+    header = next(line.split() for line in text.splitlines() if "rmse" in line)
     for name, ours in expected.items():
-        theirs = next(line.split()[1:] for line in printed.splitlines() if line.startswith(name))
+        theirs = next(line.split()[1:] for line in text.splitlines() if line.startswith(name))
         by_name = dict(zip(header, map(float, theirs), strict=True))
         found = [by_name[key] for key in ("rmse", "mean", "median", "std", "min", "max", "sse")]
         assert found == pytest.approx(ours, abs=1e-4)

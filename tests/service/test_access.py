@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 PUBLIC = {("get", "/healthz"), ("get", "/readyz")}
 READ = {
+    ("get", "/v1/compare"),
     ("get", "/v1/files"),
     ("get", "/v1/files/{file_id}"),
     ("get", "/v1/info"),
@@ -100,7 +101,7 @@ class World:
         url = path.replace("{file_id}", file).replace("{job_id}", self.job)
         url = url.replace("{share_id}", self.share)
         url = url.replace("{name}", "run-metrics" if "/schemas/" in path else "trajectory.tum")
-        options: dict[str, Any] = {}
+        options: dict[str, Any] = {"params": {"job": self.job}} if path == "/v1/compare" else {}
         if "/tus" in path:
             headers |= {"Tus-Resumable": "1.0.0", "Upload-Length": "9"}
             if method == "patch":

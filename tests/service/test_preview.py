@@ -77,3 +77,5 @@ def test_a_job_whose_poses_are_all_guesses_says_so(tmp_path: Path) -> None:
     assert [each["code"] for each in summary["warnings"]] == ["scans_without_place"]
     assert summary["metrics"]["verdict"] == "failed"
     assert summary["verdict_reasons"][0]["remedy"]
+    assert summary["run"]["seed"] == 0
+    assert len(summary["run"]["group"]) == 16

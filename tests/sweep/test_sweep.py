@@ -184,6 +184,9 @@ def test_the_command_varies_what_it_is_told_to(tmp_path: Path, capsys: pytest.Ca
     assert names == [f"office-hide.budget={n}-seed5" for n in (100, 200)]
     assert "budget: 200" in (tmp_path / names[1] / "config.yaml").read_text()
     assert json.loads((tmp_path / "sweep.json").read_text()) == json.loads(out)
+    page = (tmp_path / "sweep.html").read_text()
+    assert all(f'href="{name.replace("=", "%3D")}/report.html"' in page for name in names)
+    assert page.count('class="verdict ') == 2
     code, out, _ = command(capsys, *arguments[:-1], "--csv")  # type: ignore[arg-type]
     assert (code, out) == (0, (tmp_path / "sweep.csv").read_text())
     assert {row["state"] for row in csv.DictReader(io.StringIO(out))} == {"skipped"}

@@ -13,13 +13,14 @@
 
   class ResultComparison {
     // `runs` are {name, href, data, image}: the value of hsloc/report/view.py, and the picture of its map.
-    constructor(root, runs) {
+    // `seeds` are {names, rows}, or null: see over_seeds in hsloc/report/html.py.
+    constructor(root, runs, seeds = null) {
       this.root = root;
       const view = make("div"), charts = make("div"), first = runs[0];
       const built = runs.some((run) => run.data.summary?.mode === "slam");
       view.setAttribute("role", "region"); view.setAttribute("aria-label", "map with all paths");
       charts.setAttribute("role", "region"); charts.setAttribute("aria-label", "curves over time");
-      root.replaceChildren(this.table(runs), make("h2", `Paths on the map of ${first.name}`));
+      root.replaceChildren(this.table(runs), ...(seeds ? this.overSeeds(seeds) : []), make("h2", `Paths on the map of ${first.name}`));
       if (built) root.append(make("p", "A map that a run built has a frame of its own, which begins at the first pose of the log.", "rv-help"));
       root.append(view, charts);
       const data = { ...first.data, end: Math.max(...runs.map((run) => run.data.end)), others: [], charts: [], status: [] };
@@ -61,6 +62,19 @@
       }
       box.append(table);
       return box;
+    }
+
+    overSeeds({ names, rows }) {
+      const box = make("div", "", "scroll"), table = make("table", "", "rv-table"), head = table.createTHead().insertRow(), body = table.createTBody();
+      box.tabIndex = 0; box.setAttribute("role", "region"); box.setAttribute("aria-label", "figures over seeds");
+      head.append(make("td"), ...names.map((name) => { const cell = make("th", name); cell.scope = "col"; return cell; }));
+      for (const [name, ...cells] of rows) {
+        const row = body.insertRow(), label = make("th", name);
+        label.scope = "row";
+        row.append(label, ...cells.map((text) => make("td", text)));
+      }
+      box.append(table);
+      return [make("h2", "Over seeds"), make("p", "Mean ± standard deviation of runs that differ in their seed alone, and the 95 % interval of the mean (bootstrap).", "rv-help"), box];
     }
 
     end() { this.view.end(); this.root.replaceChildren(); }

@@ -108,7 +108,7 @@ def execute(
     say(f"verdict: {written.metrics.verdict}")
     limits = exceeded_limits(request, written.metrics)
     found = {"outcome": "below_threshold" if limits else "ok", "limits": [line[:500] for line in limits]}
-    return found | summarise(written.metrics, written.timings)
+    return found | summarise(written.metrics, written.timings) | {"run": written.view.values["run"]}
 
 
 def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
@@ -123,7 +123,9 @@ def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
         "headline": summary.headline,
         "verdict_text": summary.verdict_text,
         "key_figures": [row.label for row in summary.key_figures],
-        "figures": [{"name": row.label, "values": list(row.values)} for row in summary.figures],
+        "figures": [
+            {"name": row.label, "values": list(row.values), "numbers": list(row.numbers)} for row in summary.figures
+        ],
         "verdict_reasons": [
             {**_shortened(to_json(each)), "line": reason_text(each)[:500]} for each in metrics.verdict_reasons
         ][:_MOST_LINES],

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import functools
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Query
 from fastapi.responses import Response
 from prometheus_client import generate_latest
+from pydantic import BaseModel, Field
 from sqlalchemy import func, select, text
 
 from hsloc.options import describe
+from hsloc.report.html import ComparedRun, over_seeds
 from hsloc.version import __version__
 from hsloc_service import config_schema as job_options
 from hsloc_service.db.tables import DeliveryRow, JobRow
 from hsloc_service.errors import ServiceError, not_found
 from hsloc_service.http import metrics
 from hsloc_service.http.context import Admin, Context, Ctx, Reader, problems
-from hsloc_service.http.schemas import Health, Info, LabelList, Options, Problem, SecretView, WorkerList
+from hsloc_service.http.schemas import UUID_PATTERN, Health, Info, LabelList, Options, Problem, SecretView, WorkerList
 from hsloc_service.http.views import worker_view
 from hsloc_service.jobs.workers import workers
 from hsloc_service.webhooks import secret_of
@@ -27,6 +29,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 router = APIRouter(tags=["system"])
+MAX_COMPARED = 100
+
+
+class SeedTable(BaseModel):
+    """Groups of jobs that differ in their seed alone; each row is the name of a figure, then a cell for each group."""
+
+    names: list[str]
+    rows: list[list[str]]
+
+
 _TEXT = {"description": "the metrics", "content": {"text/plain": {"schema": {"type": "string"}}}}
 
 
@@ -93,6 +105,22 @@ def options(who: Reader) -> Options:
 def labels(ctx: Ctx, who: Reader) -> LabelList:
     """The labels of all your jobs."""
     return LabelList(labels=list(ctx.jobs.labels(who)))
+
+
+@router.get("/v1/compare", responses=problems(404))
+def compare(
+    ctx: Ctx,
+    who: Reader,
+    job: Annotated[list[Annotated[str, Field(pattern=UUID_PATTERN)]], Query(max_length=MAX_COMPARED)],
+) -> SeedTable:
+    """Figures over jobs that differ in their seed alone: mean, standard deviation, 95 % interval of the mean."""
+    runs = []
+    for row in (ctx.jobs.get(who, ident) for ident in dict.fromkeys(job)):
+        found = row.summary or {}
+        summary = {"verdict": found.get("metrics", {}).get("verdict", row.state), "figures": found.get("figures", [])}
+        runs.append(ComparedRun(row.title or row.log_name, {"run": found.get("run"), "summary": summary}))
+    table = over_seeds(runs)
+    return SeedTable(**table) if table is not None else SeedTable(names=[], rows=[])
 
 
 @router.get("/v1/schemas", responses=problems())

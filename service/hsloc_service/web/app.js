@@ -68,7 +68,8 @@ async function compare(ids) {
     if (loaded) runs.push({ name: `${job.title ?? job.log}, seed ${job.request.seed}`, href: `#job=${id}`, ...loaded });
     else notice(`${job.log}: ${job.state === "succeeded" ? "made by an earlier version; run it again to compare it" : "it has no result to compare"}`);
   }
-  if (runs.length) comparison = new globalThis.ResultComparison($("comparison"), runs);
+  const seeds = runs.length > 1 ? await get(`/v1/compare?${new URLSearchParams(ids.slice(0, 12).map((id) => ["job", id]))}`) : null;
+  if (runs.length && location.hash === address) comparison = new globalThis.ResultComparison($("comparison"), runs, seeds?.names.length ? seeds : null);
 }
 
 form.listen((made) => { if (made.length === 1) location.hash = `job=${made[0].id}`; else guarded(jobs.refresh); });

@@ -1,0 +1,120 @@
+"""A figure has one name, value and unit: on the terminal, in metrics.json, reports, page, and comparison."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from html import unescape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from report_parts import view_in
+
+from hsloc.cli.main import main
+from hsloc.cli.output import print_job, summary_lines
+from hsloc.evaluation.metrics import format_json
+from hsloc.model.verdict import Verdict
+from hsloc.report.data import ReportParts
+from hsloc.report.html import comparison_rows, read_runs, write_report_html
+from hsloc.report.seeds import Spread, spread_text
+from hsloc.report.summary import ResultSummary
+from hsloc.run_metrics import RunTimings
+from hsloc_service.execution.worker import summarise
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3, "°": 1.0, "%": 1e-2, "": 1.0}
+
+
+def in_table(text: str) -> dict[str, tuple[str, ...]]:
+    """By name, the cells of the figures in a report."""
+    (table,) = re.findall(r'<table class="figures">(.*?)</table>', text, flags=re.S)
+    rows = re.findall(r'<tr title="[^"]*"><th scope="row">(.*?)</th>(.*?)</tr>', table)
+    return {unescape(name): tuple(map(unescape, re.findall(r"<td[^>]*>(.*?)</td>", cells))) for name, cells in rows}
+
+
+def on_lines(lines: list[str], names: dict[str, Any]) -> dict[str, str]:
+    """By name, what a terminal shows behind it."""
+    found = {}
+    for line in lines:
+        for name in sorted(names, key=len, reverse=True):
+            if line.startswith(f"{name}  "):
+                found[name] = " ".join(line.removeprefix(name).split())
+                break
+    return found
+
+
+def test_the_same_figure_is_the_same_everywhere(
+    run: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    metrics = run["metrics"]
+    timings = RunTimings(seconds={"replay": 1.0}, times_real_time=None, evaluations_per_second=None)
+    figures = {row.label: row for row in ResultSummary.of(metrics).figures}
+    shown = {name: row.values for name, row in figures.items()}
+    assert len(shown) >= 7
+    # metrics.json: where a figure says that its numbers are, they are, and its text is them in its unit
+    written = json.loads(format_json(metrics.to_json()))
+    for row in figures.values():
+        for k, (source, number) in enumerate(zip(row.sources, row.numbers, strict=True)):
+            place: Any = written
+            for key in source.split("/"):
+                place = place[key]
+            assert place == number, source
+            text = row.values[k] if len(row.values) == len(row.sources) else ""
+            parts = re.fullmatch(r"([-\d.]+) ?(mm|cm|m|km|°|%|)(?: of the poses)?", text)
+            if parts and number is not None:
+                last_digit = 10.0 ** -len(parts[1].partition(".")[2])
+                assert float(parts[1]) == pytest.approx(number / UNITS[parts[2]], abs=0.51 * last_digit), row.label
+    # terminal: of a replay, and of a job of the service
+    words = {name: " ".join(" ".join(values).split()) for name, values in shown.items()}
+    assert on_lines(summary_lines(metrics, timings, tmp_path), shown) == words
+    job = summarise(metrics, timings)
+    print_job(job)
+    assert on_lines(capsys.readouterr().out.splitlines(), shown) == words
+    # page: the job's row, and the view that it draws; report.html
+    assert {each["name"]: tuple(each["values"]) for each in job["figures"]} == shown
+    (tmp_path / "a").mkdir()
+    write_report_html(tmp_path / "a" / "report.html", ReportParts(title="office.mcap", **run))
+    text = (tmp_path / "a" / "report.html").read_text()
+    assert in_table(text) == shown
+    view = view_in(text)["summary"]
+    assert {each["name"]: tuple(each["values"]) for each in view["figures"]} == shown
+    assert [each["numbers"] for each in view["figures"]] == [list(row.numbers) for row in figures.values()]
+    # comparison, with itself
+    runs = read_runs([tmp_path / "a", tmp_path / "a"])
+    rows = {name: cells for name, *cells in comparison_rows(runs)}
+    assert {name: rows[name] for name in shown} == {name: [" / ".join(values)] * 2 for name, values in shown.items()}
+    assert rows["verdict"] == [metrics.verdict, view["verdict"]]
+
+
+def test_over_seeds_runs_are_one_column(
+    run: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    metrics, names = run["metrics"], []
+    for seed, verdict in enumerate((Verdict.GOOD, Verdict.CHECK, Verdict.GOOD)):
+        changed = replace(metrics, verdict=verdict, run=replace(metrics.run, seed=seed))
+        names.append(tmp_path / f"office-seed{seed}")
+        names[-1].mkdir()
+        write_report_html(names[-1] / "report.html", ReportParts(title="office.mcap", **{**run, "metrics": changed}))
+    assert main(["compare", *map(str, names), "--out", str(tmp_path / "c.html")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.split("|")[-2].strip() == "office: 3 seeds" for line in lines if line.startswith("|"))
+    (verdicts,) = [line for line in lines if "2 good, 1 check" in line]
+    assert verdicts.startswith("| verdict")
+    (ape,) = [line for line in lines if line.startswith("| APE rmse ") and "±" in line]
+    assert re.search(r"([\d.]+) ± 0\.0+ (c?m) \[\1, \1\] / ([\d.]+) ± 0\.0+° \[\3, \3\]", ape)
+    assert view_in((tmp_path / "c.html").read_text())["seeds"]["names"] == ["office: 3 seeds"]
+
+
+def test_the_interval_of_a_mean_holds_it_as_often_as_it_says() -> None:
+    rng, n, runs = np.random.default_rng(7), 10, 120
+    held = 0
+    for _ in range(runs):
+        spread = Spread.of(rng.lognormal(0.0, 0.3, n).tolist())
+        held += spread.low <= np.exp(0.5 * 0.3**2) <= spread.high
+    assert 0.88 <= held / runs <= 0.99  # 0.95 within three standard deviations of 120 draws
+    assert spread_text(Spread(3, 0.0123, 0.002, 0.0104, 0.0141), "9.9 mm") == "1.23 ± 0.20 cm [1.04, 1.41]"
+    assert spread_text(Spread.of([0.5]), "50.0 %") == "50.0 %"

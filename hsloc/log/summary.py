@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from copy import deepcopy
 from dataclasses import dataclass, field
+from math import nan
 from typing import TYPE_CHECKING
 
 from hsloc.errors import ConfigError
@@ -70,10 +71,7 @@ class ReadOptions:
         """Radius and track of `wheels` [m]. Raises ConfigError."""
         if self.wheels is None:
             return None
-        try:
-            radius, track = (float(part) for part in self.wheels.split(","))
-        except ValueError:
-            radius = track = 0.0
+        radius, track = _pair(self.wheels)
         if not (0.0 < radius < 100.0 and 0.0 < track < 100.0):
             raise ConfigError(f"--wheels {self.wheels}: must be RADIUS,TRACK, both above 0 metres")
         return radius, track
@@ -82,10 +80,7 @@ class ReadOptions:
         """The two heights of `slice` [m]. Raises ConfigError."""
         if self.slice is None:
             return None
-        try:
-            low, high = (float(part) for part in self.slice.split(","))
-        except ValueError:
-            low = high = 0.0
+        low, high = _pair(self.slice)
         if not low < high:
             raise ConfigError(f"--slice {self.slice}: must be LOW,HIGH, two heights above the base in metres")
         return low, high
@@ -111,6 +106,15 @@ class ReadOptions:
             name = topic.strip().lstrip("/")
             found[name] = found.get(name, 0.0) + value
         return found
+
+
+def _pair(text: str) -> tuple[float, float]:
+    """Two numbers with a comma between them; NaN where the text is anything else."""
+    try:
+        first, second = (float(part) for part in text.split(","))
+    except ValueError:
+        return nan, nan
+    return first, second
 
 
 @dataclass(slots=True)

@@ -291,13 +291,9 @@ class LogSession:
         return found
 
     def _candidates(self) -> tuple[str, ...]:
-        poses = [topic for typename in POSE_TYPES[1:] for topic in of_type(self.active, typename)]
+        poses = [topic for topic in of_type(self.active, *POSE_TYPES[1:]) if topic != self.choice.odom]
         truths = [topic for topic in of_type(self.active, definitions.ODOMETRY) if is_truth_name(topic)]
-        return tuple(
-            dict.fromkeys(
-                truths + sorted({*poses} - {self.choice.odom}) + (["tf"] if self.transforms.has_map_to_odometry else [])
-            )
-        )
+        return tuple(dict.fromkeys(truths + poses + (["tf"] if self.transforms.has_map_to_odometry else [])))
 
     def _odometry_topic(self) -> str | None:
         """The topic of the odometry, that of the transforms where these are it."""

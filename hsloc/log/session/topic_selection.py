@@ -47,9 +47,9 @@ def has_name(channel: Channel, name: str) -> bool:
     return channel.topic.lstrip("/") == name.lstrip("/")
 
 
-def of_type(channels: Sequence[Channel], typename: str) -> list[str]:
-    """Topics of a type that can be decoded, sorted."""
-    return sorted({c.topic for c in channels if canonical_type(c.typename) == typename and is_decodable(c)})
+def of_type(channels: Sequence[Channel], *typenames: str) -> list[str]:
+    """Topics of some types that can be decoded, sorted."""
+    return sorted({c.topic for c in channels if canonical_type(c.typename) in typenames and is_decodable(c)})
 
 
 def names_transforms(channels: Sequence[Channel], name: str | None) -> str | None:
@@ -228,7 +228,7 @@ def _not_there(
 
 
 def _truth(where: str, channels: Sequence[Channel], options: ReadOptions) -> str | None:
-    candidates = sorted({topic for typename in POSE_TYPES for topic in of_type(channels, typename)})
+    candidates = of_type(channels, *POSE_TYPES)
     named = options.truth_topic
     if named is None:
         speaking = [topic for topic in candidates if is_truth_name(topic)]

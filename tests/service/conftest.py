@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import signal
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 import postgresql as postgresql_server
@@ -81,6 +82,21 @@ def browser() -> Iterator[Any]:
         browser = playwright.chromium.launch(executable_path=chromium, args=[*_FLAGS, "--disable-component-update"])
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="session")
+def need_accessible() -> Callable[[Any], None]:
+    """Fails with what axe-core finds against WCAG 2.2 AA and good practice on a page as it is now."""
+    source = files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8")
+
+    def check(page: Any) -> None:
+        page.evaluate(source)  # not as a script of the page, whose policy forbids it
+        found = page.evaluate("() => axe.run()")
+        assert len(found["passes"]) > 10
+        bad = [(each["id"], [node["html"][:200] for node in each["nodes"]][:3]) for each in found["violations"]]
+        assert bad == []
+
+    return check
 
 
 @pytest.fixture

@@ -46,7 +46,10 @@ def inked(page: Any, selector: str) -> int:
 
 
 def test_upload_watch_look_download(
-    make_live: Callable[..., Live], open_page: Callable[..., Any], tmp_path: Path
+    make_live: Callable[..., Live],
+    open_page: Callable[..., Any],
+    need_accessible: Callable[[Any], None],
+    tmp_path: Path,
 ) -> None:
     live = make_live(HSLOC_WORKER_COMMAND=REAL, HSLOC_SANDBOX="none", HSLOC_JOB_MEMORY_BYTES="4G")
     log = tmp_path / NASTY
@@ -71,6 +74,7 @@ def test_upload_watch_look_download(
     assert page.locator("#key-figures div").count() == 3
     picture(page, "3-result")
     assert "verdict: good" in (page.text_content("#job-log pre") or "")
+    need_accessible(page)
     share_by_a_link(page, open_page)
     with page.expect_download() as download:
         page.click("text=trajectory.tum")
@@ -83,7 +87,7 @@ def test_upload_watch_look_download(
     look_around_by_keyboard(page)
     look_around_by_mouse(page)
     picture(page, "4-zoomed")
-    look_on_a_phone_in_the_dark(page)
+    look_on_a_phone_in_the_dark(page, need_accessible)
     page.wait_for_function("() => location.hash.includes('&t=')")
     first = page.url
     press(page, "#job-buttons button >> text=Run again")
@@ -103,7 +107,10 @@ def test_upload_watch_look_download(
     assert len(pictures) == 1  # those of the results that were shown before are gone
     page.click("text=← all jobs")
     page.wait_for_function("() => document.querySelectorAll('#jobs tbody tr').length === 2")
-    compare_two(page)
+    compare_two(page, need_accessible)
+    report = open_page(f"{live.url}/v1/jobs/{job['id']}/results/report.html?download=false")
+    report.wait_for_selector(".rv-now")
+    need_accessible(report)
 
 
 def share_by_a_link(page: Any, open_page: Callable[..., Any]) -> None:
@@ -141,12 +148,13 @@ def share_by_a_link(page: Any, open_page: Callable[..., Any]) -> None:
     visitor.close()
 
 
-def compare_two(page: Any) -> None:
+def compare_two(page: Any, need_accessible: Callable[[Any], None]) -> None:
     for box in page.locator("#jobs tbody input").all():
         box.check()
     page.click("#compare-ticked")
     page.wait_for_selector("#comparison .rv-base")
     picture(page, "8-compare")
+    need_accessible(page)
     assert inked(page, "#comparison .rv-base") > 5
     rows = page.locator("#comparison table tr").all_text_contents()
     assert any(re.fullmatch(r"APE rmse(\d+\.\d+ cm / \d+\.\d+°){2}", row) for row in rows)  # the same run: no change
@@ -269,7 +277,7 @@ def drag_a_start_pose(page: Any, x: float, y: float) -> None:
     assert page.is_hidden("#start-here")
 
 
-def look_on_a_phone_in_the_dark(page: Any) -> None:
+def look_on_a_phone_in_the_dark(page: Any, need_accessible: Callable[[Any], None]) -> None:
     ground = "getComputedStyle(document.documentElement).backgroundColor"
     light, map_in_light = page.evaluate(ground), drawn(page)
     page.emulate_media(color_scheme="dark")
@@ -279,6 +287,7 @@ def look_on_a_phone_in_the_dark(page: Any) -> None:
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert page.locator(MAP).bounding_box()["width"] > 300
     picture(page, "7-phone-result")
+    need_accessible(page)
     page.emulate_media(color_scheme="light")
     page.set_viewport_size({"width": 1280, "height": 900})
 

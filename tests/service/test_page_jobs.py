@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from live_service import Live
 
 
-def test_the_form_offers_what_the_server_does(make_live: Callable[..., Live], open_page: Callable[..., Any]) -> None:
+def test_the_form_offers_what_the_server_does(
+    make_live: Callable[..., Live], open_page: Callable[..., Any], need_accessible: Callable[[Any], None]
+) -> None:
     live = make_live()
     page = open_page(live.url)
     page.wait_for_selector("[data-option=seed]", state="attached")
@@ -25,6 +27,7 @@ def test_the_form_offers_what_the_server_does(make_live: Callable[..., Live], op
     page.click("summary >> text=Map and options")
     for group in ("reading the log", "algorithms"):
         page.click(f"summary >> text={group}")
+    need_accessible(page)
     page.fill("[data-option=initial_pose]", "-1, 2, 0.5")
     page.fill("[data-option='read.start_s']", "1.5")
     page.fill("[data-option=seed]", "7")
@@ -41,7 +44,10 @@ def test_the_form_offers_what_the_server_does(make_live: Callable[..., Live], op
 
 
 def test_several_logs_are_several_jobs_or_one_and_the_table_finds_them(
-    make_live: Callable[..., Live], open_page: Callable[..., Any], tmp_path: Path
+    make_live: Callable[..., Live],
+    open_page: Callable[..., Any],
+    need_accessible: Callable[[Any], None],
+    tmp_path: Path,
 ) -> None:
     live = make_live()
     logs = [tmp_path / f"{name}.log" for name in ("alpha", "beta", "gamma")]
@@ -69,6 +75,7 @@ def test_several_logs_are_several_jobs_or_one_and_the_table_finds_them(
     page.wait_for_function("() => document.querySelector('#page-text').textContent === 'no such job'")
     page.click("nav >> text=Uploads")
     page.wait_for_function("() => document.querySelectorAll('#file-table tbody tr').length === 3")
+    need_accessible(page)
     page.click("#file-table button >> nth=0")  # used again, without an upload
     page.wait_for_function("() => document.querySelector('#stored').value !== ''")
     page.set_input_files("#log", [])

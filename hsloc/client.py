@@ -132,6 +132,29 @@ class Client:
         found: dict[str, Any] = self.request("POST", "/v1/jobs", body, headers).json()
         return found
 
+    def submit_sweep(self, logs: Sequence[str], **request: Any) -> dict[str, Any]:
+        """Queue a job for each uploaded log, configuration and seed: `seeds`, `configs`, `run`, `name` as in the API.
+
+        Sent again without harm (Idempotency-Key).
+        """
+        body = json.dumps({"logs": list(logs), **request}).encode()
+        headers = {"Content-Type": "application/json", "Idempotency-Key": str(uuid.uuid4())}
+        found: dict[str, Any] = self.request("POST", "/v1/sweeps", body, headers).json()
+        return found
+
+    def wait_sweep(
+        self, sweep_id: str, progress: Callable[[dict[str, Any]], None] | None = None, every_s: float = 1.0
+    ) -> list[dict[str, Any]]:
+        """The table of a sweep when all its jobs have ended; `progress` gets the sweep now and then."""
+        while True:
+            sweep = self.request("GET", f"/v1/sweeps/{sweep_id}").json()
+            if progress is not None:
+                progress(sweep)
+            if sweep["ended"]:
+                rows: list[dict[str, Any]] = self.request("GET", f"/v1/sweeps/{sweep_id}/table").json()["rows"]
+                return rows
+            time.sleep(every_s)
+
     def job(self, job_id: str) -> dict[str, Any]:
         """The state of a job."""
         found: dict[str, Any] = self.request("GET", f"/v1/jobs/{job_id}").json()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,7 @@ EXAMPLES = """
   hsloc sweep run.mcap --out compare --matcher hide --matcher icp --csv
   hsloc sweep logs/*.mcap --out nightly --shard 0/4
   hsloc sweep --merge --out nightly
+  hsloc sweep logs/*.mcap --out nightly --service http://127.0.0.1:8000
   hsloc sweep 's3://bucket/logs/*.mcap' --out s3://bucket/nightly --shard 0/4
 """
 
@@ -51,6 +53,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--executor", type=_dask_address, metavar="URL",
         help="Do the runs on the workers of a Dask cluster, dask://HOST:PORT, which see the same folders.",
+    )  # fmt: skip
+    parser.add_argument(
+        "--service", metavar="URL",
+        help="Have the service there do the runs as jobs; --out gets the table, the service keeps the results.",
     )  # fmt: skip
     parts = parser.add_argument_group("in parts, on several machines").add_mutually_exclusive_group()
     parts.add_argument(
@@ -86,14 +92,19 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.merge and not arguments.log:
         print("hsloc sweep: error: no log is given (see hsloc sweep --help)", file=sys.stderr)
         return EXIT_USAGE
-    if arguments.merge:
+    if arguments.service is not None and (arguments.merge or arguments.shard is not None):
+        print("hsloc sweep: error: --service does all parts; leave out --shard and --merge", file=sys.stderr)
+        return EXIT_USAGE
+    if arguments.service is not None:
+        table = _sweep_by_service(arguments)
+    elif arguments.merge:
         table = merge(arguments.log or [folder])
     else:
         runs = _plan(arguments)
         part = runs if arguments.shard is None else arguments.shard.part(runs)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if not arguments.merge:
+        if not arguments.merge and arguments.service is None:
             outcomes = _sweep(arguments, part)
             table = rows(outcomes)
         if arguments.shard is not None:
@@ -138,6 +149,46 @@ def _sweep(arguments: argparse.Namespace, runs: list[SweepRun]) -> list[Outcome]
         if arguments.executor is not None:
             return sweep_on_dask(runs, arguments.out, arguments.executor, tell)
         return sweep_in_processes(runs, arguments.out, max(min(arguments.jobs, len(runs)), 1), tell)
+
+
+def _sweep_by_service(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Upload the logs, have a service do the runs, and wait for the table."""
+    from hsloc.cli.submit import request_of
+    from hsloc.client import Client
+    from hsloc.config import differences, nested, preset
+    from hsloc.errors import HslocError
+    from hsloc.sweep.runs import DONE, FAILED
+
+    client = Client(arguments.service, os.environ.get("HSLOC_TOKEN"))
+    varied_options = {
+        label: {
+            "preset": base,
+            "config": {**nested(differences(config, preset(base)), config.matcher), "matcher": config.matcher},
+        }
+        for label, (base, config) in configs(arguments).items()
+    }
+    for place in arguments.log:
+        if not isinstance(place, Path):
+            raise HslocError(f"{place}: a service takes files; leave out --service, or fetch the log first")
+    with ProgressLine(arguments.quiet or arguments.no_progress) as line:
+        uploads: dict[Path, str] = {}
+
+        def upload(path: Path) -> str:
+            if path not in uploads:
+                uploads[path] = client.upload(path)
+                line.show("upload", len(uploads) / (len(uploads) + 1), path.name)
+            return uploads[path]
+
+        given = {name: value for name, value in values(arguments).items() if not BY_NAME[name].varied and name != "set"}
+        request = {"run": request_of(given, upload), "configs": varied_options, "seeds": list(arguments.seeds)}
+        sweep = client.submit_sweep([upload(path) for path in arguments.log], **request)
+
+        def show(now: dict[str, Any]) -> None:
+            ended = sum(count for state, count in now["states"].items() if state not in ("queued", "running"))
+            line.show("sweep", ended / now["jobs"], f"{ended} of {now['jobs']} jobs of sweep {now['id']}")
+
+        table = client.wait_sweep(sweep["id"], show)
+    return [{**row, "state": DONE if row["state"] == "succeeded" else FAILED} for row in table]
 
 
 def _exit_code(table: Sequence[Mapping[str, Any]], quiet: bool) -> int:

@@ -95,17 +95,13 @@ def plan(
     """
     runs: list[SweepRun] = []
     seeds = list(seeds)
-    labels: dict[str, int] = {}
-    for paths in logs:
+    places = [(paths,) if isinstance(paths, Path | RemoteLog) else paths for paths in logs]
+    for paths, label in zip(logs, log_labels([each[0].name for each in places]), strict=True):
         remote = paths if isinstance(paths, RemoteLog) else None
         if isinstance(paths, RemoteLog):
             parts: tuple[Path, ...] = (Path(paths.name),)
         else:
             parts = (paths,) if isinstance(paths, Path) else tuple(paths)
-        label = parts[0].name.split(".")[0] or "log"
-        labels[label] = labels.get(label, 0) + 1
-        if labels[label] > 1:
-            label = f"{label}-{labels[label]}"
         for name, item in configs.items():
             preset, config = item if isinstance(item, tuple) else ("default", item)
             for seed in seeds:
@@ -115,6 +111,17 @@ def plan(
                 request = RunRequest.from_values(parts, values)
                 runs.append(SweepRun(f"{label}-{name}-seed{seed}".replace("/", "_"), label, name, request, remote))
     return runs
+
+
+def log_labels(names: Sequence[str]) -> list[str]:
+    """What logs with these names are called in a table: without endings, each once."""
+    counts: dict[str, int] = {}
+    labels = []
+    for name in names:
+        label = name.split(".")[0] or "log"
+        counts[label] = counts.get(label, 0) + 1
+        labels.append(label if counts[label] == 1 else f"{label}-{counts[label]}")
+    return labels
 
 
 def sweep(

@@ -12,6 +12,7 @@ from hsloc import text_table
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from hsloc.run_metrics import RunMetrics, RunTimings
     from hsloc.sweep.runs import Outcome
 
     Row = Mapping[str, Any]
@@ -48,9 +49,6 @@ def rows(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:
-    metrics, times = outcome.metrics, outcome.timings
-    errors = None if metrics is None else metrics.errors
-    relations = None if metrics is None else metrics.relations
     values: dict[str, Any] = dict.fromkeys(COLUMNS)
     values |= {
         "run": outcome.run.name,
@@ -62,14 +60,21 @@ def _row(outcome: Outcome) -> dict[str, Any]:
         "limits": "; ".join(outcome.limits),
         "error": outcome.error,
     }
-    if metrics is not None:
-        values |= {
-            "verdict": metrics.verdict.value,
-            "scans": metrics.scans.total,
-            "used": metrics.scans.used,
-            "localised": metrics.localised.share_of_poses,
-            "residual_m": metrics.map.residuals.median,
-        }
+    if outcome.metrics is not None:
+        values |= figures(outcome.metrics, outcome.timings)
+    return values
+
+
+def figures(metrics: RunMetrics, times: RunTimings | None) -> dict[str, Any]:
+    """The columns that a result decides; None for what is no number."""
+    errors, relations = metrics.errors, metrics.relations
+    values: dict[str, Any] = {
+        "verdict": metrics.verdict.value,
+        "scans": metrics.scans.total,
+        "used": metrics.scans.used,
+        "localised": metrics.localised.share_of_poses,
+        "residual_m": metrics.map.residuals.median,
+    }
     if errors is not None:
         values |= {
             "ape_m": errors.ape.trans_part.rmse,

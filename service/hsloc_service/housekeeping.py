@@ -15,9 +15,9 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from sqlalchemy import delete, select, update
+from sqlalchemy import delete, exists, select, update
 
-from hsloc_service.db.tables import ENDED, FileRow, IdempotencyRow, JobRow, UploadDeletionRow
+from hsloc_service.db.tables import ENDED, FileRow, IdempotencyRow, JobRow, SweepRow, UploadDeletionRow
 from hsloc_service.errors import StoreError
 from hsloc_service.jobs.repository import base_job, delete_job
 from hsloc_service.logs import log
@@ -120,6 +120,9 @@ class Housekeeping:
         seq: int | None = 0
         while seq is not None and not self._stop.is_set():
             seq = self._delete_jobs(before, seq)
+        with self._database.write() as session:
+            empty = ~exists().where(JobRow.sweep == SweepRow.id)
+            session.execute(delete(SweepRow).where(SweepRow.created < before, empty))
         ident: str | None = ""
         while ident is not None and not self._stop.is_set():
             ident = self._delete_uploads(before, ident)

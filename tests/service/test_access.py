@@ -45,6 +45,11 @@ READ = {
     ("get", "/v1/labels"),
     ("get", "/v1/options"),
     ("get", "/v1/schemas"),
+    ("get", "/v1/sweeps"),
+    ("get", "/v1/sweeps/{sweep_id}"),
+    ("get", "/v1/sweeps/{sweep_id}/table"),
+    ("get", "/v1/sweeps/{sweep_id}/table.csv"),
+    ("get", "/v1/sweeps/{sweep_id}/table.md"),
     ("get", "/v1/schemas/{name}"),
     ("head", "/v1/tus/{file_id}"),
     ("options", "/v1/tus"),
@@ -55,6 +60,7 @@ WRITE = {
     ("delete", "/v1/jobs/{job_id}"),
     ("delete", "/v1/jobs/{job_id}/shares/{share_id}"),
     ("patch", "/v1/jobs/{job_id}"),
+    ("delete", "/v1/sweeps/{sweep_id}"),
     ("delete", "/v1/tus/{file_id}"),
     ("patch", "/v1/tus/{file_id}"),
     ("post", "/v1/files"),
@@ -64,6 +70,8 @@ WRITE = {
     ("post", "/v1/jobs/{job_id}/rerun"),
     ("post", "/v1/jobs/{job_id}/shares"),
     ("post", "/v1/run"),
+    ("post", "/v1/sweeps"),
+    ("post", "/v1/sweeps/{sweep_id}/cancel"),
     ("post", "/v1/tus"),
     ("put", "/v1/files/{file_id}"),
 }
@@ -90,6 +98,7 @@ class World:
         wait(client, self.job)
         self.file = str(client.get(f"/v1/jobs/{self.job}").json()["request"]["log"])
         self.share = str(client.post(f"/v1/jobs/{self.job}/shares").json()["id"])
+        self.sweep = str(client.post("/v1/sweeps", json={"logs": [self.file]}).json()["id"])
         headers = {"Tus-Resumable": "1.0.0", "Upload-Length": "9"}
         self.upload = client.post("/v1/tus", headers=headers).headers["location"].rsplit("/", 1)[1]
         del client.headers["Authorization"]
@@ -98,7 +107,7 @@ class World:
         """A request that would succeed for the owner."""
         headers = {} if who is None else {"Authorization": f"Bearer {self.tokens[who]}"}
         file = self.upload if "/tus/" in path else self.file
-        url = path.replace("{file_id}", file).replace("{job_id}", self.job)
+        url = path.replace("{file_id}", file).replace("{job_id}", self.job).replace("{sweep_id}", self.sweep)
         url = url.replace("{share_id}", self.share)
         url = url.replace("{name}", "run-metrics" if "/schemas/" in path else "trajectory.tum")
         options: dict[str, Any] = {"params": {"job": self.job}} if path == "/v1/compare" else {}
@@ -111,10 +120,12 @@ class World:
             options["json"] = {"log": self.file}
         elif method == "patch":
             options["json"] = {"title": "another"}
+        elif path == "/v1/sweeps" and method == "post":
+            options["json"] = {"logs": [self.file]}
         elif path == "/v1/run":
             options["files"] = {"log": b"ok"}
         elif method in ("put", "post"):
-            options["content"] = b"" if "/jobs/" in path else b"ok"
+            options["content"] = b"" if "/jobs/" in path or "/sweeps/" in path else b"ok"
         return self.client.request(method.upper(), url, headers=headers, **options)
 
 

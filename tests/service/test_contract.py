@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 TOKEN = "a-token-of-the-operator-0123456789"
-FEW = {"Config": ("matcher", "hide"), "RunRequest": ("mode", "seed")}
+FEW = {"Config": ("matcher", "hide"), "RunRequest": ("mode", "seed"), "SweepOptions": ("matcher", "priority")}
 """Of the parameters, which one table checks, some will do; `/v1/run` takes what `/v1/jobs` does, which is all tried."""
 
 
@@ -84,6 +84,9 @@ class World:
                 case.path_parameters[name] = self._known(name, case.method, case.path)
         if isinstance(case.body, dict) and picked(case.body.get("log")):
             case.body["log"] = self.file
+        logs = case.body.get("logs") if case.path == "/v1/sweeps" and isinstance(case.body, dict) else None
+        if isinstance(logs, list) and logs and picked(logs[0]):
+            case.body["logs"] = [self.file]
         # schemathesis 4.32 fills this header with "0" in requests that it holds for right: its pattern is too hard.
         if case.meta.generation.mode.is_positive and (case.headers or {}).get("Upload-Checksum") == "0":
             case.headers["Upload-Checksum"] = "sha1 2jmj7l5rSw0yVb/vlWAYkK/YBwk="

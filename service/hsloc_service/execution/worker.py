@@ -116,6 +116,7 @@ def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
     from hsloc.dataclass_json import to_json
     from hsloc.report.summary import ResultSummary
     from hsloc.report.table import reason_text
+    from hsloc.sweep.table import figures
 
     values, summary = metrics.to_json(), ResultSummary.of(metrics)
     return {
@@ -133,6 +134,7 @@ def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
         "warnings": [_shortened(to_json(each)) for each in metrics.warnings][:_MOST_LINES],
         "notes": [line[:500] for line in metrics.losses.notes][:_MOST_LINES],
         "timings": timings.to_json(),
+        "row": figures(metrics, timings),
     }
 
 

@@ -23,6 +23,7 @@ from hsloc_service.http import (
     results_routes,
     run_routes,
     shares_routes,
+    sweeps_routes,
     system_routes,
     tus,
 )
@@ -32,6 +33,7 @@ from hsloc_service.http.middleware import Conditional, add_error_handlers
 from hsloc_service.http.openapi import add_openapi
 from hsloc_service.jobs.repository import Jobs
 from hsloc_service.jobs.shares import Shares
+from hsloc_service.jobs.sweeps import Sweeps
 from hsloc_service.jobs.workers import Presence
 from hsloc_service.logs import log
 from hsloc_service.parts import open_parts
@@ -56,6 +58,7 @@ ROUTERS = tuple(
         results_routes,
         run_routes,
         shares_routes,
+        sweeps_routes,
         system_routes,
     )
 )
@@ -104,6 +107,7 @@ def open_context(settings: Settings) -> Context:
         files=files,
         jobs=jobs,
         shares=Shares(database, jobs),
+        sweeps=Sweeps(jobs),
         receiver=UploadReceiver(files, settings),
         dispatcher=parts.dispatcher,
         stores=parts.stores,

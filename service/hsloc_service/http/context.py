@@ -16,6 +16,7 @@ from hsloc_service.execution.dispatcher import Dispatcher
 from hsloc_service.http.schemas import Problem
 from hsloc_service.jobs.repository import Jobs
 from hsloc_service.jobs.shares import Shares
+from hsloc_service.jobs.sweeps import Sweeps
 from hsloc_service.results.deletion_queue import DeletionQueue
 from hsloc_service.results.stores import ResultStores
 from hsloc_service.settings import Settings
@@ -39,6 +40,7 @@ class Context:
     files: Files
     jobs: Jobs
     shares: Shares
+    sweeps: Sweeps
     receiver: UploadReceiver
     dispatcher: Dispatcher
     stores: ResultStores

@@ -87,12 +87,13 @@ def list_jobs(
         ),
     ] = None,
     label: Annotated[str | None, Query(max_length=40, description="a label that the job has")] = None,
+    sweep: Annotated[str | None, Query(pattern=UUID_PATTERN, description="the sweep that they are runs of")] = None,
     brief: Annotated[
         bool, Query(description="of each summary the key figures alone, and how many jobs there are")
     ] = False,
 ) -> JobList:
     """Your jobs, newest first. Page with `next` and `before`; in another order with `offset`."""
-    wanted = JobFilter(state=state, verdict=verdict, search=search, label=label, order=order)
+    wanted = JobFilter(state=state, verdict=verdict, search=search, label=label, order=order, sweep=sweep)
     rows = ctx.jobs.list(who, wanted, before=before, offset=offset, limit=limit)
     views = [brief_view(row) if brief else job_view(row) for row in rows]
     more = len(rows) == limit and order == "newest"

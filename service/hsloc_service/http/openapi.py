@@ -24,7 +24,16 @@ if TYPE_CHECKING:
 
 
 TUS = "/v1/tus"
-REQUESTS = ("Config", "RunRequest", "JobRequest", "RerunRequest", "ReadRequest", "MapFiles")
+REQUESTS = (
+    "Config",
+    "RunRequest",
+    "JobRequest",
+    "RerunRequest",
+    "ReadRequest",
+    "MapFiles",
+    "SweepRequest",
+    "SweepOptions",
+)
 """Models of what a client sends."""
 CONDITIONS = ("oneOf", "if", "then", "else", "dependentRequired")
 DESCRIPTION = f"""\
@@ -81,7 +90,7 @@ def _add_request_models(models: dict[str, Any]) -> None:
     models["Config"] = deepcopy(config_schema.options()["config_schema"])
     models["RunRequest"] = RunRequest.model_json_schema(ref_template="#/components/schemas/{model}")
     models["RunRequest"].pop("$defs")  # FastAPI has put them among the others
-    for name in ("RunRequest", "JobRequest", "RerunRequest"):
+    for name in ("RunRequest", "JobRequest", "RerunRequest", "SweepOptions"):
         models[name]["properties"]["config"]["anyOf"][0] = {"$ref": "#/components/schemas/Config"}
 
 
@@ -102,6 +111,8 @@ def _simplify(schema: Any) -> None:
         return
     for name in CONDITIONS:
         schema.pop(name, None)
+    if "patternProperties" in schema:  # generators know no patterns
+        (schema["additionalProperties"],) = schema.pop("patternProperties").values()
     default = schema.pop("default", None)
     if default is not None and not isinstance(default, dict):
         described = f"{schema['description']}; " if "description" in schema else ""

@@ -136,7 +136,7 @@ class RunRequest(_Run):  # type: ignore[misc, valid-type]
         description="run only where servers or workers were started with this tag",
         examples=["big-memory"],
     )
-    priority: Annotated[int, Field(ge=-100, le=100)] | None = Field(
+    priority: Annotated[int, Field(ge=-100, le=100), BeforeValidator(whole)] | None = Field(
         default=None, description="of your waiting jobs those with a higher one are begun first; 0 by default"
     )
 

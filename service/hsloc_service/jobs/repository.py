@@ -69,6 +69,8 @@ class JobFilter:
     label: str | None = None
     """A label that the job has."""
     order: JobOrder = "newest"
+    sweep: str | None = None
+    """The sweep that they are runs of."""
 
     def conditions(self, who: Principal) -> list[ColumnElement[bool]]:
         """For a query; never without the tenant."""
@@ -77,6 +79,8 @@ class JobFilter:
             found.append(JobRow.state == self.state)
         if self.verdict is not None:
             found.append(JobRow.summary["metrics"]["verdict"].as_string() == self.verdict)
+        if self.sweep is not None:
+            found.append(JobRow.sweep == self.sweep)
         if self.search:
             texts = (JobRow.log_name, JobRow.title, JobRow.labels, JobRow.notes)
             by_text = [text.icontains(self.search, autoescape=True) for text in texts]

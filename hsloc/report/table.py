@@ -256,6 +256,9 @@ def _map_rows(found: MapMetrics) -> list[Row]:
         rows.append(Row("loops closed", (loops,), _LOOPS, ("map/mapping/loops", "map/mapping/loops_refused")))
         explanation = "Scans that the map was made from: one for each part of a metre or of a turn."
         rows.append(Row("keyscans", (str(mapping.keyscans),), explanation, ("map/mapping/keyscans",)))
+        if mapping.followed:
+            explanation = "Scans that the map so far explained: they were localised on it and added nothing to it."
+            rows.append(Row("scans on the known map", (str(mapping.followed),), explanation, ("map/mapping/followed",)))
         if isfinite(mapping.sigma_max):
             values = f"{format_length(mapping.sigma_median)}, {format_length(mapping.sigma_max)}"
             sources = ("map/mapping/sigma_median", "map/mapping/sigma_max")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -9,13 +10,13 @@ import numpy as np
 
 from hsloc.errors import MapError
 from hsloc.model.occupancy_grid import OccupancyGrid
-from hsloc.model.pose2 import Pose2, wrap_angles
+from hsloc.model.pose2 import Pose2, relative_poses, wrap_angles
 from hsloc.slam.calibration import OdometryCalibration
 from hsloc.slam.evidence import Recorded, nothing_seen, weigh
 from hsloc.slam.joint_registration import Registration, moved_scans, refine
 from hsloc.slam.loop_closer import TORN, LoopCloser, loop_edges
 from hsloc.slam.map_extension import connect, unconnected
-from hsloc.slam.map_session import from_front_end
+from hsloc.slam.map_session import LEFT_THE_MAP
 from hsloc.slam.map_state import MapState, fingerprint
 from hsloc.slam.marginals import all_edges, marginal_covariances
 from hsloc.slam.occupancy_mapper import build_grid
@@ -29,10 +30,9 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from hsloc.slam.front_end import LocalMatch
-    from hsloc.slam.keyscans import KeyScan, KeyScans
+    from hsloc.slam.keyscans import KeyScans
     from hsloc.slam.loop_matcher import Loop
-    from hsloc.slam.map_session import MapSession
+    from hsloc.slam.map_session import MapSession, Tie
     from hsloc.slam.parameters import GraphMapperParameters, Resume
     from hsloc.slam.slips import Stretches
     from hsloc.slam.trajectory_correction import EventLog
@@ -47,28 +47,33 @@ _RESIDUAL_SCANS = 400
 
 
 def finish(
-    scans: list[KeyScan],
-    stamps_ns: I64,
-    local: list[LocalMatch],
+    gathered: MapSession | None,
     track: EventLog,
     parameters: GraphMapperParameters,
     rng: Generator,
     progress: Callable[[float], None] | None = None,
     resume: Resume | None = None,
 ) -> MappingResult:
-    """Close loops, refine, build the map; with `resume`, in and with a saved map.
+    """Close loops, refine, build the map; with `resume`, in and with a saved map. None: the log had no keyscan.
 
     Raises MapError if the log cannot be connected with the saved map.
     """
     report = progress if progress is not None else _silent
-    if not scans:
+    if gathered is None:
         if resume is not None:
             raise MapError(unconnected(resume.state))
         return _empty(track)
-    gathered = from_front_end(scans, stamps_ns, local, track, parameters)
     if resume is not None:
         gathered = connect(resume, gathered, parameters, rng)
     return finish_session(gathered, track, parameters, rng, report, resume.state if resume is not None else None)
+
+
+def solve(gathered: MapSession, parameters: GraphMapperParameters, rng: Generator) -> MapSession:
+    """Close the loops of a session and refine it, so that the log can go on from there: its keyscans as solved."""
+    poses, loops, edges = _close_loops(gathered, parameters, rng, _silent)
+    edges = Edges.concatenate([gathered.steps, edges])
+    refined, _ = _refine(poses, gathered.scans, edges, parameters, _silent)
+    return replace(gathered, poses=refined.poses, known=tuple(loops))
 
 
 def finish_session(
@@ -101,7 +106,7 @@ def finish_session(
     of_log = refined.poses[gathered.first :]
     calibration = track.calibrated(of_log) if parameters.use_odometry else OdometryCalibration()
     odometry_poses, scan_poses = track.corrected(of_log, calibration)
-    odometry_covariances, scan_covariances = track.covariances(covariances[gathered.first :])
+    odometry_covariances, scan_covariances = track.covariances(of_log, covariances[gathered.first :])
     return MappingResult(
         odometry_poses=odometry_poses,
         scan_poses=scan_poses,
@@ -115,7 +120,7 @@ def finish_session(
         graph=PoseGraph(gathered.stamps_ns, refined.poses, all_edges(refined, edges)),
         loops=tuple(loops),
         submap_references=gathered.places.reference,
-        quality=_quality(refined, covariances, passes, loops, loop_edges, grid, gathered.scans),
+        quality=_quality(refined, covariances, passes, loops, loop_edges, grid, gathered.scans, track.anchored),
         calibration=calibration,
         state=_state(gathered, refined.poses, loop_edges, grid, parameters),
         evidence=weigh(_recorded(gathered, refined, loops, stretches, parameters.use_odometry)),
@@ -127,22 +132,47 @@ def _recorded(
 ) -> Recorded:
     reference = gathered.places.reference
     ends = np.array([(reference[loop.first], reference[loop.second]) for loop in loops], dtype=np.int64).reshape(-1, 2)
+    accepted = ends[[loop.accepted and loop.reason != LEFT_THE_MAP for loop in loops]]
+    motions, steps = gathered.motions, gathered.steps.measured
+    if gathered.ties:
+        # Across a gap nothing was driven that the map could be held against.
+        motions, steps = motions.copy(), steps.copy()
+        after = np.array([tie.second for tie in gathered.ties])
+        motions[after] = 0.0
+        steps[after - 1] = relative_poses(refined.poses[after - 1], refined.poses[after])
+        accepted = verified_stretches(accepted, gathered.ties)
     ranges = gathered.scans.ranges
     measured = max(int((~np.isnan(ranges)).sum()), 1)
     return Recorded(
         stamps_ns=gathered.stamps_ns,
         poses=refined.poses,
-        motions=gathered.motions,
+        motions=motions,
         covariances=gathered.covariances,
         refused=gathered.refused,
-        odometry=_composed(gathered.steps.measured) if use_odometry else None,
+        odometry=_composed(steps) if use_odometry else None,
         pairs=refined.pairs,
         counts=refined.counts,
-        loops=ends[[loop.accepted for loop in loops]],
+        loops=accepted,
         torn=ends[[loop.reason.startswith(TORN) for loop in loops]],
         no_return_share=float(np.isposinf(ranges).sum()) / measured,
         stretches=stretches,
     )
+
+
+def verified_stretches(loops: I64, ties: tuple[Tie, ...]) -> I64:
+    """The stretches (m, 2) that loops (k, 2) verify: before a gap the path goes on where the map was left."""
+    begin = [tie.second for tie in ties]
+    cut: list[tuple[int, int]] = []
+    for first, second in loops.tolist():
+        a, b = bisect_right(begin, first), bisect_right(begin, second)
+        while a != b:
+            if a > b:
+                first, second, a, b = second, first, b, a
+            cut.append((begin[b - 1], second))
+            second = ties[b - 1].first
+            b = bisect_right(begin, second)
+        cut.append((min(first, second), max(first, second)))
+    return np.array(cut, dtype=np.int64).reshape(-1, 2)
 
 
 def _composed(steps: F64) -> F64:
@@ -226,6 +256,7 @@ def _quality(
     edges: Edges,
     grid: OccupancyGrid,
     scans: KeyScans,
+    followed: int,
 ) -> MappingQuality:
     nan = float("nan")
     distance, angle, _ = edge_errors(refined.poses, edges)
@@ -247,6 +278,7 @@ def _quality(
         sigma_max=float(sigma.max()),
         sigma_angle_max_deg=float(np.degrees(np.sqrt(covariances[:, 2, 2].max()))),
         keyscans=len(scans),
+        followed=followed,
         passes=passes,
         moved=refined.moved,
     )
@@ -270,7 +302,7 @@ def _empty(track: EventLog) -> MappingResult:
     """No scan had a return: odometry is all there is."""
     nan = float("nan")
     odometry_poses, scan_poses = track.corrected(np.zeros((0, 3)))
-    odometry_covariances, scan_covariances = track.covariances(np.zeros((0, 3, 3)))
+    odometry_covariances, scan_covariances = track.covariances(np.zeros((0, 3)), np.zeros((0, 3, 3)))
     none = np.zeros(0, dtype=np.int64)
     return MappingResult(
         odometry_poses=odometry_poses,
@@ -285,7 +317,7 @@ def _empty(track: EventLog) -> MappingResult:
         graph=PoseGraph(none, np.zeros((0, 3)), Edges.none()),
         loops=(),
         submap_references=np.zeros(0, dtype=np.int64),
-        quality=MappingQuality(nan, nan, nan, nan, 0, 0, nan, nan, nan, nan, nan, nan, nan, 0, 0, 0.0),
+        quality=MappingQuality(nan, nan, nan, nan, 0, 0, nan, nan, nan, nan, nan, nan, nan, 0, 0, 0, 0.0),
         calibration=OdometryCalibration(),
         state=None,
         evidence=nothing_seen(),

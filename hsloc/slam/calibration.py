@@ -1,4 +1,4 @@
-"""Calibration of the odometry by the final poses of the scans: its scale, and its delay.
+"""Calibration of the odometry by the poses of the scans: its scale, its delay, and how noisy it is.
 
 Wheels are a few per cent too large or too small, and a message may hold the pose of some hundredths of a second before
 or after the scan that bears its stamp. Neither matters to the keyscans; between two of them, where poses come from the
@@ -12,10 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.model.pose2 import compose_poses, relative_poses, wrap_angles
+from hsloc.model.pose2 import compose_poses, relative_poses, wrap_angle, wrap_angles
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from hsloc.localisation.motion_models import OdometryNoise
+    from hsloc.model.pose2 import Pose2
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
@@ -44,6 +47,16 @@ _GAIN = 0.97
 """Ratio of the rotation error with a delay to that without one that is enough. Internal: a test of significance."""
 _WORST_SCALE = 0.15
 """Maximum difference of a scale from 1. Internal: wheels are not wrong by more, such an estimate is an artefact."""
+
+FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
+"""Least covariance of a motion (m^2, rad^2). Internal: a part of a cell, keeps the equations solvable."""
+_HIGH_CHI = 2.795
+"""95th percentile of the chi of three degrees of freedom."""
+_BEST_ODOMETRY = 0.5
+_WORST_ODOMETRY = 10.0
+"""Factors within which the assumed noise of the odometry is adapted to the log."""
+_FEWEST_WEIGHED = 20
+"""Steps without which the assumed noise stays as it is."""
 
 
 def calibrate(index: F64, odometry: F64, keys: I64, key_poses: F64) -> OdometryCalibration:
@@ -116,3 +129,21 @@ def delayed(index: F64, odometry: F64, delay: float) -> F64:
     fraction = np.where(span > 0.0, (wanted - index[after - 1]) / np.maximum(span, 1e-12), 0.0)
     step = relative_poses(odometry[after - 1], odometry[after])
     return compose_poses(odometry[after - 1], step * fraction[:, None])
+
+
+def odometry_chi(motion: Pose2, found: Pose2, noise: OdometryNoise) -> float:
+    """How far a step of the odometry is off, in standard deviations of the noise that is assumed."""
+    error = found.to_array() - motion.to_array()
+    error[2] = wrap_angle(error[2])
+    return float(np.sqrt(error @ np.linalg.solve(noise.covariance(motion) + FLOOR, error)))
+
+
+def odometry_scale(chi: list[float]) -> float:
+    """Factor on the standard deviations of the assumed noise that fits the steps' `chi` of this log (robustly).
+
+    By its 95th percentile, as turns are rare and err most; not below a half, for what slips once in a hundred steps
+    is beyond that.
+    """
+    if len(chi) < _FEWEST_WEIGHED:
+        return 1.0
+    return float(np.clip(np.percentile(chi, 95.0) / _HIGH_CHI, _BEST_ODOMETRY, _WORST_ODOMETRY))

@@ -3,7 +3,8 @@
 Odometry predicts, and the scan is registered onto the last keyscans, point to line, with the prediction as prior.
 Where that is refused, or the prediction is too uncertain to begin at, HIDE searches on the field of the local map. A
 step that contradicts the odometry, or through whose walls scans have looked, is doubtful. A scan that moved far enough
-becomes a keyscan. Drift is left to the loop closer, precision to the joint registration.
+becomes a keyscan. Drift is left to the loop closer, precision to the joint registration. Where the map was solved while
+the log is read, a scan that it explains is followed on it and is no keyscan (`hsloc.slam.known_map`).
 """
 
 from __future__ import annotations
@@ -14,13 +15,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate
+from hsloc.localisation.kalman_filter import predict_covariance
 from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.matching.hide import Hide
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Status
 from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle
 from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive, Ratio
-from hsloc.slam.keyscans import SURPRISE, KeyScan, MovingScan, RecentScans, ScanRegistration, fused_covariance
+from hsloc.slam.calibration import FLOOR, odometry_chi, odometry_scale
+from hsloc.slam.keyscans import SURPRISE, MovingScan, RecentScans, ScanRegistration, fused_covariance, moving_scans
+from hsloc.slam.known_map import KnownMap, KnownMapTracker
 from hsloc.slam.local_map import LocalMap
 
 if TYPE_CHECKING:
@@ -28,6 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.model.events import PairedScan
+    from hsloc.slam.known_map import Anchor
 
     F64 = NDArray[np.float64]
 
@@ -100,12 +106,14 @@ class LocalMatch:
     is_doubtful: bool = False
     scans: tuple[MovingScan, ...] = ()
     """The scan and its companions, prepared; of a keyscan."""
+    anchor: Anchor | None = None
+    """Where the scan is in the known map: of one that was followed on it, and of the first keyscan after such scans."""
 
 
-FLOOR = np.diag((0.005**2, 0.005**2, 0.002**2))
-"""Least covariance of a motion (m^2, rad^2). Internal: a part of a cell, keeps the equations solvable."""
 _FORGET = 0.05
-"""Weight of a new match in the usual fitness."""
+"""Weight of a new period in the mean of the periods."""
+_SPARSER = 2.0
+"""A scan on the known map is matched after this multiple of the motion between keyscans: nothing is built from it."""
 _LONGEST_PREDICTION = 2.0
 """Periods of the scans for which a velocity is trusted."""
 _KNOWN = 0.85
@@ -125,13 +133,8 @@ _SLIP = 0.3
 """Standard deviation [m] of a motion that the scans contradict, without saying what it was."""
 _SLIP_ANGLE = 0.3
 """And of its turn [rad]."""
-_HIGH_CHI = 2.795
-"""95th percentile of the chi of three degrees of freedom."""
-_BEST_ODOMETRY = 0.5
-_WORST_ODOMETRY = 10.0
-"""Factors within which the assumed noise of the odometry is adapted to the log."""
 _WEIGHED_EVERY = 20
-"""Number of matched keyscans after which the odometry's weight is estimated again."""
+"""Number of matched keyscans after which the odometry's weight is estimated again; of more than 1000, 2 % of them."""
 _BASIN = 0.3
 """Half-width [m] of a window from whose centre the registration finds its way: its first gate."""
 _BASIN_ANGLE = 0.2
@@ -151,14 +154,33 @@ class FrontEnd:
         self._recent = RecentScans()
         self._hidden = np.zeros((3, 3))
         self._way = 0.0
-        self._usual: float | None = None
-        self._refused = 0
+        p = parameters
+        self._motion_gate = MotionGate(p.keyscan_min_d, p.keyscan_min_a)
+        self._known_map_gate = MotionGate(_SPARSER * p.keyscan_min_d, _SPARSER * p.keyscan_min_a)
+        ratio = p.min_fitness_ratio
+        self._match_gate = MatchGate(
+            MatchLimits(min_fitness=p.min_fitness, min_fitness_ratio=ratio, recovery_fitness_ratio=ratio)
+        )
         self._last: tuple[int, Pose2] | None = None
         self._last_heading: float | None = None
         self._velocity = np.zeros(3)
         self._period = float("inf")
         self._odometry_chi: list[float] = []
-        self._odometry_scale = 1.0
+        self._odometry_scale, self._weighed_at = 1.0, _WEIGHED_EVERY
+        self._tracker: KnownMapTracker | None = None
+        self._covariance = np.zeros((3, 3))
+
+    @property
+    def is_far_from_known_map(self) -> bool:
+        """Whether there is a known map, and only a loop leads back to it."""
+        return self._tracker is not None and self._tracker.is_far(self._way)
+
+    def go_on(self, known: KnownMap, T_map_key: Pose2) -> None:
+        """Go on in the frame of a map that was solved, in which the last keyscan is at `T_map_key`."""
+        self._recent.move(T_map_key @ self._T_map_key.inverse())
+        self._T_map_key, self._covariance = T_map_key, np.zeros((3, 3))
+        self._tracker = KnownMapTracker(known, self._way)
+        self._redraw()
 
     def update(self, paired: PairedScan, points: F64) -> LocalMatch:
         """Take a scan and its hits (n, 2) in the base's frame."""
@@ -170,14 +192,18 @@ class FrontEnd:
             return self._keep(paired, points, LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.MATCHED, True, 1.0))
         motion, covariance = self._predict(paired)
         predicted = self._T_map_key @ motion
-        small = hypot(motion.x, motion.y) < p.keyscan_min_d and abs(motion.theta) < p.keyscan_min_a
-        if small and self._use_odometry:
+        is_followed = self._tracker is not None and self._tracker.is_following
+        gate = self._known_map_gate if is_followed else self._motion_gate
+        if self._use_odometry and not gate.is_open(motion):
             return LocalMatch(predicted, motion, covariance, Status.PREDICTED, False, reason="motion gate")
         if not enough:
             found = LocalMatch(predicted, motion, covariance, Status.NO_RETURNS, False, reason=f"{len(points)} returns")
         else:
-            scans = _moving(paired)
-            near = points[np.hypot(points[:, 0], points[:, 1]) < p.local_range]
+            scans = moving_scans(paired)
+            near = points[np.hypot(*points.T) < p.local_range]
+            on_map = self._followed(paired, near, scans, motion, covariance)
+            if on_map is not None:
+                return on_map
             found = replace(self._matched(near, scans, motion, covariance), scans=scans)
         if not self._use_odometry:
             found = self._without_odometry(paired, found)
@@ -203,6 +229,40 @@ class FrontEnd:
         motion = self._T_map_key.between(pose @ Pose2(float(step[0]), float(step[1]), float(step[2])))
         return motion, covariance
 
+    def _followed(
+        self, paired: PairedScan, points: F64, scans: tuple[MovingScan, ...], motion: Pose2, covariance: F64
+    ) -> LocalMatch | None:
+        """The scan on the known map; None without one, or where it does not explain the scan."""
+        tracker, key = self._tracker, self._T_map_key
+        if tracker is None:
+            return None
+        in_map = predict_covariance(self._covariance, key, motion, covariance)
+        found = tracker.follow(self._way, scans, points, key @ motion, in_map)
+        if found is None:
+            if tracker.is_following:
+                self._recent.start_with(tracker.leave(self._way, key))
+                self._redraw()
+            return None
+        step = key.between(found.pose)
+        self._weigh_odometry(motion, step)
+        self._covariance = fused_covariance(found, in_map) + FLOOR
+        self._way += self._length(step)
+        self._T_map_key, self._T_odom_key = found.pose, paired.T_odom_base
+        self._match_gate.restart(self._match_gate.usual)
+        self._hidden = np.zeros((3, 3))
+        anchor = tracker.anchor(found.pose, self._covariance)
+        return LocalMatch(found.pose, step, covariance, Status.MATCHED, False, found.paired, 1, anchor=anchor)
+
+    def _length(self, motion: Pose2) -> float:
+        return hypot(motion.x, motion.y) + self._parameters.turn_length * abs(wrap_angle(motion.theta))
+
+    def _redraw(self) -> None:
+        """Draw the local map of the scans that are kept, and of no other."""
+        p = self._parameters
+        self._maps = [(LocalMap(p.resolution, p.sigma, p.max_distance), self._way)]
+        for hits in self._recent.hits(p.local_range):
+            self._maps[0][0].add(hits, _KNOWN)
+
     def _matched(self, points: F64, scans: tuple[MovingScan, ...], motion: Pose2, covariance: F64) -> LocalMatch:
         key = self._T_map_key
         predicted = key @ motion
@@ -210,16 +270,14 @@ class FrontEnd:
         in_map = turn @ covariance @ turn.T
         found, evaluations = self._search(points, scans, predicted, in_map)
         fitness = self._maps[0][0].field.fitness(points, found.pose)
-        reason = found.refusal()
-        if reason:
-            self._refused += 1
+        if reason := found.refusal():
+            self._match_gate.refuse()
             if found.is_contradicted():
                 covariance = covariance + np.diag((_SLIP**2, _SLIP**2, _SLIP_ANGLE**2))
             return LocalMatch(predicted, motion, covariance, Status.REJECTED, True, fitness, evaluations, reason, True)
         # What is measured is the pose in the local map; the step to it also holds what the refused steps may hide.
-        after_refusal = self._refused > 0
-        self._refused = 0
-        self._usual = fitness if self._usual is None else self._usual + _FORGET * (fitness - self._usual)
+        after_refusal = self._match_gate.refusals > 0
+        self._match_gate.accept(fitness)
         fused = turn.T @ fused_covariance(found, in_map) @ turn + FLOOR
         self._weigh_odometry(motion, key.between(found.pose))
         return LocalMatch(
@@ -239,8 +297,9 @@ class FrontEnd:
         if not self._use_odometry:
             return
         self._odometry_chi.append(odometry_chi(motion, found, p.odometry_noise))
-        if len(self._odometry_chi) % _WEIGHED_EVERY == 0:
+        if len(self._odometry_chi) >= self._weighed_at:
             self._odometry_scale = odometry_scale(self._odometry_chi)
+            self._weighed_at = len(self._odometry_chi) + max(_WEIGHED_EVERY, len(self._odometry_chi) // 50)
 
     def _search(
         self, points: F64, scans: tuple[MovingScan, ...], predicted: Pose2, covariance: F64
@@ -290,12 +349,8 @@ class FrontEnd:
         offset = np.array((found.pose.x - predicted.x, found.pose.y - predicted.y))
         if np.hypot(*offset) > p.window_min and found.observed(offset) < _OBSERVED:
             return False
-        usual = 0.0 if self._usual is None else self._usual
-        return (
-            found.paired >= _CONVINCING_PAIRED
-            and found.consistency >= _CONVINCING
-            and fitness >= max(p.min_fitness, p.min_fitness_ratio * usual)
-        )
+        agrees = found.paired >= _CONVINCING_PAIRED and found.consistency >= _CONVINCING
+        return agrees and not self._match_gate.refusal(fitness)
 
     def _without_odometry(self, paired: PairedScan, found: LocalMatch) -> LocalMatch:
         """Remember the velocity, and apply the motion gate to the match."""
@@ -310,23 +365,26 @@ class FrontEnd:
         elif found.status is not Status.MATCHED:
             self._velocity = np.zeros(3)
         self._last, self._last_heading = (stamp, found.pose), paired.heading
-        motion = found.motion
-        moved = hypot(motion.x, motion.y) >= p.keyscan_min_d or abs(motion.theta) >= p.keyscan_min_a
-        keep = found.is_keyscan and (moved or self._refused >= p.restart_after)
+        long_refused = self._match_gate.refusals >= p.restart_after
+        keep = found.is_keyscan and (long_refused or self._motion_gate.is_open(found.motion))
         return replace(found, is_keyscan=keep)
 
     def _keep(self, paired: PairedScan, points: F64, found: LocalMatch) -> LocalMatch:
         """Make the scan a keyscan: add it to the local maps."""
         p = self._parameters
-        scans = found.scans or _moving(paired)
-        self._way += hypot(found.motion.x, found.motion.y) + p.turn_length * abs(wrap_angle(found.motion.theta))
-        if self._refused >= p.restart_after:
-            self._maps, self._refused = [], 0
+        scans = found.scans or moving_scans(paired)
+        self._way += self._length(found.motion)
+        if self._match_gate.refusals >= p.restart_after:
+            self._maps = []
+            self._match_gate.restart(self._match_gate.usual)
             self._recent.clear()
         if not self._maps or self._way - self._maps[-1][1] > p.submap_length:
             self._maps = [*self._maps[-1:], (LocalMap(p.resolution, p.sigma, p.max_distance), self._way)]
         self._hidden = self._hidden + found.covariance if found.status is not Status.MATCHED else np.zeros((3, 3))
+        self._covariance = predict_covariance(self._covariance, self._T_map_key, found.motion, found.covariance)
         self._T_map_key, self._T_odom_key = found.pose, paired.T_odom_base
+        if self._tracker is not None:
+            found = replace(found, anchor=self._tracker.tie(found.pose, self._covariance))
         if self._last is None:
             self._last, self._last_heading = (paired.scan.stamp_ns, found.pose), paired.heading
         moved = found.pose @ points[np.hypot(points[:, 0], points[:, 1]) < p.local_range]
@@ -335,30 +393,6 @@ class FrontEnd:
                 local.add(moved, _KNOWN)
             self._recent.add(found.pose, scans)
         return replace(found, scans=scans)
-
-
-def odometry_chi(motion: Pose2, found: Pose2, noise: OdometryNoise) -> float:
-    """How far a step of the odometry is off, in standard deviations of the noise that is assumed."""
-    error = found.to_array() - motion.to_array()
-    error[2] = wrap_angle(error[2])
-    return float(np.sqrt(error @ np.linalg.solve(noise.covariance(motion) + FLOOR, error)))
-
-
-def odometry_scale(chi: list[float]) -> float:
-    """Factor on the standard deviations of the assumed noise that fits the steps' `chi` of this log (robustly).
-
-    By its 95th percentile, as turns are rare and err most; not below a half, for what slips once in a hundred steps
-    is beyond that.
-    """
-    if len(chi) < _WEIGHED_EVERY:
-        return 1.0
-    return float(np.clip(np.percentile(chi, 95.0) / _HIGH_CHI, _BEST_ODOMETRY, _WORST_ODOMETRY))
-
-
-def _moving(paired: PairedScan) -> tuple[MovingScan, ...]:
-    """The scan and its companions, as seen from the base at the scan's stamp."""
-    parts = ((paired.scan, IDENTITY), *((other.scan, paired.to(other)) for other in paired.companions))
-    return tuple(MovingScan.of(KeyScan.of(scan), pose) for scan, pose in parts)
 
 
 def _turn(theta: float) -> F64:

@@ -15,6 +15,8 @@ from hsloc.model.pose2 import IDENTITY, Pose2
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hsloc.model.events import PairedScan
+
     F32 = NDArray[np.float32]
     F64 = NDArray[np.float64]
     I32 = NDArray[np.int32]
@@ -237,6 +239,12 @@ class ScanRegistration:
         return self.chi > SURPRISE or self.consistency < _SURELY_CONSISTENT
 
 
+def moving_scans(paired: PairedScan) -> tuple[MovingScan, ...]:
+    """The scan and its companions, as seen from the base at the scan's stamp."""
+    parts = ((paired.scan, IDENTITY), *((other.scan, paired.to(other)) for other in paired.companions))
+    return tuple(MovingScan.of(KeyScan.of(scan), pose) for scan, pose in parts)
+
+
 class RecentScans:
     """State: the keyscans since the local map began, newest last, with their poses in the front end's map."""
 
@@ -250,6 +258,23 @@ class RecentScans:
         """Forget all."""
         self._kept = []
 
+    def start_with(self, known: list[tuple[F64, MovingScan]]) -> None:
+        """Forget all but scans of a map at their poses (3,), the nearest last."""
+        self._kept = [(pose, (scan,)) for pose, scan in known[-_BACK[-1] :]]
+
+    def move(self, T_new_old: Pose2) -> None:
+        """Move all into another frame."""
+        self._kept = [((T_new_old @ Pose2.from_array(pose)).to_array(), scans) for pose, scans in self._kept]
+
+    def hits(self, max_range: float) -> list[F64]:
+        """Hits (n, 2) of each scan within `max_range` metres of the base, in the front end's map."""
+        found = []
+        for pose, scans in self._kept:
+            for scan in scans:
+                points = scan.scan.points[np.hypot(scan.scan.points[:, 0], scan.scan.points[:, 1]) < max_range]
+                found.append(Pose2.from_array(_composed(pose, scan.pose)) @ points.astype(np.float64))
+        return found
+
     def add(self, pose: Pose2, scans: tuple[MovingScan, ...]) -> None:
         """Keep a scan with its companions."""
         self._kept = [*self._kept[-(_BACK[-1] - 1) :], (pose.to_array(), scans)]
@@ -260,23 +285,37 @@ class RecentScans:
         """Register a scan with its companions from `start` on; odometry has it at `predicted`, `covariance` (3, 3)."""
         fixed = [self._kept[-back] for back in _BACK if back <= len(self._kept)]
         still = [(_composed(pose, scan.pose), scan) for pose, kept in fixed for scan in kept]
-        poses = np.array([pose for pose, _ in still] + [scan.pose for scan in scans])
-        arrays = _arrays([*(scan for _, scan in still), *scans])
-        parameters = RegistrationParameters(
-            _GATES, _SCALE_OF_GATE, 1.0 / (_POINT_SIGMA**2 * _CORRELATED), _PRIOR_SCALE, _ROUNDS
-        )
-        pose, information, counts = start.to_array(), np.zeros((3, 3)), np.zeros(5)
-        prior = Prior(predicted.to_array(), np.asarray(np.linalg.inv(covariance), dtype=np.float64))
-        chi = register(pose, Scene(len(still), poses, arrays), prior, parameters, information, counts)
-        seen = max(float(counts[2]), 1.0)
-        return ScanRegistration(
-            Pose2.from_array(pose),
-            information,
-            float(counts[0]) / seen,
-            float(counts[1]) / seen,
-            int(counts[2]),
-            float(chi),
-        )
+        return register_onto(still, scans, start, predicted, covariance)
+
+
+def register_onto(
+    still: list[tuple[F64, MovingScan]],
+    scans: tuple[MovingScan, ...],
+    start: Pose2,
+    predicted: Pose2,
+    covariance: F64,
+) -> ScanRegistration:
+    """Register a scan with its companions onto scans that stay at their poses (3,), from `start` on.
+
+    Odometry has it at `predicted`, with `covariance` (3, 3) in the map.
+    """
+    poses = np.array([pose for pose, _ in still] + [scan.pose for scan in scans])
+    arrays = _arrays([*(scan for _, scan in still), *scans])
+    parameters = RegistrationParameters(
+        _GATES, _SCALE_OF_GATE, 1.0 / (_POINT_SIGMA**2 * _CORRELATED), _PRIOR_SCALE, _ROUNDS
+    )
+    pose, information, counts = start.to_array(), np.zeros((3, 3)), np.zeros(5)
+    prior = Prior(predicted.to_array(), np.asarray(np.linalg.inv(covariance), dtype=np.float64))
+    chi = register(pose, Scene(len(still), poses, arrays), prior, parameters, information, counts)
+    seen = max(float(counts[2]), 1.0)
+    return ScanRegistration(
+        Pose2.from_array(pose),
+        information,
+        float(counts[0]) / seen,
+        float(counts[1]) / seen,
+        int(counts[2]),
+        float(chi),
+    )
 
 
 def fused_covariance(found: ScanRegistration, covariance: F64) -> F64:

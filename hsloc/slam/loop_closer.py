@@ -192,16 +192,23 @@ class LoopCloser:
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra
 
-        loops = self.accepted
         # Where two logs are connected the path may lead over submaps that are still to be visited.
         last = place if self._first == 0 else len(self._places) - 1
+        chain = np.maximum(np.diff(self._places.path_length[: last + 1]), 1e-3)
+        lengths: list[float] = []
+        loops = []
+        for loop in self.accepted:
+            length = max(hypot(loop.T_first_second.x, loop.T_first_second.y), 0.1)
+            if loop.second == loop.first + 1 <= last:
+                # Across a gap of the path; two entries for one pair would be added up.
+                chain[loop.first] = min(chain[loop.first], length)
+            else:
+                loops.append(loop)
+                lengths.append(length)
         rows = [*range(last), *(loop.first for loop in loops)]
         columns = [*range(1, last + 1), *(loop.second for loop in loops)]
-        lengths = [
-            *np.maximum(np.diff(self._places.path_length[: last + 1]), 1e-3),
-            *(max(hypot(loop.T_first_second.x, loop.T_first_second.y), 0.1) for loop in loops),
-        ]
-        graph = coo_array((lengths, (rows, columns)), shape=(len(self._places), len(self._places)))
+        edges = (np.concatenate((chain, lengths)), (rows, columns))
+        graph = coo_array(edges, shape=(len(self._places), len(self._places)))
         distances: F64 = dijkstra(graph.tocsr(), directed=False, indices=np.array([place]))
         return distances[0, :place]
 

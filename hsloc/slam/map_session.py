@@ -9,7 +9,7 @@ import numpy as np
 
 from hsloc.model.estimate import Status
 from hsloc.model.pose2 import Pose2, compose_poses, relative_poses
-from hsloc.slam.front_end import odometry_chi, odometry_scale
+from hsloc.slam.calibration import odometry_chi, odometry_scale
 from hsloc.slam.keyscans import KeyScans
 from hsloc.slam.loop_matcher import Loop
 from hsloc.slam.pose_graph import Edges
@@ -29,6 +29,23 @@ if TYPE_CHECKING:
 
 _ODOMETRY_FLOOR = np.diag((0.01**2, 0.01**2, 0.005**2))
 """Least covariance of an odometry edge (m^2, rad^2). Internal: keeps the equations solvable."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tie:
+    """Where the robot left the map that was known: keyscan `second`, before which there is a gap, seen from `first`.
+
+    `covariance` (3, 3) is in the frame of `first`.
+    """
+
+    first: int
+    second: int
+    T_first_second: Pose2
+    covariance: F64
+
+
+LEFT_THE_MAP = "left the known map"
+"""The reason of the loop that a tie becomes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +69,8 @@ class MapSession:
     known: tuple[Loop, ...] = ()
     first: int = 0
     first_place: int = 0
+    ties: tuple[Tie, ...] = ()
+    """Where the path has gaps, in the order of the keyscans after them: there the robot was followed on the map."""
 
     @property
     def chain(self) -> Edges:
@@ -65,26 +84,59 @@ class MapSession:
 
 
 def from_front_end(
-    scans: list[KeyScan], stamps_ns: I64, local: list[LocalMatch], track: EventLog, parameters: GraphMapperParameters
+    scans: list[KeyScan],
+    stamps_ns: I64,
+    local: list[LocalMatch],
+    track: EventLog,
+    parameters: GraphMapperParameters,
+    solved: MapSession | None = None,
+    ties: tuple[Tie, ...] = (),
 ) -> MapSession:
-    """Of a log with at least one keyscan."""
-    poses = np.array([found.pose.to_array() for found in local])
-    motions = np.array([found.motion.to_array() for found in local])
-    covariances = np.array([found.covariance for found in local])
+    """Of a log with at least one keyscan; those of `solved` come first, at the poses at which they were solved."""
+    poses = np.array([found.pose.to_array() for found in local]).reshape(-1, 3)
+    motions = np.array([found.motion.to_array() for found in local]).reshape(-1, 3)
+    covariances = np.array([found.covariance for found in local]).reshape(-1, 3, 3)
     refused = np.array([found.status is Status.REJECTED or found.is_doubtful for found in local], dtype=bool)
+    known: tuple[Loop, ...] = ()
+    if solved is not None:
+        stamps_ns = np.concatenate((solved.stamps_ns, stamps_ns))
+        poses = np.concatenate((solved.poses, poses))
+        motions = np.concatenate((solved.motions, motions))
+        covariances = np.concatenate((solved.covariances, covariances))
+        refused = np.concatenate((solved.refused, refused))
+        all_scans = KeyScans.concatenate(solved.scans, KeyScans.from_scans(scans)) if scans else solved.scans
+        known = solved.known
+    else:
+        all_scans = KeyScans.from_scans(scans)
+    gaps = np.zeros(len(poses), dtype=bool)
+    gaps[[tie.second for tie in ties]] = True
+    # Across a gap the chain says nothing.
+    covariances[gaps] = UNKNOWN_STEP
     length, turn = parameters.loops.submap_length, parameters.front_end.turn_length
+    places = Submaps.split_by_path_length(
+        poses, motions, covariances, length, turn, refused, parameters.loops.refused_path_length, gaps
+    )
+    # The last place may have grown: what is known of it holds no longer.
+    first_place = max(len(solved.places) - 1, 0) if solved is not None else 0
+    kept = tuple(loop for loop in known if loop.second < first_place and loop.reason != LEFT_THE_MAP)
     return MapSession(
-        scans=KeyScans.from_scans(scans),
+        scans=all_scans,
         stamps_ns=stamps_ns,
         poses=poses,
         motions=motions,
         covariances=covariances,
         refused=refused,
-        steps=_odometry_edges(motions, covariances, refused, track, parameters),
-        places=Submaps.split_by_path_length(
-            poses, motions, covariances, length, turn, refused, parameters.loops.refused_path_length
-        ),
+        steps=_odometry_edges(motions, covariances, refused, track, parameters, gaps),
+        places=places,
+        known=(*kept, *(_tie_loop(tie, poses, places) for tie in ties)),
+        first_place=first_place,
+        ties=ties,
     )
+
+
+def _tie_loop(tie: Tie, poses: F64, places: Submaps) -> Loop:
+    measured = (tie.first, tie.second, tie.T_first_second, tie.covariance)
+    return _between_places(*measured, poses, places, LEFT_THE_MAP)
 
 
 def from_map_state(state: MapState, parameters: GraphMapperParameters) -> MapSession:
@@ -135,25 +187,31 @@ def concatenate(old: MapSession, new: MapSession) -> MapSession:
 
 def _loops(state: MapState, places: Submaps) -> tuple[Loop, ...]:
     """The saved loops, moved from their keyscans to the references of the submaps that contain those."""
-    owner = np.repeat(np.arange(len(places)), np.diff(places.start))
-    loops = []
+    saved = state.loops
+    return tuple(
+        _between_places(i, j, Pose2.from_array(measured), np.linalg.inv(information), state.poses, places)
+        for (i, j), measured, information in zip(saved.pairs.tolist(), saved.measured, saved.information, strict=True)
+    )
+
+
+def _between_places(
+    i: int, j: int, T_i_j: Pose2, covariance: F64, poses: F64, places: Submaps, reason: str = "of the saved map"
+) -> Loop:
+    """What was measured between two keyscans as an accepted loop between the places that contain them."""
+    first, second = (int(np.searchsorted(places.start, k, side="right")) - 1 for k in (i, j))
+    a, b = (Pose2.from_array(poses[places.reference[place]]) for place in (first, second))
+    T_first_second = a.between(Pose2.from_array(poses[i])) @ T_i_j @ Pose2.from_array(poses[j]).between(b)
     nan = float("nan")
-    for (i, j), measured, information in zip(
-        state.loops.pairs.tolist(), state.loops.measured, state.loops.information, strict=True
-    ):
-        first, second = int(owner[i]), int(owner[j])
-        a, b = (Pose2.from_array(state.poses[places.reference[place]]) for place in (first, second))
-        at_i, at_j = Pose2.from_array(state.poses[i]), Pose2.from_array(state.poses[j])
-        T_first_second = a.between(at_i) @ Pose2.from_array(measured) @ at_j.between(b)
-        covariance: F64 = np.asarray(np.linalg.inv(information), dtype=np.float64)
-        loops.append(
-            Loop(first, second, T_first_second, covariance, nan, nan, nan, nan, (0.0, 0.0), True, "of the saved map")
-        )
-    return tuple(loops)
+    return Loop(first, second, T_first_second, covariance, nan, nan, nan, nan, (0.0, 0.0), True, reason)
 
 
 def _odometry_edges(
-    motions: F64, covariances: F64, refused: NDArray[np.bool_], track: EventLog, parameters: GraphMapperParameters
+    motions: F64,
+    covariances: F64,
+    refused: NDArray[np.bool_],
+    track: EventLog,
+    parameters: GraphMapperParameters,
+    gaps: NDArray[np.bool_],
 ) -> Edges:
     """Steps from keyscan to keyscan by odometry alone, as the scans are compared again; without it, the matches'."""
     if not parameters.use_odometry:
@@ -163,9 +221,11 @@ def _odometry_edges(
     noise = parameters.front_end.odometry_noise
     chi = [
         odometry_chi(Pose2.from_array(step), Pose2.from_array(motion), noise)
-        for step, motion, no in zip(steps, motions[1:], refused[1:], strict=True)
+        for step, motion, no in zip(steps, motions[1:], refused[1:] | gaps[1:], strict=True)
         if not no
     ]
     scale = odometry_scale(chi)
     floored = [scale**2 * noise.covariance(Pose2.from_array(step)) + _ODOMETRY_FLOOR for step in steps]
-    return Edges.chain(steps, np.array(floored).reshape(-1, 3, 3), refused[1:])
+    covariances = np.array(floored).reshape(-1, 3, 3)
+    covariances[gaps[1:]] = UNKNOWN_STEP
+    return Edges.chain(steps, covariances, refused[1:])

@@ -2,7 +2,8 @@
 
 While the log is read, each scan is matched against the scans just before it. At its end loops are closed between
 places, the pose graph is solved, all scans are refined against all that see the same walls, until nothing moves, and
-the map is built.
+the map is built. A long log is solved before its end, too: where the robot has been often enough, scans are localised
+on the solved map and add nothing to it.
 """
 
 from __future__ import annotations
@@ -15,9 +16,12 @@ import numpy as np
 from hsloc.localisation.kalman_filter import predict_covariance
 from hsloc.model.estimate import Estimate, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
-from hsloc.model.pose2 import IDENTITY
-from hsloc.slam.back_end import finish
-from hsloc.slam.front_end import FLOOR, FrontEnd
+from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.slam.back_end import finish, solve
+from hsloc.slam.calibration import FLOOR
+from hsloc.slam.front_end import FrontEnd
+from hsloc.slam.known_map import KnownMap
+from hsloc.slam.map_session import MapSession, Tie, from_front_end
 from hsloc.slam.trajectory_correction import EventLog
 
 if TYPE_CHECKING:
@@ -29,6 +33,7 @@ if TYPE_CHECKING:
     from hsloc.model.events import Scan
     from hsloc.slam.front_end import LocalMatch
     from hsloc.slam.keyscans import KeyScan
+    from hsloc.slam.known_map import Anchor
     from hsloc.slam.parameters import GraphMapperParameters, Resume
     from hsloc.slam.result import MappingResult
 
@@ -47,6 +52,9 @@ class Mapper:
         self._scans: list[KeyScan] = []
         self._stamps: list[int] = []
         self._local: list[LocalMatch] = []
+        self._solved: MapSession | None = None
+        self._ties: list[Tie] = []
+        self._since_solved = 0
         self._held: list[tuple[int, PairedScan]] = []
         self._T_map_odom = IDENTITY
         self._T_map_key = IDENTITY
@@ -69,14 +77,23 @@ class Mapper:
         found = self._matcher.update(event, points)
         covariance = predict_covariance(self._covariance, self._T_map_key, found.motion, found.covariance)
         T_odom_base = event.T_odom_base if self._parameters.use_odometry else found.pose
+        first_new = len(self._local)
         local = self._keep_companions(event, found) if found.is_keyscan else found
         self._held = []  # No later scan carries them: a robot that waits for hours has no keyscans.
         self._track.add(T_odom_base, is_scan=True, is_key=found.is_keyscan)
         if found.is_keyscan:
             self._covariance, self._T_map_key = covariance, found.pose
             self._keep(event.scan, found.scans[0].scan, local)
+            if found.anchor is not None:
+                self._tie(found.anchor, first_new)
+        elif found.anchor is not None:
+            self._covariance, self._T_map_key = covariance, found.pose
+            self._track.anchor(found.anchor)
         self._T_map_odom = found.pose @ T_odom_base.inverse()
         self._T_last_scan = found.pose
+        self._since_solved += found.is_keyscan or found.anchor is not None
+        if found.is_keyscan and self._is_to_be_solved():
+            self._solve()
         return Estimate(
             event.scan.stamp_ns,
             found.pose,
@@ -86,6 +103,43 @@ class Mapper:
             found.evaluations,
             found.reason,
         )
+
+    def _tie(self, anchor: Anchor, first_new: int) -> None:
+        """Note where the log left the known map: at the keyscan of that number since it was solved."""
+        assert self._solved is not None
+        T_key_scan = Pose2.from_array(self._solved.poses[anchor.keyscan]).between(self._local[first_new].pose)
+        self._ties.append(Tie(anchor.keyscan, len(self._solved.poses) + first_new, T_key_scan, anchor.covariance))
+
+    def _is_to_be_solved(self) -> bool:
+        """Whether the map is to be solved now, so that the time for it grows with the log, not with its square."""
+        if self._resume is not None or not self._parameters.use_odometry:
+            return False
+        if self._solved is None:
+            return len(self._scans) >= self._parameters.solve_after
+        return self._matcher.is_far_from_known_map and self._since_solved >= len(self._solved.poses)
+
+    def _solve(self) -> None:
+        """Solve the map so far, and go on in its frame."""
+        session = self._session()
+        assert session is not None
+        solved = solve(session, self._parameters, self._rng)
+        T_map_key = Pose2.from_array(solved.poses[-1])
+        T_new_old = T_map_key @ self._T_map_key.inverse()
+        self._solved, self._since_solved = solved, 0
+        self._scans, self._stamps, self._local = [], [], []
+        known = KnownMap(solved.scans, solved.poses, self._parameters.front_end.local_range)
+        self._matcher.go_on(known, T_map_key)
+        self._T_map_key, self._T_map_odom = T_map_key, T_new_old @ self._T_map_odom
+        self._T_last_scan = T_map_key
+
+    def _session(self) -> MapSession | None:
+        """All keyscans so far, None without one."""
+        if not self._scans and self._solved is None:
+            return None
+        return from_front_end(
+            self._scans, np.array(self._stamps, dtype=np.int64), self._local, self._track, self._parameters,
+            self._solved, tuple(self._ties),
+        )  # fmt: skip
 
     def _keep(self, scan: Scan, prepared: KeyScan, local: LocalMatch) -> None:
         self._scans.append(prepared)
@@ -118,7 +172,4 @@ class Mapper:
 
         Raises MapError if no connection with the saved map is found.
         """
-        return finish(
-            self._scans, np.array(self._stamps, dtype=np.int64), self._local, self._track, self._parameters,
-            self._rng, progress, self._resume,
-        )  # fmt: skip
+        return finish(self._session(), self._track, self._parameters, self._rng, progress, self._resume)

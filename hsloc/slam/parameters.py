@@ -29,6 +29,10 @@ class GraphMapperParameters(Parameters):
     occupancy: OccupancyMapperParameters = field(default_factory=OccupancyMapperParameters)
     use_odometry: bool = True
     """Whether odometry predicts each scan's pose; otherwise a constant velocity does."""
+    solve_after: Count = 5000
+    """Number of keyscans after which the map is solved while the log is read, so that scans which it explains are
+    localised on it and add nothing to it; it is solved again when the log has left it and as many scans have come as
+    it has keyscans."""
     passes: Count = 3
     """Maximum number of passes of loop search and joint registration over the whole log."""
 

@@ -55,6 +55,8 @@ class MappingQuality:
     """Largest standard deviation of a keyscan's heading relative to the first one [deg]."""
     keyscans: int
     """Number of scans that the map was built from."""
+    followed: int
+    """Number of scans that were localised on the map so far, which explains them, and added nothing to it."""
     passes: int
     """Number of rounds of the joint registration."""
     moved: Measured

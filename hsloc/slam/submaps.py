@@ -58,13 +58,17 @@ class Submaps:
         turn_length: float,
         refused: NDArray[np.bool_] | None = None,
         refused_path_length: float = 0.0,
+        gaps: NDArray[np.bool_] | None = None,
     ) -> Submaps:
         """Submaps of `length` metres of the path; `motions` and `covariances` lead to each keyscan.
 
-        A rotation of one radian counts as `turn_length` metres, a refused match as `refused_path_length`.
+        A rotation of one radian counts as `turn_length` metres, a refused match as `refused_path_length`. At `gaps`
+        (n,) nothing leads to a keyscan from the one before: there a submap begins.
         """
         refused = np.zeros(len(poses), dtype=bool) if refused is None else refused
-        way = np.cumsum(np.hypot(motions[:, 0], motions[:, 1]) + turn_length * np.abs(motions[:, 2]))
+        gaps = np.zeros(len(poses), dtype=bool) if gaps is None else gaps
+        step = np.hypot(motions[:, 0], motions[:, 1]) + turn_length * np.abs(motions[:, 2])
+        way = np.cumsum(np.where(gaps, _FAR, step))
         index = np.floor(way / length).astype(np.int64)
         start = np.concatenate((np.flatnonzero(np.diff(index, prepend=-1)), [len(poses)])).astype(np.int64)
         reference = (start[:-1] + start[1:]) // 2
@@ -79,7 +83,7 @@ class Submaps:
             chained[k] = covariance
         count = np.cumsum(refused)
         uncertain = np.diff(count[reference]) > 0
-        piece = np.zeros(len(reference), dtype=np.int64)
+        piece = np.cumsum(gaps)[reference].astype(np.int64)
         return Submaps(
             start, reference, poses, steps, chained, uncertain, (way + refused_path_length * count)[reference], piece
         )

@@ -12,18 +12,25 @@ from hsloc.slam.calibration import OdometryCalibration, apply, calibrate
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hsloc.slam.known_map import Anchor
+
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
 
 class EventLog:
-    """Odometry of all messages and scans in the order of the log; some scans are keyscans."""
+    """Odometry of all messages and scans in the order of the log.
+
+    Some scans are keyscans, and some are anchored: their poses are known relative to a keyscan.
+    """
 
     def __init__(self, turn_length: float) -> None:
         self._turn_length = turn_length
         self._poses: list[tuple[float, float, float]] = []
         self._is_scan: list[bool] = []
         self._keys: list[int] = []
+        self._anchored: list[int] = []
+        self._anchors: list[Anchor] = []
 
     def add(self, T_odom_base: Pose2, is_scan: bool, is_key: bool = False) -> None:
         """The next event."""
@@ -31,6 +38,11 @@ class EventLog:
             self._keys.append(len(self._poses))
         self._poses.append((T_odom_base.x, T_odom_base.y, T_odom_base.theta))
         self._is_scan.append(is_scan)
+
+    def anchor(self, anchor: Anchor) -> None:
+        """Anchor the last event, a scan that is not a keyscan."""
+        self._anchored.append(len(self._poses) - 1)
+        self._anchors.append(anchor)
 
     def make_key(self, event: int) -> None:
         """Make a scan of before, the event of that number, a keyscan; keyscans must come in order."""
@@ -44,17 +56,21 @@ class EventLog:
         """Odometry of the keyscans, shape (n, 3)."""
         return np.array([self._poses[k] for k in self._keys]).reshape(-1, 3)
 
+    @property
+    def anchored(self) -> int:
+        """How many scans were anchored."""
+        return len(self._anchored)
+
     def calibrated(self, key_poses: F64) -> OdometryCalibration:
         """Calibration of the odometry by the final poses of the keyscans."""
-        return calibrate(
-            self._index(), np.array(self._poses).reshape(-1, 3), np.array(self._keys, dtype=int), key_poses
-        )
+        known, poses = self._known(key_poses)
+        return calibrate(self._index(), np.array(self._poses).reshape(-1, 3), known, poses)
 
     def corrected(self, key_poses: F64, calibration: OdometryCalibration | None = None) -> tuple[F64, F64]:
         """Poses in the map of all odometry messages (k, 3) and of all scans (m, 3).
 
-        Each event lies between two keyscans, on the odometry seen from both; what they disagree in is shared out
-        along the path: a wheel errs while it turns, not while it stands.
+        Each event lies between two keyscans or anchored scans, on the odometry seen from both; what they disagree in is
+        shared out along the path: a wheel errs while it turns, not while it stands.
         """
         odometry = np.array(self._poses).reshape(-1, 3)
         is_scan = np.array(self._is_scan, dtype=bool)
@@ -62,7 +78,7 @@ class EventLog:
             return odometry[~is_scan], odometry[is_scan]
         if calibration is not None:
             odometry = apply(calibration, self._index(), odometry)
-        keys = np.array(self._keys, dtype=np.int64)
+        keys, key_poses = self._known(key_poses)
         before, after, fraction = self._between(odometry, keys)
         from_before = compose_poses(key_poses[before], relative_poses(odometry[keys[before]], odometry))
         from_after = compose_poses(key_poses[after], relative_poses(odometry[keys[after]], odometry))
@@ -72,7 +88,7 @@ class EventLog:
         poses[:, 2] = wrap_angles(poses[:, 2])
         return poses[~is_scan], poses[is_scan]
 
-    def covariances(self, key_covariances: F64) -> tuple[F64, F64]:
+    def covariances(self, key_poses: F64, key_covariances: F64) -> tuple[F64, F64]:
         """Covariances of all odometry messages (k, 3, 3) and of all scans (m, 3, 3), from those of the keyscans.
 
         Interpolated along the path, as if the errors of two keyscans were equal: never too small. NaN without keyscans.
@@ -81,10 +97,43 @@ class EventLog:
         if len(self._keys) == 0:
             unknown = np.full((len(is_scan), 3, 3), np.nan)
             return unknown[~is_scan], unknown[is_scan]
-        before, after, fraction = self._between(np.array(self._poses).reshape(-1, 3), np.array(self._keys))
+        keys, _ = self._known(key_poses)
+        known = self._known_covariances(key_poses, key_covariances)
+        before, after, fraction = self._between(np.array(self._poses).reshape(-1, 3), keys)
         part = fraction[:, None, None]
-        found = (1.0 - part) * key_covariances[before] + part * key_covariances[after]
+        found = (1.0 - part) * known[before] + part * known[after]
         return found[~is_scan], found[is_scan]
+
+    def _known(self, key_poses: F64) -> tuple[I64, F64]:
+        """Events (n,) whose poses (n, 3) are known: keyscans and anchored scans, in the order of the log."""
+        keys = np.array(self._keys, dtype=np.int64)
+        if not self._anchors:
+            return keys, key_poses
+        rows = np.array([anchor.keyscan for anchor in self._anchors])
+        seen_from = np.array([anchor.T_key_scan.to_array() for anchor in self._anchors])
+        events = np.concatenate((keys, self._anchored))
+        poses = np.concatenate((key_poses, compose_poses(key_poses[rows], seen_from)))
+        order = np.argsort(events, kind="stable")
+        return events[order], poses[order]
+
+    def _known_covariances(self, key_poses: F64, key_covariances: F64) -> F64:
+        """Covariances (n, 3, 3) of what `_known` lists: an anchored scan's is propagated from its keyscan's."""
+        if not self._anchors:
+            return key_covariances
+        rows = np.array([anchor.keyscan for anchor in self._anchors])
+        offset = np.array([anchor.T_key_scan.to_array() for anchor in self._anchors])
+        c, s = np.cos(key_poses[rows, 2]), np.sin(key_poses[rows, 2])
+        by_pose = np.tile(np.eye(3), (len(rows), 1, 1))
+        by_pose[:, 0, 2] = -s * offset[:, 0] - c * offset[:, 1]
+        by_pose[:, 1, 2] = c * offset[:, 0] - s * offset[:, 1]
+        by_offset = np.tile(np.eye(3), (len(rows), 1, 1))
+        by_offset[:, 0, 0], by_offset[:, 0, 1], by_offset[:, 1, 0], by_offset[:, 1, 1] = c, -s, s, c
+        measured = np.array([anchor.covariance for anchor in self._anchors])
+        anchored = by_pose @ key_covariances[rows] @ by_pose.transpose(0, 2, 1)
+        anchored += by_offset @ measured @ by_offset.transpose(0, 2, 1)
+        order = np.argsort(np.concatenate((self._keys, self._anchored)), kind="stable")
+        ordered: F64 = np.concatenate((key_covariances, anchored))[order]
+        return ordered
 
     def _between(self, odometry: F64, keys: I64) -> tuple[I64, I64, F64]:
         """Of each event the keyscans before and after it, and the part of the path between them that was driven."""

@@ -11,7 +11,7 @@ from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.model import Odometry, PairedScan, Pose2
 from hsloc.simulation.odometer import Slip
 from hsloc.simulation.presets import preset
-from hsloc.slam.front_end import odometry_chi, odometry_scale
+from hsloc.slam.calibration import odometry_chi, odometry_scale
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.parameters import GraphMapperParameters
 

@@ -20,6 +20,7 @@ from sqlalchemy import delete, exists, select, update
 from hsloc_service.db.tables import ENDED, FileRow, IdempotencyRow, JobRow, SweepRow, UploadDeletionRow
 from hsloc_service.errors import StoreError
 from hsloc_service.jobs.repository import base_job, delete_job
+from hsloc_service.jobs.workers import forget_workers
 from hsloc_service.logs import log
 from hsloc_service.results.deletion_queue import delete_upload
 from hsloc_service.storage import remove_tree
@@ -77,6 +78,7 @@ class Housekeeping:
 
     def _tidy_database(self, now: float) -> None:
         self._expire_uploads(now)
+        forget_workers(self._database)
         if self._settings.retention_s is not None:
             self._delete_old(now - self._settings.retention_s)
         with self._database.write() as session:

@@ -78,6 +78,19 @@ def upload_by_turns(servers: list[TestClient], content: bytes, block: int) -> st
     return str(place.rsplit("/", 1)[1])
 
 
+def test_jobs_and_cancellations_at_one_server_are_heard_at_once_by_another(
+    make_client: Callable[..., TestClient], fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hsloc_service.execution.dispatcher.IDLE_S", 60.0)  # it does not look by itself
+    takes = make_client(data=fleet.folder / "a", slots=0, **fleet.shared)
+    runs = make_client(data=fleet.folder / "b", slots=1, heartbeat_s=30.0, lease_s=60.0, **fleet.shared)
+    wait(runs, submit(runs))  # it listens by now, and has looked for a job in vain
+    job = submit(takes, b"slow 60")
+    wait(takes, job, states=("running",))
+    takes.post(f"/v1/jobs/{job}/cancel")
+    assert wait(takes, job)["state"] == "cancelled"
+
+
 def test_an_upload_begun_at_one_server_goes_on_at_the_other_and_a_worker_runs_the_job(
     servers: list[TestClient], fleet: Fleet, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

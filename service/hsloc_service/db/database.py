@@ -24,7 +24,7 @@ from hsloc_service.settings import SettingsError
 from hsloc_service.storage import BALLAST
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from sqlalchemy import Connection
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 SQLITE = "hsloc.db"
 """Name of the database in the data folder."""
+CHANNEL = "hsloc"
 _POSTGRESQL: dict[str, Any] = {
     "connect_timeout": 10,
     # A database that is cut off must not hold up a thread for the two hours of TCP.
@@ -139,6 +140,17 @@ class Database:
                 if mine:
                     connection.execute(text("SELECT pg_advisory_unlock(:key)"), key)
 
+    @contextmanager
+    def listening(self) -> Iterator[Callable[[float], Iterable[str]]]:
+        """What `notify` sends, by a connection of its own: texts that come within a time [s]. PostgreSQL only."""
+        with self._engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+            connection.execute(text(f"LISTEN {CHANNEL}"))
+            driver: Any = connection.connection.driver_connection
+            try:
+                yield lambda within_s: (each.payload for each in driver.notifies(timeout=within_s))
+            finally:
+                connection.invalidate()  # else the next one to use it would listen, too
+
     def now(self, session: Session) -> float:
         """Seconds since 1970 by the clock of the database, which all its clients share."""
         if self.shared:
@@ -148,6 +160,12 @@ class Database:
     def close(self) -> None:
         """Close all connections."""
         self._engine.dispose()
+
+
+def notify(session: Session, message: str) -> None:
+    """Send a text to who listens on the same PostgreSQL when the transaction is committed; with SQLite, nothing."""
+    if session.get_bind().dialect.name == "postgresql":
+        session.execute(text("SELECT pg_notify(:channel, :message)"), {"channel": CHANNEL, "message": message})
 
 
 def is_unreachable(error: Exception) -> bool:

@@ -275,12 +275,3 @@ class AuditRow(Base):
     action: Mapped[str]
     target: Mapped[str]
     __table_args__ = (Index("audit_by_tenant", "tenant", "id"),)
-
-
-class RateRow(Base):
-    """A token bucket that several servers share."""
-
-    __tablename__ = "rate"
-    name: Mapped[str] = mapped_column(primary_key=True)
-    level: Mapped[float]
-    at: Mapped[float]

@@ -1,7 +1,8 @@
 """Who starts the jobs. The job's row with its lease decides; a dispatcher only chooses when it is read.
 
 `LocalDispatcher` runs jobs in N slots of this machine, whether the database is its own or shared with others: a slot
-that is free looks for a job once a second, and at once when this server took one.
+that is free looks for a job once a second, and at once when this server took one, or PostgreSQL notifies that another
+did.
 """
 
 from __future__ import annotations
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
     from hsloc_service.results.deletion_queue import DeletionQueue
 
 IDLE_S = 1.0
+"""Time between two looks of a free slot for a job [s]."""
+LISTEN_S = 0.5
+LISTEN_AGAIN_S = 5.0
+"""Wait before listening again to a database that was away [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +113,10 @@ class LocalDispatcher:
             thread = threading.Thread(target=self._slot, name=f"slot-{k}", daemon=True)
             thread.start()
             self._threads.append(thread)
+        if self._leases.database.shared:
+            thread = threading.Thread(target=self._listen, name="listen", daemon=True)
+            thread.start()
+            self._threads.append(thread)
 
     def stop(self) -> None:
         """End the slots."""
@@ -151,13 +160,37 @@ class LocalDispatcher:
                     with self._work:
                         self._work.wait(IDLE_S)
             except OperationalError as error:
-                # A full disk or a locked database passes; the slot must survive it.
+                # A full disk, a locked database or one that is away passes; the slot must survive it.
                 log("slot.database", error=str(error.orig))
-                self._storage.drop_ballast()
+                if not self._leases.database.shared:
+                    self._storage.drop_ballast()
                 self._stop.wait(IDLE_S)
             except Exception as error:
                 log("slot.error", error=f"{type(error).__name__}: {error}")
                 self._stop.wait(IDLE_S)
+
+    def _listen(self) -> None:
+        """Wake slots for jobs that other servers have queued, and end those that were cancelled there.
+
+        Where the database is away, or does not deliver notifications, slots find jobs by looking every IDLE_S.
+        """
+        while not self._stop.is_set():
+            try:
+                with self._leases.database.listening() as messages:
+                    while not self._stop.is_set():
+                        for message in messages(LISTEN_S):
+                            self._hear(message)
+            except Exception as error:
+                log("listen.error", error=f"{type(error).__name__}: {error}"[:300])
+                self._stop.wait(LISTEN_AGAIN_S)
+
+    def _hear(self, message: str) -> None:
+        kind, _, job_id = message.partition(" ")
+        if kind == "cancelling":
+            self.cancel(job_id)
+            return
+        with self._work:
+            self._work.notify_all()
 
     def _run_next(self) -> bool:
         """Run the next job; False if there is none, or the disk is so full that it would end as `disk_full`."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import delete
 
+from hsloc_service.db.database import notify
 from hsloc_service.db.tables import EventRow
 
 if TYPE_CHECKING:
@@ -19,4 +20,7 @@ def record(session: Session, job: JobRow, kind: str, data: dict[str, Any]) -> No
     """Append an event; an older event of progress is replaced by a newer one."""
     if kind == "progress":
         session.execute(delete(EventRow).where(EventRow.job_id == job.id, EventRow.kind == "progress"))
+    if kind == "state" and data["state"] in ("queued", "cancelling"):
+        # A hint for slots elsewhere; who misses it finds the row within a second, or at the next heartbeat.
+        notify(session, "queued" if data["state"] == "queued" else f"cancelling {job.id}")
     session.add(EventRow(tenant=job.tenant, job_id=job.id, at=time.time(), kind=kind, data=data))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hsloc_service.db.database import Database
 
 FORGET_S = 86400.0
-"""Age of the last heartbeat at which a worker that did not say goodbye is forgotten [s]."""
+"""Age of the last heartbeat at which the row of a worker that was killed is removed [s]."""
 
 
 class WorkerState(NamedTuple):
@@ -50,6 +50,12 @@ def workers(database: Database, who: Principal) -> list[WorkerState]:
         mine = [job.id for job in jobs if job.tenant == who.tenant]
         found.append(WorkerState(row, max(now - row.heartbeat, 0.0), len(jobs), mine))
     return found
+
+
+def forget_workers(database: Database) -> None:
+    """Remove the rows of those that were not there for a day."""
+    with database.write() as session:
+        session.execute(delete(WorkerRow).where(WorkerRow.heartbeat < database.now(session) - FORGET_S))
 
 
 @dataclass(slots=True)
@@ -83,7 +89,7 @@ class Presence:
             log("presence.error", error=str(error.orig))
 
     def beat(self) -> None:
-        """Write the row once, and forget those that were not there for a day; a database that is away is logged."""
+        """Write the row once; a database that is away is logged."""
         try:
             self._write()
         except DBAPIError as error:
@@ -98,7 +104,6 @@ class Presence:
                 row.version, row.slots, row.started = __version__, self.slots, now
                 session.add(row)
             row.heartbeat, row.draining = now, self.draining()
-            session.execute(delete(WorkerRow).where(WorkerRow.heartbeat < now - FORGET_S))
 
     def _run(self) -> None:
         while not self._stop.wait(self.interval_s):

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from sqlalchemy import delete, select
+from sqlalchemy.exc import SQLAlchemyError
 
 from hsloc_service.call_timeout import MIN_BYTES_PER_S, call_within
 from hsloc_service.db.tables import FileRow, UploadPartRow
@@ -58,10 +59,22 @@ class UploadParts:
         call_within(self.limit_s(size), lambda: self.store.publish(staged, name, [asset]))
         try:
             self._record(UploadPartRow(file_id=file_id, start=start, size=size, number=number), last)
-        except ServiceError:
+        except (ServiceError, SQLAlchemyError):
+            # After an error of the database the row may be there all the same; then the object must stay.
+            if self._is_part(file_id, number):
+                raise
             with suppress(StoreError):  # then `sweep` removes it, if the upload is completed
                 self._remove(name)
             raise
+
+    def _is_part(self, file_id: str, number: int) -> bool:
+        """Whether the upload has this part; True where the database cannot be asked."""
+        query = select(UploadPartRow.size).where(UploadPartRow.file_id == file_id, UploadPartRow.number == number)
+        try:
+            with self.database.read() as session:
+                return session.scalar(query) is not None
+        except SQLAlchemyError:
+            return True
 
     def _record(self, part: UploadPartRow, last: bool) -> None:
         with self.database.write() as session:

@@ -1,4 +1,4 @@
-"""Priorities, waits before another attempt, sweeps, an audit log, and rates that servers share."""
+"""Priorities, waits before another attempt, sweeps, and an audit log."""
 
 from __future__ import annotations
 

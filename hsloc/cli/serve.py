@@ -45,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--scopes", default="read,write,admin", help="Scopes of the new token (default: all).")
     group.add_argument("--expires-days", type=float, metavar="D", help="Validity of the new token [days].")
     group.add_argument("--list-tokens", action="store_true", help="Show the ids and tenants of the tokens, and exit.")
+    group.add_argument("--audit", action="store_true", help="Show the newest tokens and deletions, and exit.")
     group.add_argument("--revoke-token", metavar="ID", help="Revoke a token, and exit.")
 
 
@@ -66,6 +67,8 @@ def run(arguments: argparse.Namespace) -> int:
             return int(service.new_token(chosen, arguments.new_token, arguments.scopes, arguments.expires_days))
         if arguments.list_tokens:
             return int(service.list_tokens(chosen))
+        if arguments.audit:
+            return int(service.show_audit(chosen))
         if arguments.revoke_token is not None:
             return int(service.revoke_token(chosen, arguments.revoke_token))
         return int(

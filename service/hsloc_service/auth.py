@@ -9,8 +9,9 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from sqlalchemy import select, update
+from sqlalchemy import select
 
+from hsloc_service.audit import OPERATOR, note
 from hsloc_service.db.tables import TokenRow
 from hsloc_service.errors import ServiceError
 
@@ -80,6 +81,7 @@ class Tokens:
             known = session.scalar(select(TokenRow).where(TokenRow.sha256 == row.sha256))
             if known is None:
                 session.add(row)
+                note(session, tenant, OPERATOR, "token.issue", ident)
         return token
 
     def issue_operators(self, tenant: str, secret: str) -> None:
@@ -88,7 +90,9 @@ class Tokens:
         digest = sha256_of(secret)
         with self._database.write() as session:
             older = (TokenRow.label == OPERATORS, TokenRow.sha256 != digest, TokenRow.revoked.is_(None))
-            session.execute(update(TokenRow).where(*older).values(revoked=time.time()))
+            for row in session.scalars(select(TokenRow).where(*older)):
+                row.revoked = time.time()
+                note(session, row.tenant, OPERATOR, "token.revoke", row.id)
 
     def revoke(self, ident: str) -> bool:
         """Revoke a token; whether there was one with this id."""
@@ -96,6 +100,7 @@ class Tokens:
             row = session.get(TokenRow, ident)
             if row is not None:
                 row.revoked = time.time()
+                note(session, row.tenant, OPERATOR, "token.revoke", row.id)
             return row is not None
 
     def rows(self) -> Sequence[TokenRow]:

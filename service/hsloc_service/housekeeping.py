@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import delete, exists, select, update
 
+from hsloc_service.audit import RETENTION, forget, note
 from hsloc_service.db.tables import ENDED, FileRow, IdempotencyRow, JobRow, SweepRow, UploadDeletionRow
 from hsloc_service.errors import StoreError
 from hsloc_service.jobs.repository import base_job, delete_job
@@ -83,6 +84,7 @@ class Housekeeping:
             self._delete_old(now - self._settings.retention_s)
         with self._database.write() as session:
             session.execute(delete(IdempotencyRow).where(IdempotencyRow.created < now - KEY_S))
+            forget(session, now)
         uploads, results = self._deletions.clear_uploads(), self._deletions.clear()
         if uploads or results:
             log("tidy", uploads=uploads, results=results)
@@ -136,7 +138,10 @@ class Housekeeping:
             self._database.lock(session, "tenants")
             jobs = session.scalars(query.order_by(JobRow.seq).limit(BATCH)).all()
             extended = base_job(session, *(job.id for job in jobs))
-            delete_job(session, *(job for job in jobs if job.id not in extended))
+            old = [job for job in jobs if job.id not in extended]
+            delete_job(session, *old)
+            for job in old:
+                note(session, job.tenant, RETENTION, "job.delete", job.id)
             return jobs[-1].seq if jobs else None
 
     def _delete_uploads(self, before: float, after: str) -> str | None:
@@ -148,6 +153,7 @@ class Housekeeping:
             for row in files:
                 if row.id not in needed:
                     delete_upload(session, row)
+                    note(session, row.tenant, RETENTION, "file.delete", row.id)
             return files[-1].id if files else None
 
 

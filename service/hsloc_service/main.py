@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import uvicorn
 
+from hsloc_service import audit
 from hsloc_service.auth import SCOPES, Tokens
 from hsloc_service.backup import back_up
 from hsloc_service.db.database import database_place, open_database
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
 
     from fastapi import FastAPI
 
+    from hsloc_service.db.database import Database
+
+AUDIT_LINES = 1000
 SHUTDOWN_S = 10
 BACKLOG = 2048
 
@@ -177,6 +181,15 @@ def list_tokens(settings: Settings) -> int:
     return 0
 
 
+def show_audit(settings: Settings) -> int:
+    """Show the newest tokens and deletions of all tenants; works while the service runs. Raises SettingsError."""
+    with _database(settings) as database:
+        for row in reversed(audit.entries(database, None, None, AUDIT_LINES)):
+            at = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(row.at))
+            sys.stdout.write(f"{at}  {row.tenant}  {row.actor or 'without a token'}  {row.action}  {row.target}\n")
+    return 0
+
+
 def revoke_token(settings: Settings, ident: str) -> int:
     """Make a token worthless from the next request on; works while the service runs. Raises SettingsError."""
     with _tokens(settings) as tokens:
@@ -187,13 +200,19 @@ def revoke_token(settings: Settings, ident: str) -> int:
 
 @contextmanager
 def _tokens(settings: Settings) -> Iterator[Tokens]:
-    """The tokens of a data folder that exists already."""
+    with _database(settings) as database:
+        yield Tokens(database)
+
+
+@contextmanager
+def _database(settings: Settings) -> Iterator[Database]:
+    """The database of a data folder that exists already."""
     place = database_place(settings)
     if isinstance(place, Path) and not place.is_file():
         raise SettingsError(f"{settings.data}: no data folder of hsloc; name it with --data")
     database = open_database(settings)
     try:
-        yield Tokens(database)
+        yield database
     finally:
         database.close()
 

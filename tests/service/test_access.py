@@ -54,7 +54,7 @@ READ = {
     ("head", "/v1/tus/{file_id}"),
     ("options", "/v1/tus"),
 }
-ADMIN = {("get", "/metrics"), ("get", "/v1/webhook-secret"), ("get", "/v1/workers")}
+ADMIN = {("get", "/v1/audit"), ("get", "/metrics"), ("get", "/v1/webhook-secret"), ("get", "/v1/workers")}
 WRITE = {
     ("delete", "/v1/files/{file_id}"),
     ("delete", "/v1/jobs/{job_id}"),
@@ -403,3 +403,30 @@ def test_a_damaged_database_is_an_answer_and_a_line_in_the_log(make_live: Callab
         answer = client.get("/v1/files")
         assert (answer.status_code, answer.json()["code"]) == (500, "database")
     assert "Traceback" not in live.log.read_text()
+
+
+def test_tokens_and_deletions_are_in_the_audit_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    app = create_app(chosen := settings(tmp_path, require_token=True))
+    with TestClient(app) as client:
+        tokens = Tokens(app.state.context.database)
+        one, other = tokens.issue("one"), tokens.issue("two")
+        client.headers["Authorization"] = f"Bearer {one}"
+        job = submit(client)
+        wait(client, job)
+        file = client.get(f"/v1/jobs/{job}").json()["request"]["log"]
+        assert client.delete(f"/v1/jobs/{job}").status_code == 204
+        assert client.delete(f"/v1/files/{file}").status_code == 204
+        tokens.revoke(other.split("_")[1])
+        found = client.get("/v1/audit", params={"limit": 2}).json()
+        actor = one.split("_")[1]
+        assert [(each["actor"], each["action"], each["target"]) for each in found["entries"]] == [
+            (actor, "file.delete", file), (actor, "job.delete", job),
+        ]  # fmt: skip
+        more = client.get("/v1/audit", params={"before": found["next"]}).json()["entries"]
+        assert [(each["actor"], each["action"], each["target"]) for each in more] == [
+            ("operator", "token.issue", actor)
+        ]
+    assert program(["serve", "--data", str(chosen.data), "--audit"]) == 0
+    lines = [line.split("  ")[1:] for line in capsys.readouterr().out.splitlines()]
+    assert lines[-1] == ["two", "operator", "token.revoke", other.split("_")[1]]
+    assert len(lines) == 5

@@ -9,18 +9,29 @@ from typing import TYPE_CHECKING, Annotated, Any
 from fastapi import APIRouter, Query
 from fastapi.responses import Response
 from prometheus_client import generate_latest
-from pydantic import BaseModel, Field
+from pydantic import AwareDatetime, BaseModel, Field
 from sqlalchemy import func, select, text
 
 from hsloc.options import describe
 from hsloc.report.html import ComparedRun, over_seeds
 from hsloc.version import __version__
+from hsloc_service import audit
 from hsloc_service import config_schema as job_options
 from hsloc_service.db.tables import DeliveryRow, JobRow
 from hsloc_service.errors import ServiceError, not_found
 from hsloc_service.http import metrics
 from hsloc_service.http.context import Admin, Context, Ctx, Reader, problems
-from hsloc_service.http.schemas import UUID_PATTERN, Health, Info, LabelList, Options, Problem, SecretView, WorkerList
+from hsloc_service.http.schemas import (
+    UUID_PATTERN,
+    Health,
+    Info,
+    LabelList,
+    Options,
+    Problem,
+    SecretView,
+    WorkerList,
+    known_moment,
+)
 from hsloc_service.http.views import worker_view
 from hsloc_service.jobs.workers import workers
 from hsloc_service.webhooks import secret_of
@@ -92,6 +103,39 @@ def info(ctx: Ctx, who: Reader) -> Info:
 def list_workers(ctx: Ctx, who: Admin) -> WorkerList:
     """The servers and workers that share the database, with your jobs that they run. Needs the scope `admin`."""
     return WorkerList(workers=[worker_view(each, ctx.settings.lease_s) for each in workers(ctx.database, who)])
+
+
+class AuditEntry(BaseModel):
+    """Something that cannot be undone, or that gave or took access."""
+
+    id: int
+    at: AwareDatetime
+    actor: str = Field(description="id of the token; `operator`: the server's command line; `retention`: the server")
+    action: str = Field(description="token.issue, token.revoke, job.delete, sweep.delete, file.delete")
+    target: str = Field(description="id of the token, job, sweep or upload")
+
+
+class AuditList(BaseModel):
+    """Entries of your tenant, newest first; pass `next` as `before` for more."""
+
+    entries: list[AuditEntry]
+    next: int | None
+
+
+@router.get("/v1/audit", responses=problems())
+def audit_log(
+    ctx: Ctx,
+    who: Admin,
+    before: Annotated[int | None, Query(ge=1, le=2**62, description="`next` of the page before")] = None,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+) -> AuditList:
+    """Tokens and deletions of your tenant, for a year. Needs the scope `admin`."""
+    rows = audit.entries(ctx.database, who.tenant, before, limit)
+    found = [
+        AuditEntry(id=row.id, at=known_moment(row.at), actor=row.actor, action=row.action, target=row.target)
+        for row in rows
+    ]
+    return AuditList(entries=found, next=rows[-1].id if len(rows) == limit else None)
 
 
 @router.get("/v1/options", responses=problems())

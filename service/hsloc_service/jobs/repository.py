@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from sqlalchemy import ColumnElement, delete, func, or_, select
 
+from hsloc_service.audit import note
 from hsloc_service.db.tables import (
     ACTIVE,
     AssetRow,
@@ -212,6 +213,7 @@ class Jobs:
             if base_job(session, job_id):
                 raise conflict("in_use", "an active job extends the map of this one; cancel that first")
             delete_job(session, job)
+            note(session, who.tenant, who.token, "job.delete", job.id)
 
     def need_room(self, session: Session, who: Principal, count: int = 1) -> None:
         """Raises ServiceError 429 where so many more jobs would be too many that wait, 507 for a full disk or quota."""

@@ -14,6 +14,7 @@ from sqlalchemy import func, select
 
 from hsloc.sweep.runs import log_labels
 from hsloc.sweep.table import COLUMNS
+from hsloc_service.audit import note
 from hsloc_service.db.tables import ACTIVE, IdempotencyRow, JobRow, SweepRow
 from hsloc_service.errors import conflict, not_found
 from hsloc_service.jobs.repository import base_job, delete_job
@@ -122,6 +123,8 @@ class Sweeps:
             if base_job(session, *(job.id for job in jobs)):
                 raise conflict("in_use", "an active job extends the map of a job of this sweep; cancel that first")
             delete_job(session, *jobs)
+            note(session, who.tenant, who.token, "job.delete", *(job.id for job in jobs))
+            note(session, who.tenant, who.token, "sweep.delete", sweep_id)
             session.delete(state.row)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import case, delete, func, select, tuple_
 
+from hsloc_service.audit import note
 from hsloc_service.db.tables import ACTIVE, FileRow, JobRow, UploadPartRow
 from hsloc_service.errors import ServiceError, conflict, no_space, not_found
 from hsloc_service.results.deletion_queue import delete_upload
@@ -140,6 +141,7 @@ class Files:
             if file_id in needed_files(session):
                 raise conflict("in_use", "an active job needs this file; cancel it first")
             delete_upload(session, row)
+            note(session, who.tenant, who.token, "file.delete", file_id)
         self.storage.upload_path(file_id).unlink(missing_ok=True)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from hsloc_service.db.database import open_database
 from hsloc_service.execution.dispatcher import LocalDispatcher
 from hsloc_service.execution.input_cache import InputCache
+from hsloc_service.execution.inspection import Inspector
 from hsloc_service.execution.sandbox import choose_sandbox
 from hsloc_service.execution.supervisor import Supervisor
 from hsloc_service.jobs.leases import Leases, RetryPolicy
@@ -34,6 +35,7 @@ class Parts:
     upload_parts: UploadParts | None
     deletions: DeletionQueue
     dispatcher: LocalDispatcher
+    inspector: Inspector
 
     def close(self) -> None:
         """Close the database and release the data folder."""
@@ -66,4 +68,5 @@ def open_parts(
     inputs = InputCache(storage, upload_parts, settings.cache_bytes)
     supervisor = Supervisor(leases, storage, settings, stores, sandbox, inputs, store_failed)
     dispatcher = LocalDispatcher(supervisor, deletions, ended)
-    return Parts(storage, database, stores, upload_parts, deletions, dispatcher)
+    inspector = Inspector(storage, settings, sandbox, inputs, store_failed)
+    return Parts(storage, database, stores, upload_parts, deletions, dispatcher, inspector)

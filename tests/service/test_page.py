@@ -57,6 +57,7 @@ def test_upload_watch_look_download(
     page = open_page(live.url, viewport={"width": 1280, "height": 900})
     picture(page, "1-empty")
     page.set_input_files("#log", str(log))
+    look_before_it_runs(page)
     page.click("#go")
     page.wait_for_selector("#job-state .running")
     picture(page, "2-running")
@@ -111,6 +112,25 @@ def test_upload_watch_look_download(
     report = open_page(f"{live.url}/v1/jobs/{job['id']}/results/report.html?download=false")
     report.wait_for_selector(".rv-now")
     need_accessible(report)
+
+
+def look_before_it_runs(page: Any) -> None:
+    page.click("#inspect")
+    page.wait_for_selector("#inspected-map .rv-base")
+    assert "scans /scan, odometry /odom, reference /ground_truth; a map" in (page.text_content("#inspected") or "")
+    topics = "(control) => [...control.list.options].map((each) => each.value)"
+    assert page.locator("[data-option='read.scan_topic']").evaluate(topics) == ["/scan"]
+    page.click("#inspected-view [data-do=pose]")
+    page.locator("#inspected-view .rv-over").scroll_into_view_if_needed()
+    box = page.locator("#inspected-view .rv-over").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 50, y)
+    page.mouse.up()
+    assert (page.input_value("[data-option=initial_pose]") or "").endswith(", 0.000")
+    picture(page, "10-inspected")
+    page.evaluate("document.querySelector('[data-option=initial_pose]').value = ''")
 
 
 def share_by_a_link(page: Any, open_page: Callable[..., Any]) -> None:

@@ -6,14 +6,17 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from live_service import submit, wait
+from live_service import submit, upload, wait
+from paths import RECORDINGS
 from sqlalchemy import update
 
 from hsloc_service.auth import Tokens
 from hsloc_service.db.tables import ShareRow
+from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from fastapi.testclient import TestClient
 
@@ -40,6 +43,21 @@ def test_jobs_are_found_by_title_labels_and_notes(make_client: Callable[..., Tes
     assert client.patch(f"/v1/jobs/{first}", json={"title": None}).json()["notes"] == "people at the door"
     for wrong in ({"labels": ["a,b"]}, {"labels": [" a"]}, {"title": "x" * 201}, {"state": "failed"}):
         assert client.patch(f"/v1/jobs/{first}", json=wrong).status_code == 422, wrong
+
+
+def test_a_log_is_read_before_it_is_run(make_client: Callable[..., TestClient], tmp_path: Path) -> None:
+    client = make_client(worker_command=Settings().worker_command, sandbox="none", job_memory_bytes=4 << 30)
+    log = upload(client, (RECORDINGS / "hall.mcap").read_bytes(), "hall.mcap")
+    found = client.post("/v1/inspect", json={"log": log}).json()
+    assert (found["format"], found["scan_topic"], found["odom_topic"]) == ("mcap", "/scan", "/odom")
+    assert found["map_image"].startswith("data:image/png;base64,")
+    assert {each["topic"] for each in found["topics"]} >= {"/scan", "/odom", "/map"}
+    assert found["findings"] is not None
+    wrong = client.post("/v1/inspect", json={"log": upload(client, b"no log at all", "x.mcap")})
+    assert (wrong.status_code, wrong.json()["code"]) == (422, "invalid_input")
+    assert wrong.json()["message"].startswith("x.mcap: ")
+    assert client.get("/v1/jobs").json()["jobs"] == []
+    assert list((tmp_path / "data" / "work").iterdir()) == []
 
 
 def test_a_link_shows_one_job_until_it_is_revoked_or_expires(make_client: Callable[..., TestClient]) -> None:

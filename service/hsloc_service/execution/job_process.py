@@ -9,7 +9,7 @@ import selectors
 import signal
 import time
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from hsloc_service.execution.outcome import Outcome, interrupted
 from hsloc_service.execution.processes import end_job, start_job
@@ -18,7 +18,6 @@ from hsloc_service.storage import folder_bytes
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from hsloc_service.execution.heartbeat import Heartbeat
     from hsloc_service.execution.sandbox import Sandbox
     from hsloc_service.settings import Settings
     from hsloc_service.storage import Storage
@@ -67,11 +66,31 @@ def _printable(line: bytes) -> str:
     return "".join(letter for letter in text if letter.isprintable())[:MAX_LINE].rstrip()
 
 
+class JobMonitor(Protocol):
+    """Who is told how far a process is and what it writes, and says when it has to stop: see `Heartbeat`."""
+
+    def begin(self) -> None:
+        """The process was started."""
+
+    def report(self, phase: str, done: float, total: float, scans: int) -> None:
+        """Progress."""
+
+    def log(self, lines: list[str]) -> None:
+        """Lines that the process wrote."""
+
+    def flush(self) -> None:
+        """The process has ended."""
+
+    def cancel_reason(self) -> str | None:
+        """Why it has to stop; None if it may go on."""
+        ...
+
+
 class JobProcess:
     """Starts the process of a job in its folder, and watches it. Used in the thread of one slot."""
 
     def __init__(
-        self, folder: Path, mark: str, heartbeat: Heartbeat, storage: Storage, settings: Settings, sandbox: Sandbox
+        self, folder: Path, mark: str, heartbeat: JobMonitor, storage: Storage, settings: Settings, sandbox: Sandbox
     ) -> None:
         self._folder, self._mark, self._heartbeat = folder, mark, heartbeat
         self._storage, self._settings, self._sandbox = storage, settings, sandbox

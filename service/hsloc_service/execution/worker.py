@@ -57,7 +57,10 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.write(f"{time.monotonic() - begin:7.1f} s  {plain_names(text)}\n")  # it is not buffered
 
     try:
-        tell({"done": execute(job, arguments.folder, _throttled(tell, say), say)})
+        if job["request"].get("inspect"):
+            tell({"done": inspect(job, arguments.folder)})
+        else:
+            tell({"done": execute(job, arguments.folder, _throttled(tell, say), say)})
     except MemoryError:
         tell({"failed": "out_of_memory", "message": "the job needed more memory than it is allowed"})
         return 1
@@ -66,6 +69,53 @@ def main(argv: list[str] | None = None) -> int:
         traceback.print_exc()
         return 1
     return 0
+
+
+CHECKED_BYTES = 1 << 30
+"""Logs up to this size are checked before they are run [B]; larger ones would take minutes."""
+_SEEN_TOPICS, _SEEN_FINDINGS = 300, 30
+
+
+def inspect(job: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """What is in the log of the job, what is wrong with it, and what its map looks like; nothing is run."""
+    import numpy as np
+
+    from hsloc.log import check_log, open_log
+    from hsloc.maps import read_map
+    from hsloc.model.trajectory import Trajectory
+    from hsloc.report.data import ReportParts
+    from hsloc.report.view import view_of
+
+    request = make_request(job, folder)
+    log = open_log(request.logs, dataclasses.replace(request.reading(), require_scan=False, require_odometry=False))
+    summary, start = log.summary, log.initial_pose()
+    grid = log.map() if request.map_path is None else read_map(request.map_path).grid
+    output = folder / "output"
+    output.mkdir()
+    if grid is not None:
+        nowhere = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
+        write_viewer(view_of(ReportParts(title="", trajectory=nowhere, grid=grid)), output)
+    findings = None
+    if sum(path.stat().st_size for path in request.logs) <= CHECKED_BYTES:
+        findings = [
+            {"severity": each.severity.value, "topic": each.topic, "count": each.count}
+            | {"text": plain_names(each.text)[:500], "remedy": each.remedy[:500]}
+            for each in check_log(log).findings[:_SEEN_FINDINGS]
+        ]
+    return {
+        "format": summary.format,
+        "duration_s": summary.duration_s,
+        "topics": [
+            {"topic": each.topic[:200], "type": each.typename[:200], "count": each.count, "rate_hz": each.rate_hz}
+            for each in summary.topics[:_SEEN_TOPICS]
+        ],
+        "scan_topic": summary.scan_topic,
+        "odom_topic": summary.odom_topic,
+        "truth_topic": summary.truth_topic,
+        "initial_pose": None if start is None else [start[1].x, start[1].y, start[1].theta],
+        "findings": findings,
+        "warnings": [plain_names(str(each))[:500] for each in summary.warnings[:_SEEN_FINDINGS]],
+    }
 
 
 def execute(

@@ -18,6 +18,7 @@ from hsloc_service.execution.warm_up import WarmUp
 from hsloc_service.housekeeping import Housekeeping
 from hsloc_service.http import (
     files_routes,
+    inspect_routes,
     jobs_routes,
     metrics,
     results_routes,
@@ -54,6 +55,7 @@ ROUTERS = tuple(
     for module in (
         files_routes,
         tus,
+        inspect_routes,
         jobs_routes,
         results_routes,
         run_routes,
@@ -110,6 +112,7 @@ def open_context(settings: Settings) -> Context:
         sweeps=Sweeps(jobs),
         receiver=UploadReceiver(files, settings),
         dispatcher=parts.dispatcher,
+        inspector=parts.inspector,
         stores=parts.stores,
         deletions=parts.deletions,
         store_calls=BoundedExecutor(settings.store_timeout_s),

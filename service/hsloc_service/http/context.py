@@ -13,6 +13,7 @@ from hsloc_service.auth import Principal
 from hsloc_service.call_timeout import BoundedExecutor
 from hsloc_service.errors import ServiceError
 from hsloc_service.execution.dispatcher import Dispatcher
+from hsloc_service.execution.inspection import Inspector
 from hsloc_service.http.schemas import Problem
 from hsloc_service.jobs.repository import Jobs
 from hsloc_service.jobs.shares import Shares
@@ -43,6 +44,7 @@ class Context:
     sweeps: Sweeps
     receiver: UploadReceiver
     dispatcher: Dispatcher
+    inspector: Inspector
     stores: ResultStores
     deletions: DeletionQueue
     store_calls: BoundedExecutor

@@ -2,6 +2,7 @@
 
 import { get, post } from "./api.js";
 import { $, bytes, element, guarded, notice, when } from "./dom.js";
+import * as inspection from "./inspect.js";
 import { chosen as chosenOptions } from "./options.js";
 import { upload } from "./upload.js";
 
@@ -12,6 +13,7 @@ function chosenLog() {
   const files = [...$("log").files];
   $("drop-text").textContent = files.length ? `${files.map((f) => f.name).join(", ")} (${bytes(files.reduce((n, f) => n + f.size, 0))})` : "Choose logs, or drop them here";
   $("many").hidden = files.length < 2;
+  inspection.hide();
 }
 
 export function listen(submitted) {
@@ -27,19 +29,27 @@ export function listen(submitted) {
     });
   }
   $("more-options").addEventListener("toggle", () => { if ($("more-options").open) guarded(reusable); });
-  $("upload-form").addEventListener("submit", async (event) => {
-    event.preventDefault();
+  const working = async (work) => {
     notice("");
     uploading = new AbortController();
-    $("go").disabled = true;
+    $("go").disabled = $("inspect").disabled = true;
     $("stop").hidden = $("upload-progress").hidden = false;
-    const jobs = await guarded(submit);
+    const found = await guarded(work);
     if (uploading.signal.aborted) $("upload-text").textContent += ": paused; the same file goes on from here";
-    $("go").disabled = false;
+    $("go").disabled = $("inspect").disabled = false;
     $("go").textContent = uploading.signal.aborted ? "Go on" : "Upload and run";
     $("stop").hidden = true;
-    if (jobs) submitted(jobs);
+    return found;
+  };
+  $("upload-form").addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const jobs = await working(submit);
+    if (!jobs) return;
+    inspection.hide();
+    submitted(jobs);
   });
+  $("inspect").addEventListener("click", () => working(inspect));
+  inspection.listen();
   $("stop").addEventListener("click", () => uploading.abort());
 }
 
@@ -49,7 +59,8 @@ function options() {
   return found;
 }
 
-async function submit() {
+// Uploads what is chosen, and gives the requests of the jobs.
+async function requests() {
   const wanted = options(), files = [...$("log").files], stored = $("stored").value;
   if (!files.length && !stored) throw new SyntaxError("choose a log, or drop one on the field");
   const report = (name) => (done, total, note) => {
@@ -73,26 +84,47 @@ async function submit() {
   const others = ["relations", "reference", "calibration"].filter((name) => $(name).files.length);
   for (const name of others) wanted[name] = await send($(name).files[0]);
   const parts = document.querySelector("input[name=many]:checked").value === "parts" && files.length > 1;
-  const requests = [];
+  const found = [];
   if (parts) {
     const logs = [];
     for (const file of files) logs.push(await send(file));
-    requests.push({ ...wanted, logs });
+    found.push({ ...wanted, logs });
   } else {
-    if (stored) requests.push({ ...wanted, log: stored });
-    for (const file of files) requests.push({ ...wanted, log: await send(file) });
+    if (stored) found.push({ ...wanted, log: stored });
+    for (const file of files) found.push({ ...wanted, log: await send(file) });
   }
+  return found;
+}
+
+async function submit() {
   const jobs = [];
   try {
-    for (const request of requests) {
+    for (const request of await requests()) {
       jobs.push(await post("/v1/jobs", request, { "Idempotency-Key": crypto.randomUUID ? crypto.randomUUID() : String(Math.random()) }));
     }
   } catch (error) {
-    // An upload may have been deleted: the next attempt sends all of them again.
-    for (const file of [...files, ...map, ...others.map((name) => $(name).files[0])]) sent.delete(file);
+    forget(error);
     throw error;
   }
   return jobs;
+}
+
+// An upload may have been deleted: the next attempt sends all of them again.
+function forget(error) {
+  if (!error.status) return;
+  for (const name of ["log", "map", "relations", "reference", "calibration"]) for (const file of $(name).files) sent.delete(file);
+}
+
+async function inspect() {
+  try {
+    const [first] = await requests();
+    $("upload-text").textContent = "reading it …";
+    await inspection.show(await post("/v1/inspect", first));
+    $("upload-text").textContent = "";
+  } catch (error) {
+    forget(error);
+    throw error;
+  }
 }
 
 // Uploads and maps that another job can use; rebuilt only if they changed, so that an open list stays open.

@@ -89,6 +89,7 @@ def test_several_logs_are_several_jobs_or_one_and_the_table_finds_them(
 def name_and_label(page: Any) -> None:
     """Of alpha.log, the first in the table by name; the whole table by one label; and back to the filters of before."""
     page.locator("#jobs tbody .name").first.click()
+    page.wait_for_selector("#job-state .succeeded")
     page.click("summary >> text=Name, labels and notes")
     page.fill("#title", "<b>Hall</b> 3")
     page.fill("#labels", "rain, floor 2,rain")

@@ -31,9 +31,9 @@ export async function show(id, focus, time = 0) {
   const ending = follow(job, mine);
   if (ACTIVE.includes(job.state)) await ending;
   if (mine.aborted) return;
-  const ended = await guarded(() => get(`/v1/jobs/${id}`));
+  const ended = ACTIVE.includes(job.state) ? await guarded(() => get(`/v1/jobs/${id}`)) : job;
   if (!ended || mine.aborted) return;
-  render(ended);
+  if (ended !== job) render(ended);
   if (ended.state === "succeeded") await guarded(() => showResult(ended, `/v1/jobs/${id}/results`, mine, time));
 }
 

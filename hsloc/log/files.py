@@ -1,11 +1,12 @@
 """The files of a recording: which there are, of which kind, by what they hold and never by their names.
 
-Packed logs (gzip, zstd, zip, tar) are unpacked into a temporary folder (`$TMPDIR`), because containers are read at
-random places. What a packed file may unpack to is bounded, so that a small file cannot fill the disk.
+Packed logs (gzip, bzip2, xz, lz4, zstd, zip, tar) are unpacked into a temporary folder (`$TMPDIR`), because containers
+are read at random places. What a packed file may unpack to is bounded, so that a small file cannot fill the disk.
 """
 
 from __future__ import annotations
 
+import bz2
 import gzip
 import lzma
 import re
@@ -107,7 +108,7 @@ def _by_content(inside: Sequence[Path], path: Path, scratch: Scratch, shown: Pat
     return [file for part in files for file in expand(part, scratch, _name_inside(part, path, shown))]
 
 
-def _of_file(path: Path, scratch: Scratch, shown: Path) -> list[LogFile]:
+def _of_file(path: Path, scratch: Scratch, shown: Path, layers: int = 0) -> list[LogFile]:
     if not path.is_file():
         raise LogFormatError(f"{shown}: is not a regular file")
     head = _head(path)
@@ -116,10 +117,12 @@ def _of_file(path: Path, scratch: Scratch, shown: Path) -> list[LogFile]:
     if is_packed(head):
         inner = unpacked_head(path, head)
         # Text logs are read through gzip line by line; all else is unpacked.
-        if head.startswith(GZIP) and not is_archive(inner) and kind_of(inner) in ("", "text"):
+        if head.startswith(GZIP) and not is_packed(inner) and kind_of(inner) in ("", "text"):
             return [LogFile(path, "text", shown)]
+        if layers == _MAX_LAYERS:
+            raise LogFormatError(f"{shown}: is packed more than {_MAX_LAYERS} times; unpack it first")
         found = unpack(path, head, scratch.folder)
-        return expand(found, scratch, shown) if found.is_dir() else _of_file(found, scratch, shown)
+        return expand(found, scratch, shown) if found.is_dir() else _of_file(found, scratch, shown, layers + 1)
     kind = kind_of(head)
     if not kind:
         raise LogFormatError(f"{shown}: {NO_LOG}")
@@ -146,29 +149,34 @@ def kind_of(head: bytes) -> str:
 
 
 GZIP, ZSTD, ZIP = b"\x1f\x8b", b"\x28\xb5\x2f\xfd", b"PK\x03\x04"
+_BZIP2, _XZ, _LZ4 = b"BZh", b"\xfd7zXZ\0", b"\x04\x22\x4d\x18"
+_STREAMS = (GZIP, ZSTD, _BZIP2, _XZ, _LZ4)
+"""How files begin that hold one packed file."""
+_MAX_LAYERS = 3
+"""How many times a file may be packed. Internal: some packed files unpack to themselves."""
 _TAR_AT, _TAR = 257, b"ustar"
 MAX_TOTAL_RATIO = 100
 FREE_UNPACKED_BYTES = 4 << 30
 """Bytes that a packed log may unpack to: 100 times its size, and in any case 4 GiB."""
 _MAX_MEMBERS = 1000
 _BLOCK = 1 << 20
-_PACKED_ENDINGS = (".gz", ".zst", ".zstd", ".zip", ".tar", ".tgz")
+_PACKED_ENDINGS = (".gz", ".zst", ".zstd", ".bz2", ".xz", ".lz4", ".zip", ".tar", ".tgz")
 _BROKEN = (EOFError, gzip.BadGzipFile, zlib.error, lzma.LZMAError, zipfile.BadZipFile, tarfile.TarError, ValueError)
 
 
 def is_packed(head: bytes) -> bool:
     """Whether a file that begins with `head` (the first 512 bytes or more) is packed."""
-    return head.startswith((GZIP, ZSTD, ZIP)) or _is_tar(head)
+    return head.startswith((*_STREAMS, ZIP)) or _is_tar(head)
 
 
 def unpacked_head(path: Path, head: bytes) -> bytes:
-    """The first bytes of what a gzip or zstd file holds; empty where that cannot be read, and for archives."""
-    if not head.startswith((GZIP, ZSTD)):
+    """The first bytes of what a packed file holds; empty where that cannot be read, and for archives."""
+    if not head.startswith(_STREAMS):
         return b""
     try:
         with _opened(path, head) as stream:
             return stream.read(_HEAD_BYTES)
-    except (*_BROKEN, LogFormatError):
+    except (*_BROKEN, OSError, LogFormatError):
         return b""
 
 
@@ -228,6 +236,22 @@ def _opened(path: Path, head: bytes) -> Iterator[BinaryIO]:
             with path.open("rb") as file, zstandard.ZstdDecompressor(max_window_size=1 << 31).stream_reader(file) as s:
                 yield cast("BinaryIO", s)
         except zstandard.ZstdError as error:
+            raise LogFormatError(f"{path}: its compression is damaged or ends too early ({error})") from error
+    elif head.startswith(_LZ4):
+        import lz4.frame
+
+        try:
+            with lz4.frame.open(path, "rb") as stream:
+                yield cast("BinaryIO", stream)
+        except RuntimeError as error:
+            raise LogFormatError(f"{path}: its compression is damaged or ends too early ({error})") from error
+    elif head.startswith((_BZIP2, _XZ)):
+        try:
+            with bz2.open(path, "rb") if head.startswith(_BZIP2) else lzma.open(path, "rb") as stream:
+                yield cast("BinaryIO", stream)
+        except OSError as error:
+            if error.errno is not None:  # bz2 raises one without a number for data that are damaged
+                raise
             raise LogFormatError(f"{path}: its compression is damaged or ends too early ({error})") from error
     else:
         with path.open("rb") as plain:

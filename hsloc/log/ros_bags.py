@@ -7,6 +7,7 @@ the user's file is created or changed.
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 from contextlib import closing, contextmanager
@@ -136,7 +137,7 @@ class Db3Container:
     def __init__(self, path: Path, shown: Path | None = None) -> None:
         self.path = shown or path
         self._scratch = Scratch()
-        self._file = self._with_write_ahead_log(path)
+        self._file = self._with_its_log(path)
         self._is_copy = self._file != path
         self.channels: dict[int, Channel] = {}
         self.statistics: dict[int, TopicStatistics] = {}
@@ -181,27 +182,29 @@ class Db3Container:
             pass
         return losses
 
-    def _with_write_ahead_log(self, path: Path) -> Path:
-        """The file to open: the path itself, or a copy of it together with its write-ahead log."""
-        log = path.with_name(path.name + "-wal")
+    def _with_its_log(self, path: Path) -> Path:
+        """The file to open: the path itself, or a copy of it together with its write-ahead log or rollback journal."""
+        log = path
         try:
-            if not log.is_file() or log.stat().st_size == 0:
-                return path
-            copy = self._scratch.folder / "bag.db3"
-            shutil.copyfile(path, copy)
-            shutil.copyfile(log, copy.with_name("bag.db3-wal"))
+            for ending in ("-wal", "-journal"):
+                log = path.with_name(path.name + ending)
+                if log.is_file() and log.stat().st_size:
+                    copy = self._scratch.folder / "bag.db3"
+                    shutil.copyfile(path, copy)
+                    shutil.copyfile(log, copy.with_name(copy.name + ending))
+                    return copy
         except OSError as error:
             raise LogError(
                 f"{log}: cannot be copied beside its database ({error.strerror or error}); "
                 "set TMPDIR to a folder with space"
             ) from error
-        return copy
+        return path
 
     @contextmanager
     def _connected(self) -> Iterator[sqlite3.Connection]:
         """A connection that changes nothing. A name may hold `#`, `?` and `%`: it is quoted in the URI."""
         mode = "mode=rw" if self._is_copy else "mode=ro&immutable=1"
-        uri = f"file:{quote(str(self._file.absolute()))}?{mode}"
+        uri = f"file:{quote(os.fsencode(self._file.absolute()))}?{mode}"
         with closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
             connection.execute("PRAGMA query_only = 1")
             connection.execute("PRAGMA temp_store = MEMORY")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import bz2
 import gzip
 import json
+import lzma
 import shutil
 import sqlite3
 import tarfile
@@ -11,6 +13,7 @@ import zipfile
 from typing import TYPE_CHECKING, Any
 
 import log_formats
+import lz4.frame
 import numpy as np
 import pytest
 import zstandard
@@ -58,7 +61,9 @@ def events_of(path: Path | list[Path], **options: Any) -> list[tuple[str, int, f
 # Files.
 
 
-@pytest.mark.parametrize("name", ["x.bag.active", "X.BAG", "x.bag.1", "noext", "x.db3", "run #3.mcap", "a%20?b.txt"])
+@pytest.mark.parametrize(
+    "name", ["x.bag.active", "X.BAG", "x.bag.1", "noext", "x.db3", "run #3.mcap", "a%20?b.txt", "\udcfc.db3"]
+)
 @pytest.mark.parametrize("which", ["bag", "db3", "plain"])
 def test_the_kind_of_a_file_is_what_it_holds(
     request: pytest.FixtureRequest, tmp_path: Path, expected: list[Any], which: str, name: str
@@ -89,8 +94,23 @@ def _zstd(source: Path, target: Path) -> None:
     target.write_bytes(zstandard.compress(source.read_bytes()))
 
 
+def _with(*compress: Callable[[bytes], bytes]) -> Callable[[Path, Path], None]:
+    def pack(source: Path, target: Path) -> None:
+        data = source.read_bytes()
+        for each in compress:
+            data = each(data)
+        target.write_bytes(data)
+
+    return pack
+
+
 @pytest.mark.parametrize(
-    ("pack", "ending"), [(_gzip, ".gz"), (_zstd, ".zstd"), (_zstd, ""), (_zip, ".zip"), (_tar, ".tgz")]
+    ("pack", "ending"),
+    [
+        *((_gzip, ".gz"), (_zstd, ".zstd"), (_zstd, ""), (_zip, ".zip"), (_tar, ".tgz")),
+        *((_with(bz2.compress), ".bz2"), (_with(lzma.compress), ".xz"), (_with(lz4.frame.compress), ".lz4")),
+        (_with(gzip.compress, gzip.compress), ".gz.gz"),
+    ],
 )
 @pytest.mark.parametrize("which", ["bag", "db3", "plain"])
 def test_packed_logs_are_unpacked(
@@ -118,12 +138,18 @@ def test_a_folder_of_packed_files_is_a_recording(tmp_path: Path, db3: Path, expe
 
 
 def test_damaged_packing_is_one_line(tmp_path: Path, plain: Path) -> None:
-    for pack, name in ((_gzip, "a.mcap.gz"), (_zstd, "a.mcap.zst"), (_zip, "a.zip")):
+    packed = ((_gzip, "a.mcap.gz"), (_zstd, "a.mcap.zst"), (_zip, "a.zip"), (_with(bz2.compress), "a.bz2"))
+    for pack, name in (*packed, (_with(lzma.compress), "a.xz"), (_with(lz4.frame.compress), "a.lz4")):
         pack(plain, tmp_path / name)
-        data = (tmp_path / name).read_bytes()
-        (tmp_path / name).write_bytes(data[: len(data) // 2])
-        with pytest.raises((LogFormatError, LogError), match=f"{name}: "):
-            open_log(tmp_path / name)
+        data = bytearray((tmp_path / name).read_bytes())
+        noise = np.random.default_rng(0).bytes(len(data) // 2 - 300)
+        for damaged in (data[: len(data) // 2], data[:300] + noise + data[-len(data) // 2 :]):
+            (tmp_path / name).write_bytes(damaged)
+            with pytest.raises((LogFormatError, LogError), match=f"{name}: "):
+                open_log(tmp_path / name)
+    (tmp_path / "deep.gz").write_bytes(gzip.compress(gzip.compress(gzip.compress(gzip.compress(plain.read_bytes())))))
+    with pytest.raises(LogFormatError, match="packed more than 3 times"):
+        open_log(tmp_path / "deep.gz")
 
 
 def test_messages_compressed_one_by_one_are_read(tmp_path: Path, plain: Path, expected: list[Any]) -> None:
@@ -158,6 +184,20 @@ def test_the_write_ahead_log_of_a_database_is_read_and_nothing_beside_it_changes
     assert events_of(copied / "live.db3") == expected
     assert events_of(copied) == expected
     assert {path.name: path.read_bytes() for path in copied.iterdir()} == before
+
+
+def test_a_transaction_that_was_cut_off_is_rolled_back(tmp_path: Path, db3: Path, expected: list[Any]) -> None:
+    live, copied = tmp_path / "live.db3", tmp_path / "copied.db3"
+    shutil.copy(db3, live)
+    connection = sqlite3.connect(live, isolation_level=None)
+    connection.execute("PRAGMA cache_size = 1")
+    connection.execute("BEGIN")
+    connection.execute("UPDATE messages SET timestamp = 7, data = zeroblob(3000)")
+    shutil.copy(live, copied)
+    shutil.copy(f"{live}-journal", f"{copied}-journal")
+    connection.close()
+    assert copied.read_bytes() != db3.read_bytes()
+    assert events_of(copied) == expected
 
 
 # Times and encodings.

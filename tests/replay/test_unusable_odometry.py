@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -104,7 +105,7 @@ def still(seconds: float, changed: float, moving_odometry: bool) -> list[Odometr
     events: list[Odometry | Scan] = []
     for tick in range(int(seconds * 50)):
         stamp = tick * 20_000_000
-        events.append(Odometry(stamp, Pose2(1e-6 * tick if moving_odometry else 0.0, 0.0, 0.0)))
+        events.append(Odometry(stamp, Pose2(1e-3 * tick if moving_odometry else 1e-3 * rng.random(), 0.0, 0.0)))
         if tick % 5 == 0:
             ranges = (base + rng.normal(0.0, 0.01, 360)).astype(np.float32)
             beams = rng.random(360) < changed
@@ -126,6 +127,15 @@ def test_a_robot_that_moves_without_odometry_is_noticed_within_seconds() -> None
     with pytest.raises(UnusableOdometry, match="does not move"):
         passed.extend(OdometryWatch(still(60.0, 0.95, False)))  # type: ignore[arg-type]
     assert len(passed) < 6 * 60
+
+
+def test_a_heading_that_never_changes_is_noticed_when_the_scans_turn() -> None:
+    events = [
+        replace(e, T_odom_base=Pose2(e.T_odom_base.x, e.T_odom_base.y, 0.0)) if isinstance(e, Odometry) else e
+        for e in open_log(OFFICE).events()
+    ]
+    with pytest.raises(UnusableOdometry, match="heading never changes"):
+        list(OdometryWatch(events))
 
 
 def test_odometry_that_ends_before_the_scans_is_not_frozen() -> None:

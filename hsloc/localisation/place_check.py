@@ -40,7 +40,7 @@ class PlaceCheckParameters(Parameters):
     """How a place is compared with all others on the map."""
 
     interval: NonNegative = 8.0
-    """Path length between two comparisons with the whole map [m]; 0 turns them off."""
+    """Path length between two comparisons with the whole map [m], up to 4 times while they say the same; 0: none."""
     length: Positive = 6.0
     """Path length over which scans are joined for a comparison [m]."""
     scans: Count = 8

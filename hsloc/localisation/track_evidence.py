@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
-from math import exp
+from math import exp, isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -85,6 +85,9 @@ _CERTIFIED_M = 6.0
 
 _FEWEST_JOINED = 4
 """Scans that a place is compared by, at least."""
+_RAREST = 4
+"""Intervals that pass between two comparisons where the last ones said the same, at most: over 32 m a look-alike has a
+probability of 3 %, and a jump into one is told by the scans, after which comparisons are frequent again."""
 _FIRST_COMPARISON_M = 3.0
 """A new track is compared with the whole map after this path length (m), or after the usual one if that is shorter."""
 
@@ -253,6 +256,7 @@ class TrackMonitor:
         self._trail: deque[tuple[float, Pose2, F64]] = deque()
         self._path_length = 0.0
         self._compared_at = 0.0
+        self._unchanged = 1
         self._seen_at = 0.0
         self.begin()
 
@@ -264,6 +268,7 @@ class TrackMonitor:
     def begin(self) -> None:
         """A new track begins; it is compared with the whole map soon."""
         self._filter.start()
+        self._unchanged = 1
         self._trail.clear()
         self._compared_at = self._path_length - max(self._check.parameters.interval - _FIRST_COMPARISON_M, 0.0)
 
@@ -278,6 +283,7 @@ class TrackMonitor:
     def refused(self) -> Evidence:
         """The match of a scan was refused."""
         evidence = Evidence(self._distance())
+        self._unchanged = 1
         self._filter.add(TrackRow(Status.REJECTED, evidence))
         return evidence
 
@@ -289,14 +295,22 @@ class TrackMonitor:
         while self._trail[0][0] < self._path_length - p.length:
             self._trail.popleft()
         rival, other = float("nan"), None
-        if self._path_length - self._compared_at >= p.interval and len(self._trail) >= _FEWEST_JOINED:
+        if self._path_length - self._compared_at >= self._unchanged * p.interval and len(self._trail) >= _FEWEST_JOINED:
             self._compared_at = self._path_length
             chosen = np.unique(np.linspace(0, len(self._trail) - 1, p.scans).astype(np.int64))
             rival, other = self._check.rival([self._trail[k][1:] for k in chosen], pose)
         found = self._check.explain(paired, pose)
         evidence = Evidence(distance, found.fitness, found.short, found.through, found.unmapped, rival, other)
+        self._weigh_change(evidence)
         self._filter.add(TrackRow(Status.MATCHED, evidence))
         return evidence
+
+    def _weigh_change(self, evidence: Evidence) -> None:
+        """Comparisons that say the same again become rarer; where a scan fits worse than usual they do not."""
+        if not evidence.explained >= _GOOD_FIT * self._filter.usual or evidence.unmapped > _STRAY:
+            self._unchanged = 1
+        elif isfinite(evidence.rival):
+            self._unchanged = min(2 * self._unchanged, _RAREST) if evidence.rival <= _UNIQUE else 1
 
     def is_astray(self, evidence: Evidence, probability: float) -> bool:
         """Whether the track is astray with at least this probability, and another place was found that fits as well."""

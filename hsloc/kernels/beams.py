@@ -200,7 +200,8 @@ def wall_information(
 
     Arguments as for `wall_rows`. `weights` (n,) in [0, 1] say how well each point fits; `variances` (2,) are those of a
     point by itself and of the wall (m^2); `order` (n,) sorts `rows`. Beams closer together than a cell share its error
-    and count as a part of one.
+    and count as a part of one. A row is trusted by the cells that are seen of it, or of the walls that cross it: a wall
+    that is oblique to the cells lies in many rows.
     """
     c = cos(pose[2])
     s = sin(pose[2])
@@ -209,13 +210,18 @@ def wall_information(
     squares = np.zeros((3, 3))
     j = np.zeros(3)
     weight = 0.0
+    extent = 0.0
+    count = np.empty(len(points))
+    seen = np.empty(len(points))
+    _extents(points, normals, weights, cell, count, seen)
     for k in range(len(order)):
         i = order[k]
         if k > 0 and rows[i] != rows[order[k - 1]]:
-            _close(summed, squares, weight, variances, information)
+            _close(summed, squares, weight, extent, variances, information)
             summed[:] = 0.0
             squares[:] = 0.0
             weight = 0.0
+            extent = 0.0
         if normals[i, 0] == 0.0 and normals[i, 1] == 0.0:
             continue
         nx = c * normals[i, 0] - s * normals[i, 1]
@@ -225,20 +231,40 @@ def wall_information(
             ny = -ny
         rx = c * points[i, 0] - s * points[i, 1]
         ry = s * points[i, 0] + c * points[i, 1]
-        step = cell
-        if i > 0:
-            step = sqrt((points[i, 0] - points[i - 1, 0]) ** 2 + (points[i, 1] - points[i - 1, 1]) ** 2)
         j[0] = nx
         j[1] = ny
         j[2] = ny * rx - nx * ry
-        w = weights[i] * min(step / cell, 1.0)
+        w = count[i]
         for a in range(3):
             summed[a] += w * j[a]
             for b in range(3):
                 squares[a, b] += w * j[a] * j[b]
         weight += w
-    _close(summed, squares, weight, variances, information)
+        extent += w * seen[i]
+    _close(summed, squares, weight, extent, variances, information)
     return information
+
+
+@njit(cache=True, nogil=True)
+def _extents(points: F64, normals: F64, weights: F64, cell: float, count: F64, seen: F64) -> None:
+    """Write how many cells each point stands for into `count` (n,), and the cells that its wall shows into `seen`.
+
+    A wall is a run of points that share a normal, as `wall_normals` leaves them.
+    """
+    n = len(points)
+    start = 0
+    while start < n:
+        end = start
+        total = 0.0
+        while end < n and normals[end, 0] == normals[start, 0] and normals[end, 1] == normals[start, 1]:
+            step = cell
+            if end > 0:
+                step = sqrt((points[end, 0] - points[end - 1, 0]) ** 2 + (points[end, 1] - points[end - 1, 1]) ** 2)
+            count[end] = weights[end] * min(step / cell, 1.0)
+            total += count[end]
+            end += 1
+        seen[start:end] = total
+        start = end
 
 
 @njit(cache=True, nogil=True)
@@ -310,10 +336,13 @@ def _within(points: F64, a: int, b: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _close(summed: F64, squares: F64, weight: float, variances: F64, information: F64) -> None:
-    """Add a group's information, `(S - v_w / (v_p + v_w W) s s^T) / v_p`."""
+def _close(summed: F64, squares: F64, weight: float, extent: float, variances: F64, information: F64) -> None:
+    """Add a group's information, `(S - v_w / (v_p + v_w W) s s^T) / v_p`; `extent` sums the cells of its walls."""
+    if weight <= 0.0:
+        return
     shared = variances[1] / (variances[0] + variances[1] * weight)
-    trusted = weight / (weight + DOUBTFUL_WEIGHT)
+    shown = max(weight, extent / weight)
+    trusted = shown / (shown + DOUBTFUL_WEIGHT)
     for a in range(3):
         for b in range(3):
             information[a, b] += trusted * (squares[a, b] - shared * summed[a] * summed[b]) / variances[0]

@@ -10,8 +10,8 @@ variance grows with it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import cos, sin
-from typing import TYPE_CHECKING
+from math import cos, exp, log, sin
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,18 @@ _MAX_SQUARED = 16.3
 of chi squared with 3 degrees of freedom. Beyond it a wheel slipped."""
 _METRES_PER_RADIAN = 0.5
 """Metres that a radian counts for in the share of the motion: about the track width of an indoor robot."""
+_REMEMBERED = 0.98
+"""Weight of an innovation after the next one: about 50 are remembered, the 10 m of a match each 0.2 m."""
+_ASSUMED = 7.5
+"""Information of the assumption that the odometry is as noisy as stated: that of five innovations."""
+_EXCESS_GAIN = 0.1
+"""Gain of the running mean of squared innovations by their expected ones: it follows within about ten matches."""
+_MOST_EXCESS = 10.0
+"""One innovation counts for at most this multiple of its expected square: a slip is not noise."""
+_LEAST_NOISE = 0.04
+"""And at least: a fifth of the standard deviation, the 2 % of the distance of wheels that are calibrated well."""
+_MOST_NOISE = 30.0
+"""Variance of the odometry by the assumed one, at most: half of the distance, more than its whole turn."""
 _NO_NOISE = 1e-10 * np.eye(3)
 
 
@@ -85,18 +97,55 @@ def fuse_match(prediction: Pose2, covariance: F64, match: Match, information: F6
     return update_with_information(prediction, covariance, match.pose, information)
 
 
-def normalised_innovation(prediction: Pose2, covariance: F64, measured: Pose2, information: F64) -> tuple[float, float]:
-    """Squared innovation by its expected covariance, and its degrees of freedom.
+class Innovations:
+    """What the innovations of a run show: how noisy the odometry is, and whether covariances are too small.
 
-    Directions that are not measured count for none.
+    `noise_scale` is the variance of the odometry by the assumed one, by maximum likelihood. With `S` the covariance of
+    an innovation `v` and `Q` the part of it that is due to the odometry, the derivative of the log likelihood by the
+    log of the scale is `(v^T S^-1 Q S^-1 v - tr(S^-1 Q)) / 2`, its information `tr((S^-1 Q)^2) / 2`. Old innovations
+    are forgotten. The filter takes no scale below 1: errors of the map last while a wall is seen, and where it trusts
+    the odometry more it averages over them as over independent ones.
 
-    With `P` the covariance of the prediction and `L` the information of the measurement the innovation's covariance is
-    `P + L^-1`, its inverse `L (I + P L)^-1`, and the degrees of freedom are the trace of the gain.
+    `excess`, 1 or more, is what is left: the running mean of squared innovations by what is expected of them then.
+    Covariances that are reported grow by it. Whether odometry or matches are worse than assumed it does not show.
     """
-    gain = np.linalg.solve(np.eye(3) + covariance @ information, covariance @ information)
-    weight = information @ np.linalg.inv(np.eye(3) + covariance @ information)
-    innovation = difference(measured, prediction)
-    return float(innovation @ weight @ innovation), float(np.trace(gain))
+
+    def __init__(self) -> None:
+        self.noise_scale = 1.0
+        self._sum, self._information = 0.0, 0.0
+        self._excess = 1.0
+
+    @property
+    def excess(self) -> float:
+        """See the class."""
+        return max(self._excess, 1.0)
+
+    def add(self, innovation: F64, information: F64, propagated: F64, noise: F64) -> None:
+        """Take an innovation (3,): a measured pose of known information (3, 3) less a prediction.
+
+        The prediction's covariance is that of the pose before, `propagated` (3, 3), and the assumed one of the motion,
+        `noise` (3, 3), by the scale; all in the map frame. Directions that are not measured count for none: the inverse
+        of the innovation's covariance is `L (I + P L)^-1`, its degrees of freedom are the trace of the gain.
+        """
+        covariance = propagated + max(self.noise_scale, 1.0) * noise
+        weight = information @ np.linalg.inv(np.eye(3) + covariance @ information)
+        squared = float(innovation @ weight @ innovation)
+        freedom = float(np.trace(covariance @ weight))
+        if freedom <= 0.0:
+            return
+        self._excess += _EXCESS_GAIN * (min(squared / freedom, _MOST_EXCESS) - self._excess)
+        if self.noise_scale < 1.0:
+            scaled = propagated + self.noise_scale * noise
+            weight = information @ np.linalg.inv(np.eye(3) + scaled @ information)
+            squared = float(innovation @ weight @ innovation)
+        part = weight @ (self.noise_scale * noise)
+        limited = min(1.0, _MAX_SQUARED / squared) if squared > 0.0 else 1.0  # a slip is not noise
+        score = 0.5 * (limited * float(innovation @ part @ weight @ innovation) - float(np.trace(part)))
+        weighed = 0.5 * float(np.trace(part @ part))
+        self._sum = _REMEMBERED * self._sum + weighed * log(self.noise_scale) + score
+        self._information = _REMEMBERED * self._information + weighed
+        found = self._sum / (self._information + _ASSUMED)
+        self.noise_scale = exp(min(max(found, log(_LEAST_NOISE)), log(_MOST_NOISE)))
 
 
 def difference(pose: Pose2, other: Pose2) -> F64:
@@ -108,7 +157,8 @@ def difference(pose: Pose2, other: Pose2) -> F64:
 class Anchor:
     """A match of a track: the pose in the odometry's and in the map's frame, and its covariance (3, 3).
 
-    `count` odometry messages came before. `begins` says that it does not continue the anchor before.
+    `count` odometry messages came before. `begins` says that it does not continue the anchor before. The odometry up
+    to here is `noise_scale` times as noisy as assumed (variances).
     """
 
     count: int
@@ -116,26 +166,69 @@ class Anchor:
     T_map_base: Pose2
     covariance: F64
     begins: bool
+    noise_scale: float = 1.0
 
 
-def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> F64:
-    """The poses (n, 3) of the matches, T_map_base, each smoothed by those of its track that follow."""
+class SmoothedMatches(NamedTuple):
+    """Poses (n, 3) and covariances (n, 3, 3) at the matches, and the variances (n, 3) of the odometry up to each."""
+
+    poses: F64
+    covariances: F64
+    motion: F64
+
+
+def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> SmoothedMatches:
+    """The poses of the matches, T_map_base, each smoothed by those of its track that follow, and their covariances.
+
+    The covariances follow by the same recursion: `P_i + C (P_(i+1) - P_(i+1|i)) C^T`.
+    """
     poses = np.array([anchor.T_map_base.to_array() for anchor in anchors]).reshape(-1, 3)
+    covariances = np.array([anchor.covariance for anchor in anchors]).reshape(-1, 3, 3)
+    variances = np.zeros((len(anchors), 3))
     for k in range(len(anchors) - 2, -1, -1):
         here, following = anchors[k], anchors[k + 1]
         if following.begins:
             continue
         motion = here.T_odom_base.between(following.T_odom_base)
         noise = motion_model.covariance(motion)
+        turned = predict_covariance(np.zeros((3, 3)), here.T_map_base, motion, noise)
+        variances[k + 1] = following.noise_scale * np.diag(turned)
+        noise = max(following.noise_scale, 1.0) * noise
         predicted = here.T_map_base @ motion
         variance = predict_covariance(here.covariance, here.T_map_base, motion, noise) + _NO_NOISE
         off = difference(Pose2.from_array(poses[k + 1]), predicted)
         weighted = np.linalg.solve(variance, off)
         if off @ weighted > _MAX_SQUARED:
             continue
-        poses[k] += here.covariance @ transition(here.T_map_base, motion).T @ weighted
+        gain = np.linalg.solve(variance, transition(here.T_map_base, motion) @ here.covariance).T
+        poses[k] += gain @ off
         poses[k, 2] = wrap_angles(poses[k, 2:])[0]
-    return poses
+        smoothed = here.covariance + gain @ (covariances[k + 1] - variance) @ gain.T
+        covariances[k] = 0.5 * (smoothed + smoothed.T)
+    return SmoothedMatches(poses, covariances, variances)
+
+
+class _Between(NamedTuple):
+    """Poses between two matches of a track: rows, anchors before and after, and the share (n, 1) of the motion."""
+
+    rows: NDArray[np.int64]
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    share: F64
+
+
+def _between(odometry: F64, anchors: Sequence[Anchor]) -> _Between:
+    counts = np.array([anchor.count for anchor in anchors])
+    begins = np.array([anchor.begins for anchor in anchors])
+    before = np.searchsorted(counts, np.arange(len(odometry)), side="right") - 1
+    rows = np.flatnonzero((before >= 0) & (before + 1 < len(anchors)))
+    rows = rows[~begins[before[rows] + 1]]
+    first, second = before[rows], before[rows] + 1
+    steps = np.diff(odometry, axis=0, prepend=odometry[:1])
+    moved = np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) + _METRES_PER_RADIAN * np.abs(wrap_angles(steps[:, 2])))
+    begin, end = moved[np.maximum(counts[first] - 1, 0)], moved[np.maximum(counts[second] - 1, 0)]
+    share = np.clip((moved[rows] - begin) / np.maximum(end - begin, 1e-9), 0.0, 1.0)[:, None]
+    return _Between(rows, first, second, share)
 
 
 def between_matches(poses: F64, odometry: F64, anchors: Sequence[Anchor], matched: F64) -> F64:
@@ -147,16 +240,7 @@ def between_matches(poses: F64, odometry: F64, anchors: Sequence[Anchor], matche
         return poses
     at_odometry = np.array([anchor.T_odom_base.inverse().to_array() for anchor in anchors])
     T_map_odom = compose_poses(matched, at_odometry)
-    counts = np.array([anchor.count for anchor in anchors])
-    begins = np.array([anchor.begins for anchor in anchors])
-    before = np.searchsorted(counts, np.arange(len(poses)), side="right") - 1
-    rows = np.flatnonzero((before >= 0) & (before + 1 < len(anchors)))
-    rows = rows[~begins[before[rows] + 1]]
-    first, second = before[rows], before[rows] + 1
-    steps = np.diff(odometry, axis=0, prepend=odometry[:1])
-    moved = np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) + _METRES_PER_RADIAN * np.abs(wrap_angles(steps[:, 2])))
-    begin, end = moved[np.maximum(counts[first] - 1, 0)], moved[np.maximum(counts[second] - 1, 0)]
-    share = np.clip((moved[rows] - begin) / np.maximum(end - begin, 1e-9), 0.0, 1.0)[:, None]
+    rows, first, second, share = _between(odometry, anchors)
     ahead = compose_poses(T_map_odom[first], odometry[rows])
     back = compose_poses(T_map_odom[second], odometry[rows])
     off = back - ahead
@@ -165,3 +249,15 @@ def between_matches(poses: F64, odometry: F64, anchors: Sequence[Anchor], matche
     smoothed[rows] = ahead + share * off
     smoothed[rows, 2] = wrap_angles(smoothed[rows, 2])
     return smoothed
+
+
+def bridge_variances(odometry: F64, anchors: Sequence[Anchor], motion: F64) -> F64:
+    """What the odometry (n, 3) adds to the variances (n, 3) of poses between two matches: a walk whose ends are known.
+
+    `motion` (m, 3) are the variances of the odometry up to each anchor; half-way a quarter of them is left.
+    """
+    variances = np.zeros((len(odometry), 3))
+    if len(anchors) >= 2:
+        rows, _, second, share = _between(odometry, anchors)
+        variances[rows] = share * (1.0 - share) * motion[second]
+    return variances

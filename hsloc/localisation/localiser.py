@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate
-from hsloc.localisation.kalman_filter import fuse_match, normalised_innovation, predict_covariance
+from hsloc.localisation.kalman_filter import Innovations, difference, fuse_match, predict_covariance
 from hsloc.localisation.map_scale import MapScale, MapScaleEstimator
 from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, OdometryNoise, OmnidirectionalNoise
 from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
@@ -117,10 +117,6 @@ class LocaliserParameters(Parameters):
 
 _AS_USUAL = 0.98
 """Ratio to the usual fitness from which the optimum next to the prediction is taken without a search."""
-_EXCESS_GAIN = 0.1
-"""Gain of the running mean of squared innovations by their expected ones: it follows within about ten matches."""
-_MOST_EXCESS = 10.0
-"""One innovation counts for at most this multiple of its expected square: a slip is not noise."""
 
 
 class Localiser:
@@ -158,7 +154,7 @@ class Localiser:
         self._covariance = np.diag(
             (parameters.initial_sigma**2, parameters.initial_sigma**2, parameters.initial_sigma_angle**2)
         )
-        self._excess = 1.0
+        self._innovations = Innovations()
         # Where a proof is asked for, the optimum next to the prediction has none.
         proves = parameters.certify or heuristic(matcher) is not matcher
         self._refines = parameters.refine_first and not proves
@@ -226,8 +222,10 @@ class Localiser:
         predicted = self._T_map_match @ motion
         if not self._match_gate.is_fresh and not self._motion_gate.is_open(motion):
             return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
+        propagated = predict_covariance(self._covariance, self._T_map_match, motion, np.zeros((3, 3)))
         noise = self._motion_model.covariance(motion)
-        covariance = predict_covariance(self._covariance, self._T_map_match, motion, noise)
+        noise = predict_covariance(np.zeros((3, 3)), self._T_map_match, motion, noise)
+        covariance = propagated + max(self._innovations.noise_scale, 1.0) * noise
         points = paired.points_base()
         for each in (self._monitor, self._map_scale):
             if each is not None:
@@ -242,10 +240,10 @@ class Localiser:
         reason = self._match_gate.refusal(match.fitness)
         if reason:
             return self._refuse(paired, predicted, covariance, match, evaluations, reason)
-        information = match_information(points, self._field, match.pose)
+        information = match_information(points, self._field, match.pose, self._wall_variance())
         if p.fuse:
             if information is not None:
-                self._weigh_innovation(predicted, covariance, match.pose, information)
+                self._innovations.add(difference(match.pose, predicted), information, propagated, noise)
             pose, covariance = fuse_match(predicted, covariance, match, information)
         else:
             pose, covariance = match.pose, match.covariance
@@ -269,7 +267,12 @@ class Localiser:
             reason,
             evidence=evidence,
             certificate=match.certificate,
+            noise_scale=self._innovations.noise_scale,
         )
+
+    def _wall_variance(self) -> float | None:
+        """What the scans so far show of how walls are drawn (m^2)."""
+        return None if self._map_scale is None else self._map_scale.wall_variance
 
     def _lose(self) -> None:
         """The pose is unknown from now on: search."""
@@ -277,20 +280,9 @@ class Localiser:
         self._search_began = self._count
         self._global_search.start(None if self._monitor is None else self._monitor.usual_explained)
 
-    def _weigh_innovation(self, predicted: Pose2, covariance: F64, measured: Pose2, information: F64) -> None:
-        """Follow how large innovations really are; covariances that are reported grow with them.
-
-        What grows is not the weight of the odometry or of the match: which of the two is worse than assumed, an
-        innovation does not show. (Where the odometry's noise was scaled, the matches pulled the pose from door to door
-        in the corridors of Wean Hall.)
-        """
-        squared, freedom = normalised_innovation(predicted, covariance, measured, information)
-        if freedom > 0.0:
-            self._excess += _EXCESS_GAIN * (min(squared / freedom, _MOST_EXCESS) - self._excess)
-
     def _reported(self, covariance: F64) -> F64:
         """A covariance with the scale of the innovations; never smaller than the filter's."""
-        return max(self._excess, 1.0) * covariance
+        return self._innovations.excess * covariance
 
     def _match(self, points: F64, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
         """Match in the window of the prediction; a refused match may give way to one in a wider window."""

@@ -7,17 +7,19 @@ Each scan that was matched gives the distances of its points from the walls of t
 are explained by five unknowns: the pose, the scale, and an offset of the range, because a wall is drawn as whole cells,
 whose centres lie behind its surface. Pose and offset are eliminated; what is left is the information about the scale.
 Odometry plays no part, for its scale is unknown itself.
+
+The same distances, averaged over each row of cells, show how well the walls are drawn: where they lie in the cells.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot, inf, sqrt
+from math import cos, hypot, inf, sin, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.beams import wall_normals
+from hsloc.kernels.beams import wall_normals, wall_rows
 from hsloc.kernels.fitness import point_scores
 from hsloc.matching.covariance import MAX_GAP, POINT_SIGMA
 from hsloc.matching.local_refinement import refine
@@ -54,6 +56,14 @@ _LARGEST_PRIOR = 0.1
 """Standard deviation of the scale before anything is known; larger ones are not followed by the localiser."""
 _CORRELATED = 30.0
 """Number of points that count as one, as in the covariance of a match."""
+_MOST_CELLS_OFF = 1.5
+"""A point farther from its wall than this many cells shows something else than how the wall is drawn."""
+_LEAST_OF_ROW = 5
+"""Points of a row of cells whose mean shows where its wall is, at least."""
+_PRIOR_WALLS = 10.0
+"""Number of rows that the assumption about a wall's place within its cell counts as."""
+_LEAST_SIGMA = 0.002
+"""Standard deviation of a wall's place, at least (m): no building is drawn better."""
 _SIGMAS, _LEAST = 3.0, 0.005
 """A scale is significant if it is off 1 by so many standard deviations, and by this much: 5 cm in 10 m."""
 
@@ -94,6 +104,8 @@ class MapScaleEstimator:
         self._vector: dict[int, F64] = {}
         self._weight = 0.0
         self._squares = 0.0
+        self._wall_squares = 0.0
+        self._walls = 0
 
     def move(self, distance: float) -> None:
         """The robot moved on (m)."""
@@ -123,6 +135,7 @@ class MapScaleEstimator:
         distance, found = self._distances(scaled, normals, pose)
         step = np.hypot(*np.diff(scaled, axis=0, prepend=scaled[:1]).T)
         weight = np.minimum(step / self._field.resolution, 1.0) * found / (1.0 + (distance / _ROBUST_M) ** 2)
+        self._add_walls(scaled, normals, np.where(found, distance, np.inf), pose)
         across = (normals * beams).sum(axis=1)
         turned = normals[:, 1] * scaled[:, 0] - normals[:, 0] * scaled[:, 1]
         by = np.column_stack((normals, turned, across, across / ranges))
@@ -157,6 +170,32 @@ class MapScaleEstimator:
         # A score is exp(-d / sigma): its logarithms on both sides of a wall show where between the steps it lies.
         between = 0.5 * field.sigma * (logs[best + 1, rows] - logs[best - 1, rows])
         return moves[best] * step + np.clip(between, -step, step), np.isfinite(far.min(axis=0))
+
+    def _add_walls(self, points: F64, normals: F64, distance: F64, pose: Pose2) -> None:
+        """How far the walls of the map, row by row of cells, are from where a scan sees them."""
+        cell = self._field.resolution
+        metres = self._field.to_cells(pose) * (cell, cell, 1.0)
+        rows = np.empty(len(points), dtype=np.int64)
+        wall_rows(points, normals, metres, cell, rows)
+        c, s = cos(metres[2]), sin(metres[2])
+        x, y = c * normals[:, 0] - s * normals[:, 1], s * normals[:, 0] + c * normals[:, 1]
+        signed = np.where(np.where(np.abs(x) > np.abs(y), x, y) < 0.0, -distance, distance)
+        near = np.abs(distance) < _MOST_CELLS_OFF * cell
+        _, row, count = np.unique(rows[near], return_inverse=True, return_counts=True)
+        mean = np.bincount(row, signed[near]) / count
+        scatter = float(((signed[near] - mean[row]) ** 2).sum()) / max(len(row) - len(count), 1)
+        seen_well = count >= _LEAST_OF_ROW
+        free = int(seen_well.sum()) - 3  # the pose was fitted to them
+        if free > 0:
+            self._wall_squares += float((mean[seen_well] ** 2 - scatter / count[seen_well]).sum())
+            self._walls += free
+
+    @property
+    def wall_variance(self) -> float:
+        """Variance of the place of a wall on the map (m^2): that within a cell first, then what the scans show."""
+        prior = self._field.resolution**2 / 12.0
+        found = (_PRIOR_WALLS * prior + self._wall_squares) / (_PRIOR_WALLS + self._walls)
+        return max(found, _LEAST_SIGMA**2)
 
     def _prior(self) -> F64:
         """Information (2, 2) about scale and offset before the first scan, in the unit of the sums."""

@@ -13,7 +13,7 @@ from hsloc.model.estimate import Evidence, State, Status
 from hsloc.model.verdict import Verdict, VerdictReason
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -104,9 +104,13 @@ class StateLog:
     def __len__(self) -> int:
         return len(self._estimates)
 
-    def at_odometry(self, n: int) -> StateRows:
-        """The states at the n odometry messages: each lies between two scans, and is no surer than either."""
-        scans = self.at_scans()
+    def at_odometry(self, n: int, smoothed: Mapping[int, F64] | None = None, between: F64 | float = 0.0) -> StateRows:
+        """The states at the n odometry messages: each lies between two scans, and is no surer than either.
+
+        `smoothed` are covariances (3, 3) by the index of a scan, which take the place of those of its estimate, and
+        `between` (n, 3) is what the odometry between two scans adds to their variances.
+        """
+        scans = self.at_scans(smoothed)
         if len(scans) == 0:
             return StateRows((State.LOST,) * n, np.zeros(n), np.full((n, 3), np.nan), np.full(n, np.nan), ("",) * n)
         counts = np.array(self._counts)
@@ -122,17 +126,17 @@ class StateLog:
         return StateRows(
             tuple(scans.state[i] for i in worse),
             np.minimum(scans.probability[before], scans.probability[after]),
-            np.sqrt(variance),
+            np.sqrt(variance + between),
             scans.fitness[before],
             tuple(scans.reason[i] for i in worse),
         )
 
-    def at_scans(self) -> StateRows:
-        """The states at the scans that were added."""
+    def at_scans(self, smoothed: Mapping[int, F64] | None = None) -> StateRows:
+        """The states at the scans that were added; `smoothed` as for `at_odometry`."""
         rows, owners = self._tracks()
-        smoothed = smooth(rows)
+        probabilities = smooth(rows)
         usual = usual_explained(rows)
-        sigma = self._sigma(owners)
+        sigma = self._sigma(owners, smoothed or {})
         states: list[State] = []
         reasons: list[str] = []
         probability = np.zeros(len(self._estimates))
@@ -142,8 +146,8 @@ class StateLog:
                 states.append(estimate.state or State.LOST)
                 reasons.append(estimate.reason)
                 continue
-            probability[k] = smoothed[owner, 0]
-            state, reason = _judge(smoothed[owner], sigma[k], usual, rows[: owner + 1])
+            probability[k] = probabilities[owner, 0]
+            state, reason = _judge(probabilities[owner], sigma[k], usual, rows[: owner + 1])
             states.append(state)
             reasons.append(reason or estimate.reason)
         fitness = np.array([np.nan if e.fitness is None else e.fitness for e in self._estimates])
@@ -168,7 +172,7 @@ class StateLog:
                     owners[j] = owners[k]
         return rows, owners
 
-    def _sigma(self, owners: Sequence[int]) -> F64:
+    def _sigma(self, owners: Sequence[int], smoothed: Mapping[int, F64]) -> F64:
         """Standard deviations (n, 3): of a guess unknown; of refused scans between agreeing matches interpolated."""
         n = len(self._estimates)
         sigma = np.full((n, 3), np.nan)
@@ -176,8 +180,9 @@ class StateLog:
             estimate = self._estimates[k]
             if owners[k] < 0:
                 continue
-            if estimate.covariance is not None:
-                sigma[k] = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
+            covariance = smoothed.get(k, estimate.covariance)
+            if covariance is not None:
+                sigma[k] = np.sqrt(np.maximum(np.diag(covariance), 0.0))
             elif k + 1 < n and owners[k] == owners[k + 1]:
                 sigma[k] = sigma[k + 1]
             if estimate.status is Status.RELOCALISED:

@@ -61,11 +61,13 @@ MAX_GAP = 0.2
 """Neighbouring points of one wall lie as near as this (m), and farther apart with distance."""
 
 
-def match_information(points: F64, field: LikelihoodField, pose: Pose2) -> F64 | None:
+def match_information(
+    points: F64, field: LikelihoodField, pose: Pose2, wall_variance: float | None = None
+) -> F64 | None:
     """Information (3, 3) of (x, y, theta) in the map frame (1/m^2, 1/rad^2) of points (n, 2) in the order of the beams.
 
     Zero in directions that no wall holds; None where most points show no wall, so that nothing is known of it.
-    The wall's own variance is that of a place within a cell.
+    `wall_variance` is that of the place of a wall (m^2), by default of a uniform one within a cell.
     """
     if len(points) == 0:
         return np.zeros((3, 3))
@@ -81,8 +83,8 @@ def match_information(points: F64, field: LikelihoodField, pose: Pose2) -> F64 |
     rows = np.empty(len(points), dtype=np.int64)
     wall_rows(points, normals, metres, field.resolution, rows)
     order = np.argsort(rows, kind="stable")
-    cell_variance = field.resolution**2 / 12.0
-    variances = np.array((POINT_SIGMA**2 + cell_variance, cell_variance))
+    within_cell = field.resolution**2 / 12.0
+    variances = np.array((POINT_SIGMA**2 + within_cell, within_cell if wall_variance is None else wall_variance))
     information = wall_information(
         points, normals, scores.astype(np.float64), metres, field.resolution, variances, rows, order
     )

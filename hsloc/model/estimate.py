@@ -94,6 +94,8 @@ class Estimate:
     """What the scan says about the track, of an estimator that weighs it."""
     certificate: Certificate | None = None
     """What was proven about the match, where it was asked for."""
+    noise_scale: float = 1.0
+    """Variance of the odometry by the assumed one, as the scans so far show it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

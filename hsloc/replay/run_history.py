@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.kalman_filter import Anchor, between_matches, predict_covariance, smooth_matches
+from hsloc.localisation.kalman_filter import (
+    Anchor,
+    SmoothedMatches,
+    between_matches,
+    bridge_variances,
+    predict_covariance,
+    smooth_matches,
+)
 from hsloc.localisation.states import StateLog, with_position_errors
 from hsloc.model.estimate import ScanDiagnostics, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
@@ -25,6 +32,8 @@ if TYPE_CHECKING:
     from hsloc.model.certificate import Certificate
     from hsloc.model.estimate import Estimate
 
+    F64 = NDArray[np.float64]
+
 
 class RunHistory:
     """Columns that grow with the log: the result itself, and all of the memory that does."""
@@ -33,6 +42,9 @@ class RunHistory:
         """With a motion model the trajectory is smoothed backwards; without, each pose knows the past alone."""
         self._motion_model = motion_model
         self._anchors: list[Anchor] = []
+        self._anchor_scans: list[int] = []
+        self._anchor_states: list[int] = []
+        self._smoothed: SmoothedMatches | None = None
         self._track_ended = True
         self._odometry_stamps = array("q")
         self._odometry = array("d")
@@ -98,8 +110,18 @@ class RunHistory:
         if self._motion_model is not None and is_match and estimate.covariance is not None:
             begins = self._track_ended or estimate.status is Status.RELOCALISED
             self._anchors.append(
-                Anchor(len(self._odometry_stamps), paired.T_odom_base, estimate.T_map_base, estimate.covariance, begins)
+                Anchor(
+                    len(self._odometry_stamps),
+                    paired.T_odom_base,
+                    estimate.T_map_base,
+                    estimate.covariance,
+                    begins,
+                    estimate.noise_scale,
+                )
             )
+            self._anchor_scans.append(len(self._scan_stamps) - 1)
+            self._anchor_states.append(-1 if estimate.evidence is None else len(self._states) - 1)
+            self._smoothed = None
             self._track_ended = False
 
     def _note_belief(self, status: Status) -> None:
@@ -128,7 +150,7 @@ class RunHistory:
         """One pose for each odometry message, revised where the estimator knew better later; and which are believed."""
         estimated = _trajectory(self._odometry_stamps, self._poses)
         if self._motion_model is not None and self._anchors:
-            matched = smooth_matches(self._anchors, self._motion_model)
+            matched = self._smooth().poses
             poses = between_matches(estimated.poses, self.odometry().poses, self._anchors, matched)
             estimated = Trajectory(estimated.stamps_ns, poses)
         if not self._revisions:
@@ -143,6 +165,14 @@ class RunHistory:
                 localised[first:last] = True
         return Trajectory(estimated.stamps_ns, poses), localised
 
+    def _smooth(self) -> SmoothedMatches:
+        """The smoothed poses at the matches; of none without a motion model."""
+        if self._motion_model is None:
+            return SmoothedMatches(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)))
+        if self._smoothed is None:
+            self._smoothed = smooth_matches(self._anchors, self._motion_model)
+        return self._smoothed
+
     def states(self, scale: MapScale | None = None) -> StateRows | None:
         """The state of each pose of the trajectory in hindsight; None for an estimator that weighs no evidence.
 
@@ -150,22 +180,30 @@ class RunHistory:
         """
         if len(self._states) == 0:
             return None
-        rows = self._states.at_odometry(len(self._odometry_stamps))
+        smoothed = self._smooth()
+        covariances = dict(zip(self._anchor_states, smoothed.covariances, strict=True))
+        between = bridge_variances(self.odometry().poses, self._anchors, smoothed.motion)
+        rows = self._states.at_odometry(len(self._odometry_stamps), covariances, between)
         if scale is None or not scale.is_significant:
             return rows
         errors = scale.position_errors(self.trajectory()[0].poses)
         return with_position_errors(rows, errors, f"the scale of the map is {scale.value:.3f}")
 
     def diagnostics(self) -> ScanDiagnostics:
-        """One row for each scan."""
+        """One row for each scan; covariances are those of the smoothed poses where these are smoothed."""
+        covariance = np.array(self._covariance, dtype=np.float64).reshape(-1, 3, 3)
+        sigma = np.array(self._sigma, dtype=np.float64).reshape(-1, 3)
+        smoothed = self._smooth().covariances
+        covariance[self._anchor_scans] = smoothed
+        sigma[self._anchor_scans] = np.sqrt(np.maximum(np.diagonal(smoothed, axis1=1, axis2=2), 0.0))
         return ScanDiagnostics(
             stamps_ns=np.array(self._scan_stamps, dtype=np.int64),
             status=tuple(self._status),
             fitness=np.array(self._fitness, dtype=np.float64),
-            sigma=np.array(self._sigma, dtype=np.float64).reshape(-1, 3),
+            sigma=sigma,
             evaluations=np.array(self._evaluations, dtype=np.int64),
             reason=tuple(self._reason),
-            covariance=np.array(self._covariance, dtype=np.float64).reshape(-1, 3, 3),
+            covariance=covariance,
             certificates=tuple(self._certificates),
         )
 

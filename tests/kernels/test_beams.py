@@ -179,3 +179,18 @@ def test_points_of_one_wall_lie_in_one_row_of_cells() -> None:
     turned = np.empty(20, dtype=np.int64)
     wall_rows(points, normals, np.array((0.3, 0.0, 0.4)), 0.05, turned)
     assert len(set(turned)) > 10
+
+
+def test_an_oblique_wall_is_trusted_as_one_along_the_cells() -> None:
+    cell, variances = 0.05, np.array((4e-4, 0.0))
+    points = np.column_stack((np.linspace(-3.0, 3.0, 121), np.full(121, 2.0)))
+    normals, weights = np.tile((0.0, 1.0), (121, 1)), np.ones(121)
+    held = []
+    for angle in (0.0, 0.6):
+        pose, rows = np.array((0.0, 0.0, angle)), np.empty(121, dtype=np.int64)
+        wall_rows(points, normals, pose, cell, rows)
+        order = np.argsort(rows, kind="stable")
+        information = wall_information(points, normals, weights, pose, cell, variances, rows, order)
+        across = np.array((-np.sin(angle), np.cos(angle), 0.0))
+        held.append(across @ information @ across)
+    assert held[1] == pytest.approx(held[0], rel=0.01)

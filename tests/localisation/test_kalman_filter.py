@@ -10,7 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hsloc.errors import ConfigError
-from hsloc.localisation.kalman_filter import Anchor, between_matches, fuse, predict_covariance, smooth_matches
+from hsloc.localisation.kalman_filter import (
+    Anchor,
+    Innovations,
+    between_matches,
+    bridge_variances,
+    fuse,
+    predict_covariance,
+    smooth_matches,
+)
 from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.model import Pose2, wrap_angle
 
@@ -111,7 +119,7 @@ def test_over_the_begin_of_another_track_nothing_is_shared_out() -> None:
     ]
     matched = np.array([a.T_map_base.to_array() for a in anchors])
     assert (between_matches(odometry, odometry, anchors, matched) == odometry).all()
-    assert (smooth_matches(anchors, OdometryNoise()) == matched).all()
+    assert (smooth_matches(anchors, OdometryNoise())[0] == matched).all()
 
 
 def test_what_the_end_of_a_corridor_shows_corrects_the_poses_before() -> None:
@@ -120,10 +128,14 @@ def test_what_the_end_of_a_corridor_shows_corrects_the_poses_before() -> None:
     places = [Pose2(0.5 * k + 0.05 * k, 0.0, 0.0) for k in range(4)]
     anchors = [anchor(k, Pose2(0.55 * k, 0.0, 0.0), places[k], along, begins=k == 0) for k in range(4)]
     anchors.append(anchor(4, Pose2(2.2, 0.0, 0.0), Pose2(2.0, 0.0, 0.0), SURE))
-    smoothed = smooth_matches(anchors, OdometryNoise())
+    smoothed, covariances, _ = smooth_matches(anchors, OdometryNoise())
     before = abs(places[3].x - 1.5)
     assert abs(smoothed[3, 0] - 1.5) < 0.5 * before
     assert np.abs(smoothed[:, 1:]).max() < 1e-9
+    # The end holds the poses before it: the nearest best, by the noise of the odometry in between.
+    assert 0.05 < np.sqrt(covariances[3, 0, 0]) < 0.06
+    assert (np.diff(covariances[:, 0, 0]) < 0.0).all()
+    assert covariances[0, 0, 0] < along[0, 0]
 
 
 def test_a_slip_is_not_taken_for_noise() -> None:
@@ -131,4 +143,39 @@ def test_a_slip_is_not_taken_for_noise() -> None:
         anchor(0, Pose2(), Pose2(), SURE, begins=True),
         anchor(1, Pose2(0.3, 0.0, 0.0), Pose2(1.3, 0.0, 0.0), SURE),
     ]
-    assert (smooth_matches(anchors, OdometryNoise())[0] == 0.0).all()
+    assert (smooth_matches(anchors, OdometryNoise())[0][0] == 0.0).all()
+
+
+def test_the_noise_of_the_odometry_is_taken_from_the_innovations() -> None:
+    rng = np.random.default_rng(0)
+    before, information = 1e-9 * np.eye(3), np.diag((1e6, 1e6, 1e6))
+    noise = OdometryNoise().covariance(Pose2(0.2, 0.0, 0.05)) + before
+    for true, low, high in ((9.0, 5.0, 15.0), (1.0, 0.6, 1.6), (0.1, 0.04, 0.2)):
+        found = Innovations()
+        for _ in range(200):
+            found.add(rng.multivariate_normal(np.zeros(3), true * noise), information, before, noise)
+        assert low <= found.noise_scale <= high
+        assert found.excess < 2.0
+
+
+def test_one_slip_is_no_noise() -> None:
+    found, none, noise, information = Innovations(), np.zeros((3, 3)), 1e-4 * np.eye(3), 1e6 * np.eye(3)
+    found.add(np.array((0.5, 0.0, 0.0)), information, none, noise)
+    assert found.noise_scale < 3.0
+    before = found.noise_scale
+    found.add(np.array((9.0, 9.0, 9.0)), none, none, noise)
+    assert found.noise_scale == before
+
+
+def test_between_two_matches_the_odometry_adds_its_noise() -> None:
+    odometry = straight(7, 0.1)
+    anchors = [
+        anchor(1, Pose2(), Pose2(), SURE, begins=True),
+        anchor(5, Pose2(0.4, 0.0, 0.0), Pose2(0.4, 0.0, 0.0), SURE),
+    ]
+    motion = smooth_matches(anchors, OdometryNoise()).motion
+    assert motion[1, 0] == pytest.approx(0.01 * 0.4**2)
+    found = bridge_variances(odometry, anchors, motion)
+    assert found[2:4].min() > 0.0
+    np.testing.assert_allclose(found[2, 0], motion[1, 0] / 4.0)
+    assert (found[[0, 5, 6]] == 0.0).all()

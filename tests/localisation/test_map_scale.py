@@ -44,6 +44,13 @@ def test_the_scale_is_found(scale: float) -> None:
     assert found.sigma < 0.01
 
 
+def test_walls_that_are_drawn_where_they_are_become_surer() -> None:
+    # Walls of a room in whole decimetres lie on borders of cells, both of which are drawn: their middle is right.
+    cell = 0.05**2 / 12.0
+    assert estimator(1.0, []).wall_variance == pytest.approx(cell)
+    assert estimator(1.0).wall_variance < cell
+
+
 def test_a_few_scans_say_nothing() -> None:
     assert estimator(1.02, PLACES[:5]).estimate() is None
 

@@ -38,6 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--backup", type=Path, metavar="DIR", help="Copy the data folder to DIR, also while a server runs, and exit."
     )
+    parser.add_argument(
+        "--move-to", metavar="URL",
+        help="Copy the data folder's database to an empty PostgreSQL, postgresql://USER@HOST/NAME, and exit.",
+    )  # fmt: skip
     group = parser.add_argument_group("tokens")
     group.add_argument("--first-token", action="store_true", help="Make a token on the first start and print it.")
     group.add_argument("--open-to-all", action="store_true", help="Listen beyond loopback without any token.")
@@ -63,6 +67,8 @@ def run(arguments: argparse.Namespace) -> int:
             chosen = replace(chosen, allowed_hosts=(*chosen.allowed_hosts, *arguments.allowed_host))
         if arguments.backup is not None:
             return int(service.back_up_folder(chosen, arguments.backup))
+        if arguments.move_to is not None:
+            return int(service.move_database(chosen, arguments.move_to))
         if arguments.new_token is not None:
             return int(service.new_token(chosen, arguments.new_token, arguments.scopes, arguments.expires_days))
         if arguments.list_tokens:

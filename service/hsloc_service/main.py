@@ -23,6 +23,7 @@ from hsloc_service.db.database import database_place, open_database
 from hsloc_service.http.app import create_app
 from hsloc_service.http.middleware import protocol_class
 from hsloc_service.logs import configure
+from hsloc_service.move import move
 from hsloc_service.settings import Settings, SettingsError
 from hsloc_service.storage import Storage
 
@@ -151,6 +152,16 @@ def back_up_folder(settings: Settings, target: Path) -> int:
     lost = f"; {report.deleted} were deleted meanwhile" if report.deleted else ""
     counts = f"{report.uploads} uploads, {report.jobs} jobs, {report.results} results, {report.bytes} bytes"
     sys.stdout.write(f"{target}: {counts}{lost}\n")
+    return 0
+
+
+def move_database(settings: Settings, url: str) -> int:
+    """Move the database of the data folder to PostgreSQL and show what was moved. Raises SettingsError."""
+    report = move(settings, url)
+    sys.stdout.write(
+        f"{report.jobs} jobs, {report.uploads} uploads, {report.rows} rows; start with HSLOC_DATABASE_URL and the same "
+        "--data, which keeps uploads and results\n"
+    )
     return 0
 
 

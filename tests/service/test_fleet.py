@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
+import re
 import signal
 import time
 from typing import TYPE_CHECKING, Any
@@ -76,6 +78,30 @@ def upload_by_turns(servers: list[TestClient], content: bytes, block: int) -> st
         sent = servers[k % len(servers)].patch(place, headers=headers, content=content[start : start + block])
         assert sent.status_code == 204, sent.text
     return str(place.rsplit("/", 1)[1])
+
+
+def test_servers_know_each_other_and_the_dashboard_names_metrics_that_are_there(
+    make_client: Callable[..., TestClient], fleet: Fleet
+) -> None:
+    rates = {"requests_per_s": 0.01, "heartbeat_s": 0.1}
+    one, other = (make_client(data=fleet.folder / name, slots=3, **rates, **fleet.shared) for name in ("a", "b"))
+    context: Any = one.app.state.context  # type: ignore[attr-defined]
+    deadline = time.monotonic() + 20.0
+    while context.servers() < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    text = one.get("/metrics").text
+    assert 'hsloc_workers{kind="server"} 2.0' in text
+    assert "hsloc_fleet_slots 6.0" in text
+    assert one.get("/v1/info").status_code == 429  # of the burst of two, each server grants one
+    assert other.get("/v1/info").status_code == 200
+    known = set(re.findall(r"^# TYPE (\S+)", text, re.MULTILINE))
+    board = json.loads((ROOT / "examples" / "fleet" / "grafana.json").read_text())
+    for panel in board["panels"]:
+        for target in panel["targets"]:
+            named = re.findall(r"\b(?:hsloc|process)_\w+", target["expr"])
+            assert {name.removesuffix("_bucket") for name in named} <= known, target["expr"]
+            assert named
+    assert len({panel["id"] for panel in board["panels"]}) == len(board["panels"])
 
 
 def test_jobs_and_cancellations_at_one_server_are_heard_at_once_by_another(

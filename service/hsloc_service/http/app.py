@@ -88,7 +88,9 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.context = context
     app.add_middleware(Conditional)
-    app.add_middleware(Guard, settings=settings, tokens=Tokens(context.database), shares=context.shares)
+    app.add_middleware(
+        Guard, settings=settings, tokens=Tokens(context.database), shares=context.shares, servers=context.servers
+    )
     for router in ROUTERS:
         app.include_router(router, dependencies=[Depends(known_query)])
     _add_page(app)
@@ -131,7 +133,9 @@ async def running(context: Context) -> AsyncIterator[None]:
         helpers.append(WarmUp(storage.cache.absolute()))
     if database.shared:
         slots = settings.slots
-        helpers.append(Presence(database, context.dispatcher.owner, "server", slots, settings.heartbeat_s))
+        beat_s, lease_s, owner = settings.heartbeat_s, settings.lease_s, context.dispatcher.owner
+        context.presence = Presence(database, owner, "server", slots, beat_s, lease_s=lease_s)
+        helpers.append(context.presence)
     context.dispatcher.start()
     for helper in helpers:
         helper.start()

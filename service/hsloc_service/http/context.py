@@ -18,6 +18,7 @@ from hsloc_service.http.schemas import Problem
 from hsloc_service.jobs.repository import Jobs
 from hsloc_service.jobs.shares import Shares
 from hsloc_service.jobs.sweeps import Sweeps
+from hsloc_service.jobs.workers import Presence
 from hsloc_service.results.deletion_queue import DeletionQueue
 from hsloc_service.results.stores import ResultStores
 from hsloc_service.settings import Settings
@@ -50,8 +51,14 @@ class Context:
     store_calls: BoundedExecutor
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     """Set when the server begins to shut down: event streams end."""
+    presence: Presence | None = None
+    """Where servers share the database: who else is there."""
     streams: Counter[str] = field(default_factory=Counter)
     """Open event streams of each tenant."""
+
+    def servers(self) -> int:
+        """How many servers share the database, this one among them."""
+        return 1 if self.presence is None else self.presence.servers
 
 
 def _context(request: Request) -> Context:

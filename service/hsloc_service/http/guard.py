@@ -24,6 +24,8 @@ from hsloc_service.http import metrics
 from hsloc_service.logs import log, request_id
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from starlette.types import ASGIApp, Receive, Scope, Send
 
     from hsloc_service.auth import Tokens
@@ -53,9 +55,11 @@ SECURITY = {
 class Guard:
     """The outermost layer."""
 
-    def __init__(self, app: ASGIApp, settings: Settings, tokens: Tokens, shares: Shares) -> None:
+    def __init__(
+        self, app: ASGIApp, settings: Settings, tokens: Tokens, shares: Shares, servers: Callable[[], int] = lambda: 1
+    ) -> None:
         self._app, self._settings, self._tokens, self._shares = app, settings, tokens, shares
-        self._rates = Rates(settings.requests_per_s)
+        self._rates, self._servers = Rates(settings.requests_per_s), servers
         self._closed = settings.require_token
         """Whether a token is required: by the settings, or because one was made meanwhile."""
 
@@ -130,7 +134,7 @@ class Guard:
             raise ServiceError(503, "database", "the database is busy", {"Retry-After": "1"}) from error
         if who is None:
             slow = self._settings.refusals_per_s
-            self._rates.take(("refused", client), slow, 20.0 * slow)
+            self._take(("refused", client), slow, 20.0 * slow)
             if path.startswith(SHARED_PREFIX):
                 raise ServiceError(404, "not_found", "this link is unknown, expired or revoked")
             missing = "authorization" not in headers
@@ -140,10 +144,15 @@ class Guard:
                 "send a token: Authorization: Bearer hsl_…" if missing else "this token is unknown, expired or revoked",
                 {"WWW-Authenticate": 'Bearer realm="hsloc"'},
             )
-        self._rates.take(("tenant", who.tenant), self._settings.requests_per_s, 2.0 * self._settings.requests_per_s)
+        self._take(("tenant", who.tenant), self._settings.requests_per_s, 2.0 * self._settings.requests_per_s)
         if random.random() < self._settings.fault_fail_requests:
             raise ServiceError(503, "fault_injection", "this server fails requests on purpose", {"Retry-After": "1"})
         return who
+
+    def _take(self, who: tuple[str, str], per_s: float, burst: float) -> None:
+        """Count a request; of servers that share a database each grants its part of the rate."""
+        share = self._servers()
+        self._rates.take(who, per_s / share, max(burst / share, 1.0))
 
     def _need_host(self, scope: Scope, headers: Headers) -> None:
         """Refuse requests that a page of another site makes: by rebinding its name, by a form or by a script."""

@@ -33,7 +33,7 @@ from hsloc_service.http.schemas import (
     known_moment,
 )
 from hsloc_service.http.views import worker_view
-from hsloc_service.jobs.workers import workers
+from hsloc_service.jobs.workers import alive_workers, workers
 from hsloc_service.webhooks import secret_of
 
 if TYPE_CHECKING:
@@ -197,8 +197,12 @@ def _measure(ctx: Context) -> None:
         counts = {row[0]: row[1] for row in rows}
         oldest = session.scalar(select(func.min(JobRow.created)).where(JobRow.state == "queued"))
         pending = session.scalar(select(func.count()).select_from(DeliveryRow).where(DeliveryRow.state == "pending"))
+        alive = alive_workers(session, ctx.database.now(session) - ctx.settings.lease_s)
     for state in ("queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"):
         metrics.JOBS.labels(state).set(counts.get(state, 0))
+    for kind in ("server", "worker"):
+        metrics.WORKERS.labels(kind).set(sum(row.kind == kind for row in alive))
+    metrics.FLEET_SLOTS.set(sum(row.slots for row in alive))
     capacity = ctx.dispatcher.capacity()
     metrics.SLOTS.set(capacity.slots)
     metrics.BUSY.set(capacity.busy)

@@ -16,7 +16,9 @@ from hsloc_service.db.tables import JobRow, WorkerRow
 from hsloc_service.logs import log
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
+
+    from sqlalchemy.orm import Session
 
     from hsloc_service.auth import Principal
     from hsloc_service.db.database import Database
@@ -52,6 +54,11 @@ def workers(database: Database, who: Principal) -> list[WorkerState]:
     return found
 
 
+def alive_workers(session: Session, since: float) -> Sequence[WorkerRow]:
+    """Those whose last heartbeat was after a time of the database's clock."""
+    return session.scalars(select(WorkerRow).where(WorkerRow.heartbeat > since)).all()
+
+
 def forget_workers(database: Database) -> None:
     """Remove the rows of those that were not there for a day."""
     with database.write() as session:
@@ -68,6 +75,9 @@ class Presence:
     slots: int
     interval_s: float
     draining: Callable[[], bool] = lambda: False
+    lease_s: float = 30.0
+    servers: int = 1
+    """How many servers were alive at the last heartbeat, this one among them."""
     _stop: threading.Event = field(default_factory=threading.Event)
     _thread: threading.Thread | None = None
 
@@ -104,6 +114,8 @@ class Presence:
                 row.version, row.slots, row.started = __version__, self.slots, now
                 session.add(row)
             row.heartbeat, row.draining = now, self.draining()
+            session.flush()
+            self.servers = max(sum(each.kind == "server" for each in alive_workers(session, now - self.lease_s)), 1)
 
     def _run(self) -> None:
         while not self._stop.wait(self.interval_s):

@@ -11,7 +11,7 @@ import numpy as np
 from hsloc.kernels.raycasting import cast_rays
 from hsloc.model import IDENTITY, Pose2, Scan
 from hsloc.model.pose2 import compose_poses
-from hsloc.parameters import NonNegative, Parameters, Range, Ratio
+from hsloc.parameters import NonNegative, Parameters, Positive, Range, Ratio
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -86,7 +86,7 @@ class Lidar(Parameters):
     """Largest range that is measured [m]."""
     range_noise: NonNegative = 0.01
     """Standard deviation of a range [m]."""
-    range_step: Length = RANGE_STEP
+    range_step: Positive = RANGE_STEP
     """Step to which ranges are rounded [m]."""
     dropout: Ratio = 0.0
     """Ratio of the readings that are lost."""
@@ -159,7 +159,7 @@ class PointSensor(Parameters):
     """Number of directions of a scan."""
     range_max: Length = 50.0
     """Largest range that is measured [m]."""
-    range_step: Length = RANGE_STEP
+    range_step: Positive = RANGE_STEP
     """Step to which ranges are rounded [m]."""
     mounting: Pose2 = IDENTITY
     """Pose of the sensor in the base frame."""

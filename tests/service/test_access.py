@@ -64,7 +64,7 @@ WRITE = {
     ("delete", "/v1/tus/{file_id}"),
     ("patch", "/v1/tus/{file_id}"),
     ("post", "/v1/files"),
-    ("post", "/v1/files/sample"),
+    ("post", "/v1/sample-log"),
     ("post", "/v1/inspect"),
     ("post", "/v1/jobs"),
     ("post", "/v1/jobs/{job_id}/cancel"),

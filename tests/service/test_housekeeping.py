@@ -115,6 +115,7 @@ def test_retention_of_many_jobs_holds_up_nobody(make_client: Callable[..., TestC
     tidy = Housekeeping(context.database, context.storage, context.settings, context.deletions).tidy
     thread = threading.Thread(target=tidy, args=(time.time(),))
     waits = []
+    start = time.monotonic()
     thread.start()
     while thread.is_alive():
         begin = time.monotonic()
@@ -122,9 +123,10 @@ def test_retention_of_many_jobs_holds_up_nobody(make_client: Callable[..., TestC
             waits.append(time.monotonic() - begin)
         time.sleep(0.02)
     thread.join()
+    took = time.monotonic() - start
     assert client.get("/v1/jobs").json()["jobs"] == []
     assert client.get("/v1/files").json()["files"] == []
-    assert max(waits) < 2.0  # 60 batches; one takes 0.1 s on an idle machine
+    assert max(waits) < took / 3  # 60 batches; as one transaction the longest wait is all of it
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from hsloc_service.uploads.sample import sample_log
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-router = APIRouter(prefix="/v1/files", tags=["files"])
+router = APIRouter(prefix="/v1", tags=["files"])
 FileId = Annotated[str, Path(pattern=UUID_PATTERN, description="id of an upload")]
 Name = Annotated[
     str, Query(max_length=255, description="what you call it; a label, never a path", examples=["run.mcap"])
@@ -40,7 +40,7 @@ _BODY = {
 }
 
 
-@router.post("", status_code=201, openapi_extra=_BODY, responses=problems(409, 413, 460, 507))
+@router.post("/files", status_code=201, openapi_extra=_BODY, responses=problems(409, 413, 460, 507))
 async def upload(request: Request, ctx: Ctx, who: Writer, name: Name = "log", repr_digest: Digest = None) -> FileView:
     """Upload a log, or a file of a map, as the raw body."""
     wanted = parse_digest(repr_digest)
@@ -48,7 +48,7 @@ async def upload(request: Request, ctx: Ctx, who: Writer, name: Name = "log", re
     return file_view(await _take(request, ctx, who, row, wanted))
 
 
-@router.post("/sample", status_code=201, responses=problems(413, 507))
+@router.post("/sample-log", status_code=201, responses=problems(413, 507))
 async def sample(ctx: Ctx, who: Writer) -> FileView:
     """A log to try the service with, as an upload of yours: a minute of a simulated office, with its map."""
     path = await to_thread.run_sync(sample_log, ctx.storage)
@@ -61,7 +61,7 @@ async def sample(ctx: Ctx, who: Writer) -> FileView:
         return file_view(await ctx.receiver.append(who, row.id, 0, body()))
 
 
-@router.put("/{file_id}", status_code=201, openapi_extra=_BODY, responses=problems(404, 409, 413, 423, 460, 507))
+@router.put("/files/{file_id}", status_code=201, openapi_extra=_BODY, responses=problems(404, 409, 413, 423, 460, 507))
 async def put(
     request: Request,
     response: Response,
@@ -91,7 +91,7 @@ async def put(
     return file_view(await _take(request, ctx, who, row, wanted))
 
 
-@router.get("", responses=problems(404))
+@router.get("/files", responses=problems(404))
 def list_files(
     ctx: Ctx,
     who: Reader,
@@ -103,13 +103,13 @@ def list_files(
     return FileList(files=[file_view(row) for row in rows], next=rows[-1].id if len(rows) == limit else None)
 
 
-@router.get("/{file_id}", responses=problems(404))
+@router.get("/files/{file_id}", responses=problems(404))
 def get(ctx: Ctx, who: Reader, file_id: FileId) -> FileView:
     """One upload."""
     return file_view(ctx.files.get(who, file_id))
 
 
-@router.delete("/{file_id}", status_code=204, responses=problems(404, 409, 423))
+@router.delete("/files/{file_id}", status_code=204, responses=problems(404, 409, 423))
 async def delete(ctx: Ctx, who: Writer, file_id: FileId) -> None:
     """Remove an upload; refused while an active job needs it."""
     await to_thread.run_sync(ctx.files.get, who, file_id)

@@ -80,7 +80,7 @@ share.listen();
 $("try-sample").addEventListener("click", () => guarded(async () => {
   $("try-sample").disabled = true;
   try {
-    const job = await post("/v1/jobs", { log: (await post("/v1/files/sample")).id });
+    const job = await post("/v1/jobs", { log: (await post("/v1/sample-log")).id });
     location.hash = `job=${job.id}`;
   } finally { $("try-sample").disabled = false; }
 }));

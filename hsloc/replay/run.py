@@ -218,7 +218,7 @@ def _run_with(
     replayed = time.perf_counter()
     if history.scans == 0:
         where = "between --start and --end" if _cut(request) else f"on {log.summary.scan_topic} that could be read"
-        lost = "".join(f": {line}" for line in ["; ".join(log.losses.lines())] if line)
+        lost = "".join(f": {line}" for line in ["; ".join([*log.losses.lines(), *log.losses.reasons])] if line)
         raise LogError(f"{request.logs[0]}: no scan {where}{lost}")
     if first is None and not lidar_only:
         where = "between --start and --end" if _cut(request) else f"on {log.summary.odom_topic} that could be read"

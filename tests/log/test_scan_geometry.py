@@ -69,7 +69,7 @@ def codes(found: list[ScanMessage]) -> list[str]:
         {"step": 0.0},
         {"far": 0.01},
         {"far": 0.4, "code": 65.533},  # what a driver writes for no return
-        {"range_max": 1e6},
+        {"range_max": 450.0},
         {"beams": 721, "increment": TURN / 720, "step": 0.1 / 720},
         {"step": -0.1 / 360},
     ],
@@ -84,18 +84,34 @@ def test_sound_scans_raise_no_word(changes: dict[str, float]) -> None:
         ({"increment": -TURN / 360, "high": pi}, "scan_angle_increment", "increment=negate"),
         ({"increment": TURN / 720, "high": pi}, "scan_angle_increment", "increment=angles"),
         ({"increment": TURN / 180, "high": pi}, "scan_angle_increment", "increment=angles"),
+        ({"increment": TURN / 180}, "scan_angle_increment", "increment=0.0174533"),
         ({"low": -180.0, "increment": 1.0}, "scan_angle_unit", "angles=degrees"),
         ({"beams": 271, "low": -135.0, "increment": 1.0}, "scan_angle_unit", "angles=degrees"),
         ({"step": 0.1 / 360 / 1000}, "scan_time_increment", "time_increment=interval"),
         ({"step": 0.1 / 360 / 20}, "scan_time_increment", "time_increment=interval"),
         ({"step": 0.1 / 360 * 50}, "scan_time_increment", "time_increment=interval"),
         ({"far": 0.3}, "scan_range_max", "range_max="),
+        ({"range_max": 12e3}, "scan_range_unit", "ranges=millimetres"),
     ],
 )
 def test_what_does_not_fit_is_named_with_the_flag(changes: dict[str, float], code: str, flag: str) -> None:
     (problem,) = survey(scans(**changes)).problems  # type: ignore[arg-type]
     assert problem.code == code
     assert flag in problem.remedy
+
+
+def test_limits_and_ranges_of_another_unit_are_named_and_corrected() -> None:
+    plain = scans(1)[0]
+    near = plain._replace(range_min=50.0, range_max=12e3)
+    assert codes([near]) == ["scan_range_min"]
+    assert codes([ScanFixes.parse("range_min=0.05").apply(near, 0.1)]) == []
+    # Limits may be in metres already.
+    for limits in ((50.0, 12e3), (0.05, 12.0)):
+        scan = plain._replace(ranges=plain.ranges * 1000, range_min=limits[0], range_max=limits[1])
+        assert codes([scan]) == ["scan_range_unit"]
+        fixed = ScanFixes.parse("ranges=millimetres").apply(scan, 0.1)
+        np.testing.assert_allclose(fixed.ranges, plain.ranges, rtol=1e-6)
+        assert (fixed.range_min, fixed.range_max) == (0.05, 12.0)
 
 
 @pytest.mark.parametrize(

@@ -160,7 +160,7 @@ class ScanCheck(TopicCheck):
                 Severity.ERROR, "scan_unusable", place,
                 f"scans without geometry (angle_min {message.angle_min:g}, angle_increment "
                 f"{message.angle_increment:g}, range_max {message.range_max:g}, {len(message.ranges)} beams)",
-                "repair the driver: no point can be made of them",
+                "repair the driver, or override a field with --scan-fix: no point can be made of them",
             )  # fmt: skip
         if self._beams is not None and len(message.ranges) != self._beams:
             far = abs(len(message.ranges) - self._beams) > _BEAMS_TOLERATED * self._beams

@@ -108,6 +108,7 @@ class ScanFeed:
             or (increment == 0.0 and len(ranges) > 2)  # all beams in one direction: no scan of a place
         ):
             self._losses.invalid_messages[self.topic] += 1
+            self._losses.note(f"{self.topic}: {_why_unusable(increment, range_max)}")
             return ()
         self._code.learn(ranges, increment, (range_min, range_max))
         ranges = self._code.apply(ranges)
@@ -133,6 +134,15 @@ class ScanFeed:
             intensities,
         )
         return ((self._clock, scan),)
+
+
+def _why_unusable(increment: float, range_max: float) -> str:
+    """Which field makes a scan unusable, and what corrects it."""
+    if increment == 0.0:
+        return "angle_increment is 0; --scan-fix increment=angles takes that of angle_max, increment=RADIANS any other"
+    if not range_max > 0.0:
+        return f"range_max is {range_max:g}; --scan-fix range_max=METRES corrects it"
+    return "the angles are no numbers; --scan-fix increment=RADIANS overrides the increment"
 
 
 class CloudFeed:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import pairwise
-from math import inf, isfinite, nan, pi, radians
+from math import copysign, inf, isfinite, nan, pi, radians
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -42,8 +42,17 @@ _CODE_SHARE = 0.5
 """Readings beyond range_max of which more than this part have one value are a code for no return."""
 
 
-_ONLY = {"angles": ("degrees",), "echo": ("strongest",)}
+_NEAR_SHARE = 0.5
+"""Finite readings below range_min that are worth a word, as a part of all finite ones."""
+_FARTHEST_M = 500.0
+"""No planar lidar measures as far [m]: readings that are larger are not in metres."""
+
+
+_ONLY = {"angles": ("degrees",), "echo": ("strongest",), "ranges": ("millimetres",)}
 """Fields of `--scan-fix` that take a word alone."""
+
+
+_NUMBERS = ("increment", "time_increment", "range_min", "range_max")
 
 
 class Problem(NamedTuple):
@@ -60,14 +69,17 @@ class ScanFixes:
 
     `increment` is an angle in radians, or `angles` (from angle_min, angle_max and the number of beams) or `negate`;
     `degrees` says that all angles are in degrees; `time_increment` is a time in seconds, or `interval` (from the time
-    between scans); `range_max` is in metres; `strongest` takes of each beam the strongest echo, not the first.
+    between scans); `range_min` and `range_max` are in metres; `millimetres` says that ranges are in millimetres, and
+    their limits, too, if no lidar measures as far; `strongest` takes of each beam the strongest echo, not the first.
     """
 
     increment: float | str | None = None
     degrees: bool = False
     time_increment: float | str | None = None
+    range_min: float | None = None
     range_max: float | None = None
     strongest: bool = False
+    millimetres: bool = False
 
     @staticmethod
     def parse(text: str | None) -> ScanFixes:
@@ -77,11 +89,8 @@ class ScanFixes:
         words = {"increment": ("angles", "negate"), "time_increment": ("interval",), **_ONLY}
         for item in items:
             name, _, text = item.partition("=")
-            if name not in ("increment", "time_increment", "range_max", *_ONLY):
-                raise ConfigError(
-                    f"--scan-fix {item}: {name!r} is unknown; known are increment, time_increment, range_max, "
-                    f"{', '.join(_ONLY)}"
-                )
+            if name not in (*_NUMBERS, *_ONLY):
+                raise ConfigError(f"--scan-fix {item}: {name!r} is unknown; known are {', '.join((*_NUMBERS, *_ONLY))}")
             if text in words.get(name, ()):
                 values[text if name in _ONLY else name] = True if name in _ONLY else text
                 continue
@@ -90,7 +99,7 @@ class ScanFixes:
             except ValueError:
                 number = nan
             allowed = " or ".join([*words.get(name, ()), *(["a number"] if name not in _ONLY else [])])
-            if not isfinite(number) or name in _ONLY or (name == "range_max" and number <= 0.0):
+            if not isfinite(number) or name in _ONLY or (name.startswith("range_") and number < 0.0):
                 raise ConfigError(f"--scan-fix {item}: {text!r} must be {allowed}")
             values[name] = number
         return ScanFixes(**values)  # type: ignore[arg-type]
@@ -114,12 +123,18 @@ class ScanFixes:
         if self.strongest and message.echoes is not None:
             ranges, intensities = strongest_echoes(*message.echoes)
             message = message._replace(ranges=ranges, intensities=intensities)
+        nearest, farthest = message.range_min, message.range_max
+        if self.millimetres:
+            message = message._replace(ranges=message.ranges * np.float32(0.001))
+            if farthest > _FARTHEST_M:
+                nearest, farthest = 0.001 * nearest, 0.001 * farthest
         return message._replace(
             angle_min=low,
             angle_increment=increment,
             angle_max=high,
             time_increment=step,
-            range_max=message.range_max if self.range_max is None else self.range_max,
+            range_min=nearest if self.range_min is None else self.range_min,
+            range_max=farthest if self.range_max is None else self.range_max,
             echoes=None,
         )
 
@@ -170,7 +185,14 @@ def _angles(scan: ScanMessage) -> Problem | None:
         return None
     known = [angle for angle in (low, high) if isfinite(angle)]
     if max(map(abs, known)) > _TURN + _LEAST_DISAGREEMENT and abs(increment) * (beams - 1) > 1.5 * _TURN:
-        fits = abs(increment) * (beams - 1) <= 360.0 + _SPARE_BEAMS * abs(increment)
+        span = abs(increment) * (beams - 1)
+        if span <= 3.0 * _TURN:  # as degrees this would be a slit
+            turn = f"{copysign(_TURN / beams, increment):.6g}"
+            text = f"{beams} beams of angle_increment {increment:g} make {span / _TURN:.1f} turns"
+            return Problem(
+                WarningCode.SCAN_ANGLE_INCREMENT, text, f"--scan-fix increment={turn} makes it one, or give your own"
+            )
+        fits = span <= 360.0 + _SPARE_BEAMS * abs(increment)
         text = f"angles from {low:g} to {high:g} with steps of {increment:g} are no radians"
         return Problem(
             WarningCode.SCAN_ANGLE_UNIT, text, "--scan-fix angles=degrees reads them as degrees" if fits else _REPAIR
@@ -198,11 +220,25 @@ _REPAIR = "repair the driver; --scan-fix overrides a field"
 
 
 def _ranges(scans: Sequence[ScanMessage]) -> Problem | None:
-    """Whether readings beyond range_max are measured: then they are dropped, and range_max is wrong."""
-    limit = scans[0].range_max
-    if not isfinite(limit):
-        return None
+    """Whether readings beyond the limits are measured: then they are dropped, and a limit or the unit is wrong."""
+    limit, nearest = scans[0].range_max, scans[0].range_min
     readings = np.concatenate([scan.ranges[np.isfinite(scan.ranges)] for scan in scans])
+    measured = readings[readings > 0.0]
+    if len(measured) and np.median(measured) > _FARTHEST_M:
+        return Problem(
+            WarningCode.SCAN_RANGE_UNIT,
+            f"half of the readings are beyond {np.median(measured):.0f} m, farther than any lidar measures",
+            "--scan-fix ranges=millimetres reads them as millimetres",
+        )
+    if np.count_nonzero(measured < nearest) > _NEAR_SHARE * max(len(measured), 1):
+        share, first = 100.0 * float(np.mean(measured < nearest)), float(np.percentile(measured, 1.0))
+        return Problem(
+            WarningCode.SCAN_RANGE_MIN,
+            f"{share:.0f} % of the finite readings lie below range_min, {nearest:g} m, and are discarded",
+            f"--scan-fix range_min={np.floor(50.0 * first) / 100.0:g} uses them, if the lidar measures as near",
+        )
+    if not (isfinite(limit) and limit > 0.0):
+        return None
     beyond = readings[readings > limit * (1.0 + 1e-6)]
     if len(beyond) <= _FAR_SHARE * max(len(readings), 1):
         return None

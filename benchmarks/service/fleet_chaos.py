@@ -32,7 +32,7 @@ from sqlalchemy import select
 from hsloc.client import Client, ClientError
 from hsloc_service.db.database import Database
 from hsloc_service.db.tables import AssetRow, EventRow, FileRow, JobRow
-from hsloc_service.results.object_store import ObjectStore
+from hsloc_service.results.stores import ObjectStore
 from hsloc_service.results.upload_parts import UploadParts
 
 ENDS = ("succeeded", "failed", "crashed", "cancelled")

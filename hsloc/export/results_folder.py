@@ -20,9 +20,8 @@ from hsloc.atomic_write import whole_folder
 from hsloc.dataclass_json import to_json
 from hsloc.errors import OutputError
 from hsloc.evaluation import write_json, write_tum
-from hsloc.export.lichtblick import LAYOUT_FILE, write_layout
 from hsloc.export.provenance import config_text, provenance
-from hsloc.export.run_mcap import RunRecording
+from hsloc.export.run_mcap import LAYOUT_FILE, RunRecording, write_layout
 from hsloc.maps import save_map
 from hsloc.report.data import ReportParts
 from hsloc.report.html import write_report_html

@@ -25,9 +25,8 @@ from hsloc_service.errors import ServiceError
 from hsloc_service.housekeeping import Housekeeping
 from hsloc_service.http.app import create_app
 from hsloc_service.http.results_routes import parse_range
-from hsloc_service.results.object_store import ObjectStore
 from hsloc_service.results.store import BLOCK, Asset, FolderStore, ResultStore, collect
-from hsloc_service.results.stores import ResultStores
+from hsloc_service.results.stores import ObjectStore, ResultStores
 from hsloc_service.settings import SettingsError
 from hsloc_service.storage import Storage
 from hsloc_service.uploads.repository import need_quota

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -51,6 +52,7 @@ def test_importing_is_cheap() -> None:
 def test_a_matcher_of_ones_own_through_all_of_a_run(mine: hsloc.Result, tmp_path: Path) -> None:
     written = hsloc.write_results(mine, str(tmp_path / "out"))
     assert written.metrics.run.matcher == "MyMatcher"
+    assert re.fullmatch(r"<WrittenResults: <Analysis: good, 0 warnings, <Comparison: 600 pairs, .*>>>", repr(written))
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["run"]["matcher"] == "MyMatcher"
     text = (tmp_path / "out" / "config.yaml").read_text()
     assert "# matcher of the caller's own: MyMatcher" in text
@@ -71,6 +73,11 @@ def test_a_result_is_a_line_and_its_poses_are_arrays(mine: hsloc.Result) -> None
     assert list(frame.columns) == ["stamp_ns", "x", "y", "theta"]
     np.testing.assert_array_equal(frame[["x", "y", "theta"]].to_numpy(), mine.trajectory.poses)
     assert len(repr(mine.trajectory)) < 100
+    assert re.fullmatch(r"<OccupancyGrid: \d+ x \d+ cells of 0.05 m, \d+ occupied>", repr(mine.grid))
+    field = hsloc.LikelihoodField.from_grid(mine.grid)
+    assert repr(field).startswith("<LikelihoodField: ")
+    scan = hsloc.Scan(7, np.array([1.0, np.inf], dtype=np.float32), 0.0, 0.1, 0.1, 10.0)
+    assert repr(scan) == "<Scan: 'laser' at 7 ns, 1 of 2 beams hit>"
 
 
 def test_without_pandas_there_is_a_reason(mine: hsloc.Result, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,6 +65,10 @@ class Analysis:
     convergence: Convergence
     overlay: ScanOverlay
 
+    def __repr__(self) -> str:
+        compared = "no reference" if self.comparison is None else repr(self.comparison)
+        return f"<Analysis: {self.metrics.verdict.value}, {len(self.metrics.warnings)} warnings, {compared}>"
+
 
 def analyse(
     result: Result,

@@ -104,6 +104,10 @@ class Comparison:
     aligned: Floats
     errors: PoseErrors
 
+    def __repr__(self) -> str:
+        rmse = float(np.sqrt(np.mean(np.square(self.errors.trans_part))))
+        return f"<Comparison: {len(self.aligned)} pairs, alignment {self.alignment}, APE rmse {rmse:.4f} m>"
+
     def evaluation(self, deltas: tuple[Delta, ...] = DELTAS) -> Evaluation:
         """The statistics of the errors, with RPE over pieces of each of `deltas`."""
         pairs = self.pairs

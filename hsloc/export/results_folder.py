@@ -58,6 +58,9 @@ class WrittenResults:
     timings: RunTimings
     view: ReportView
 
+    def __repr__(self) -> str:
+        return f"<WrittenResults: {self.analysis!r}>"
+
     @property
     def metrics(self) -> RunMetrics:
         """The content of metrics.json."""

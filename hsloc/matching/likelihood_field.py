@@ -47,6 +47,10 @@ class LikelihoodField:
     walls: F64 | None = None
     """The points of the map, shape (n, 2) in metres in the map frame, for matchers that pair points (ICP)."""
 
+    def __repr__(self) -> str:
+        height, width = self.packed.shape[:2]
+        return f"<LikelihoodField: {width} x {height} squares of {self.resolution:g} m, sigma {self.sigma:g} m>"
+
     @staticmethod
     def from_scores(
         scores: F32, resolution: float, T_map_field: Pose2, sigma: float, walls: F64 | None = None

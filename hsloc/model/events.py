@@ -68,6 +68,9 @@ class Scan:
     intensities: NDArray[np.float32] | None = field(default=None, repr=False)
     T_base_beam: NDArray[np.float64] | None = field(default=None, repr=False)
 
+    def __repr__(self) -> str:
+        return f"<Scan: {self.frame_id!r} at {self.stamp_ns} ns, {self.hits().sum()} of {len(self.ranges)} beams hit>"
+
     def angles(self) -> NDArray[np.float64]:
         """Direction of each beam in the laser's frame, radians, shape (n,)."""
         return self.angle_min + self.angle_increment * np.arange(len(self.ranges), dtype=np.float64)

@@ -31,6 +31,10 @@ class OccupancyGrid:
     origin: Pose2 = IDENTITY
     occupied_threshold: int = 65
 
+    def __repr__(self) -> str:
+        height, width = self.cells.shape
+        return f"<OccupancyGrid: {width} x {height} cells of {self.resolution:g} m, {self.occupied().sum()} occupied>"
+
     def occupied(self) -> NDArray[np.bool_]:
         """Which cells count as occupied, shape (height, width)."""
         return self.cells >= self.occupied_threshold

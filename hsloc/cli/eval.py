@@ -193,7 +193,7 @@ def _compared(arguments: argparse.Namespace, path: str, reference: str | None) -
 
 def _draw(arguments: argparse.Namespace, comparisons: Mapping[str, Comparison]) -> None:
     """Save the plot, and show it, where that is asked for."""
-    from hsloc.report.eval_plot import save_plot, show_plot
+    from hsloc.report.png import save_plot, show_plot
 
     if arguments.save_plot is not None:
         save_plot(arguments.save_plot, comparisons)

@@ -1,4 +1,7 @@
-"""report.png: where the robot went, how large the errors are, and how certain the result is, in one picture."""
+"""Pictures by matplotlib: report.png of a run, and the plots of `hsloc eval`.
+
+The plots show trajectories with the reference, the error on the map, and errors over time.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +10,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import matplotlib
+import numpy as np
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from hsloc.atomic_write import write_atomically
+from hsloc.errors import OutputError
 from hsloc.report import style
 from hsloc.report.charts import Chart, run_charts
-from hsloc.report.data import prepare
+from hsloc.report.data import prepare, since
 from hsloc.report.map_image import Extent, shown_extent
 from hsloc.report.png_panels import draw_map, draw_panel, draw_table
 from hsloc.report.summary import ResultSummary
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from matplotlib.axes import Axes
     from matplotlib.text import Text
+    from numpy.typing import NDArray
 
+    from hsloc.evaluation import Comparison
     from hsloc.report.data import ReportData, ReportParts
     from hsloc.report.table import Row
 
@@ -41,6 +52,16 @@ WIDE = 2.1
 """From this ratio of width to height on, the map takes the whole width, and the rest is below it."""
 
 SETTINGS_THAT_STAY = ("backend", "backend_fallback", "interactive", "toolbar", "webagg", "tk.", "savefig.directory")
+
+Box = tuple[float, float, float, float]
+FORMATS = (".png", ".svg", ".pdf")
+_INKS = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE)
+_METADATA: dict[str, dict[str, str | None]] = {
+    ".png": {"Software": None},
+    ".svg": {"Date": None},
+    ".pdf": {"CreationDate": None},
+}
+"""Without the time, so that the same errors give the same bytes."""
 
 
 def draw_report(path: str | Path, parts: ReportParts) -> None:
@@ -129,9 +150,6 @@ def _fit(line: Text, texts: list[str], width: float) -> None:
         line.set_text(texts[low])
 
 
-Box = tuple[float, float, float, float]
-
-
 def _place(figure: Figure, extent: Extent, panels: list[Chart], rows: list[Row], data: ReportData) -> Box:
     """Draw panels and table beside the map or below it; returns the box that is left for the map."""
     if not panels and not rows:
@@ -166,3 +184,73 @@ def _draw_panels(figure: Figure, panels: list[Chart], data: ReportData, box: Box
 def _draw_rows(figure: Figure, rows: list[Row], box: Box) -> None:
     if rows:
         draw_table(figure.add_axes(box), rows, line_height=LINE / box[3])
+
+
+def draw_comparisons(comparisons: Mapping[str, Comparison], figure: Figure | None = None) -> Figure:
+    """The figure: paths with the reference on the left, translation and rotation errors over time on the right.
+
+    A single estimate is coloured by its error, as evo does.
+    """
+    figure = Figure(figsize=(13.0, 6.5), layout="constrained") if figure is None else figure
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
+    paths, translation = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
+    rotation = figure.add_subplot(grid[1, 1], sharex=translation)
+    first = min(int(each.pairs.stamps_ns.min()) for each in comparisons.values())
+    for k, (name, each) in enumerate(comparisons.items()):
+        order = np.argsort(each.pairs.stamps_ns, kind="stable")
+        seconds = since(each.pairs.stamps_ns[order], first)
+        error, turn = each.errors.trans_part[order], each.errors.angle_deg[order]
+        reference, moved = each.pairs.reference[order], each.aligned[order, :2]
+        ink = _INKS[k % len(_INKS)]
+        paths.plot(*reference[:, :2].T, "--", color=style.MUTED, linewidth=1.0, label="reference" if k == 0 else None)
+        if len(comparisons) == 1 and len(moved) > 1:
+            _by_error(figure, paths, moved, error)
+        else:
+            paths.plot(*moved.T, color=ink, linewidth=1.6, label=name)
+        translation.plot(seconds, error * 100.0, color=ink, linewidth=1.1, label=name)
+        rotation.plot(seconds, turn, color=ink, linewidth=1.1)
+    paths.set_aspect("equal", adjustable="datalim")
+    alignment = next(iter(comparisons.values())).alignment
+    paths.set(xlabel="x [m]", ylabel="y [m]", title=f"Path (alignment {alignment})")
+    translation.set(ylabel="translation error [cm]", title="Absolute pose error")
+    rotation.set(ylabel="rotation error [deg]", xlabel="time [s]")
+    for axes in (translation, rotation):
+        axes.set_ylim(bottom=0.0)
+    for axes in (paths, translation, rotation):
+        axes.grid(color=style.RULE, linewidth=0.6)
+        axes.set_axisbelow(True)
+    paths.legend(loc="best", fontsize=style.SMALL)
+    if len(comparisons) > 1:
+        translation.legend(loc="best", fontsize=style.SMALL)
+    return figure
+
+
+def _by_error(figure: Figure, axes: Axes, path: NDArray[np.float64], error: NDArray[np.float64]) -> None:
+    pieces = np.stack((path[:-1], path[1:]), axis=1)
+    lines = LineCollection(list(pieces), cmap="viridis", linewidths=2.0)
+    lines.set_array(100.0 * error[1:])
+    axes.add_collection(lines)
+    axes.autoscale_view()
+    figure.colorbar(lines, ax=axes, label="translation error [cm]", shrink=0.7)
+
+
+def save_plot(path: Path, comparisons: Mapping[str, Comparison]) -> None:
+    """Write the figure as PNG, SVG or PDF, by the name's ending. Raises OutputError."""
+    if path.suffix.lower() not in FORMATS:
+        raise OutputError(f"{path}: unknown kind of picture; name a file that ends in {', '.join(FORMATS)}")
+    try:
+        with rc_context({"svg.hashsalt": "hsloc"}):  # else ids of an SVG differ from one time to the next
+            draw_comparisons(comparisons).savefig(path, dpi=140, metadata=_METADATA[path.suffix.lower()])
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}; choose another file") from error
+
+
+def show_plot(comparisons: Mapping[str, Comparison]) -> None:
+    """Open the figure in a window, and wait until it is closed. Raises OutputError where there is none to open."""
+    import matplotlib
+    from matplotlib import pyplot
+
+    if matplotlib.get_backend().lower() == "agg":
+        raise OutputError("--plot: there is no display, or no toolkit for windows (tkinter); use --save-plot FILE.png")
+    draw_comparisons(comparisons, pyplot.figure(figsize=(13.0, 6.5), layout="constrained"))
+    pyplot.show()

@@ -15,7 +15,7 @@ import pytest
 from evaluation_paths import disturb, make_path
 
 from hsloc.cli.main import main
-from hsloc.report.eval_plot import FORMATS
+from hsloc.report.png import FORMATS
 from hsloc.trajectory_io.tum import write_tum
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from hsloc_service.http import metrics
 from hsloc_service.http.context import Context, Ctx, Reader, Writer, problems
 from hsloc_service.http.schemas import UUID_PATTERN, FileList, FileView
 from hsloc_service.http.views import file_view
-from hsloc_service.uploads.sample import sample_log
+from hsloc_service.uploads.repository import sample_log
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

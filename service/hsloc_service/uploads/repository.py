@@ -1,7 +1,11 @@
-"""Uploads: their rows, whose offset counts only bytes that are on the disk."""
+"""Uploads: their rows, whose offset counts only bytes that are on the disk; and a log to try the service with."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import threading
 import time
 import uuid
 from dataclasses import dataclass
@@ -9,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import case, delete, func, select, tuple_
 
+from hsloc.version import __version__
 from hsloc_service.audit import note
 from hsloc_service.db.tables import ACTIVE, FileRow, JobRow, UploadPartRow
 from hsloc_service.errors import ServiceError, conflict, no_space, not_found
@@ -17,6 +22,7 @@ from hsloc_service.stored_request import files_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from sqlalchemy.orm import Session
 
@@ -25,6 +31,11 @@ if TYPE_CHECKING:
     from hsloc_service.results.upload_parts import UploadParts
     from hsloc_service.settings import Settings
     from hsloc_service.storage import Storage
+
+SECONDS = 60
+"""Length of the log [s]."""
+TIMEOUT_S = 120.0
+_making = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,3 +180,20 @@ def _file(session: Session, who: Principal, file_id: str) -> FileRow:
     if row is None:
         raise not_found("file", file_id)
     return row
+
+
+def sample_log(storage: Storage) -> Path:
+    """The log, made by `hsloc record` in a process of its own. Raises ServiceError 503 where that fails."""
+    path = storage.cache / f"sample-{__version__}.mcap"
+    with _making:
+        if not path.exists():
+            storage.need_space(4 << 20)
+            made = storage.work / f"sample-{uuid.uuid4().hex}.mcap"
+            command = [sys.executable, "-m", "hsloc.cli.main", "record", str(made), "--world", "office", "-q"]
+            try:
+                subprocess.run([*command, "--duration", str(SECONDS)], check=True, timeout=TIMEOUT_S)
+            except (OSError, subprocess.SubprocessError) as error:
+                made.unlink(missing_ok=True)
+                raise ServiceError(503, "sample", "the sample could not be made; upload a log of your own") from error
+            os.replace(made, path)
+    return path

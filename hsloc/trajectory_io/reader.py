@@ -1,7 +1,8 @@
 """Trajectories as other tools write them: TUM, EuRoC, KITTI, planar text, CSV with a head; in whatever unit of time.
 
-What a file means is taken from its head (also behind `#`), from the number of its columns, and from its values. Where
-these leave a choice, the reading is refused with the remedy, or made and named in `warnings`.
+What a file means is taken from its head (also behind `#`, or `%` as `rostopic echo -p` writes it), from the number of
+its columns, and from its values. Where these leave a choice, the reading is refused with the remedy, or made and named
+in `warnings`.
 """
 
 from __future__ import annotations
@@ -37,7 +38,10 @@ class LoadedTrajectory:
 
 
 class _Columns(NamedTuple):
-    """Where the values of a pose are in a row: t, x, y, z (or -1) and the quaternion, or the heading alone."""
+    """Where the values of a pose are in a row: t, x, y, z (or -1) and the quaternion, or the heading alone.
+
+    `nanoseconds` is the column of a stamp's second part, where `t` has whole seconds, or -1.
+    """
 
     t: int
     position: tuple[int, int, int]
@@ -45,6 +49,7 @@ class _Columns(NamedTuple):
     heading: int = -1
     unit: str = ""
     in_degrees: bool = False
+    nanoseconds: int = -1
 
 
 _TUM = _Columns(0, (1, 2, 3), (4, 5, 6, 7))
@@ -121,13 +126,18 @@ def _head(path: Path) -> _Columns | None:
     return None
 
 
+_MARKS = "\"'[]()%"
+"""What stands around the names of a head."""
+
+
 def _is_head(fields: list[str]) -> bool:
-    names = [field.strip("\"'[]()").lower() for field in fields if field.strip("\"'[]()")]
+    names = [field.strip(_MARKS).lower() for field in fields if field.strip(_MARKS)]
     return bool(names) and all(name[:1].isalpha() and name not in ("nan", "inf", "infinity") for name in names)
 
 
 def _columns(path: Path, line: str) -> _Columns | None:
     """The columns that a head names; None where it names no pose."""
+    line = line.lstrip("% ")
     separator = "," if "," in line else ";" if ";" in line else None
     names = [name.strip().strip("\"'").lower() for name in (line.split(separator) if separator else line.split())]
     units = ("[s]", "[m]", "[]", "[ns]", "[us]", "[ms]", "(s)", "(m)")
@@ -136,11 +146,16 @@ def _columns(path: Path, line: str) -> _Columns | None:
     def find(*words: str) -> int:
         for index, name in enumerate(names):
             bare = name.split("[")[0].split("(")[0].strip().replace(".", "_")
-            if bare in words or any(bare.endswith(f"_{word}") for word in words if len(word) <= 2):
+            if bare in words or any(bare.endswith(f"_{word}") for word in words if len(word) <= 2 or "_" in word):
                 return index
         return -1
 
-    t = find("t", "time", "timestamp", "stamp", "#timestamp", "sec", "seconds")
+    t = find("header_stamp", "stamp_sec", "stamp_secs")
+    if t < 0:
+        t = find("t", "time", "timestamp", "stamp", "#timestamp", "sec", "secs", "seconds")
+    nanoseconds = find(
+        "nanosec", "nanosecs", "nsec", "nsecs", "nanoseconds", "stamp_nanosec", "stamp_nsec", "stamp_nsecs"
+    )
     x, y, z = (find(f"t{axis}", f"p{axis}", f"p_{axis}", f"pos_{axis}", f"position_{axis}", axis) for axis in "xyz")
     q = [find(f"q{axis}", f"q_{axis}", f"q_rs_{axis}", f"orientation_{axis}", f"rot_{axis}") for axis in "xyzw"]
     if t < 0:
@@ -150,11 +165,12 @@ def _columns(path: Path, line: str) -> _Columns | None:
     unit = next((unit for unit in ("ns", "us", "ms") if f"[{unit}]" in names[t] or names[t].endswith(f"_{unit}")), "")
     if min(q) >= 0:
         quaternion = (q[0], q[1], q[2], q[3])
-        return _Columns(t, (x, y, z), quaternion, unit=unit)
+        return _Columns(t, (x, y, z), quaternion, unit=unit, nanoseconds=nanoseconds)
     angles = ("theta", "yaw", "heading", "phi")
     heading = find(*angles, *(f"{angle}_{unit}" for angle in angles for unit in ("rad", "deg", "radians", "degrees")))
     if heading >= 0:
-        return _Columns(t, (x, y, z), heading=heading, unit=unit, in_degrees="deg" in names[heading])
+        in_degrees = "deg" in names[heading]
+        return _Columns(t, (x, y, z), heading=heading, unit=unit, in_degrees=in_degrees, nanoseconds=nanoseconds)
     return None
 
 
@@ -194,6 +210,11 @@ def _unit(rows: list[list[str]], columns: _Columns) -> str:
 
 def _stamp(fields: list[str], columns: _Columns, unit: str) -> int:
     text = fields[columns.t]
+    if columns.nanoseconds >= 0:
+        parts = text, fields[columns.nanoseconds]
+        if not all(part.isdecimal() and len(part) <= 10 for part in parts):
+            raise ValueError(f"{' '.join(parts)!r} are no seconds and nanoseconds of a stamp")
+        return int(parts[0]) * 1_000_000_000 + int(parts[1])
     digits = {name: count for name, _, count in _UNITS}
     if not unit:
         try:

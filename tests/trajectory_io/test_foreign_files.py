@@ -51,6 +51,24 @@ def rows() -> list[tuple[int, list[float]]]:
     return [(int(stamp), pose.tolist()) for stamp, pose in zip(STAMPS, PATH, strict=True)]
 
 
+def test_ros_messages_as_csv(tmp_path: Path) -> None:
+    """As `rostopic echo -p` writes them, and with seconds and nanoseconds in columns of their own."""
+    q = [(math.sin(theta / 2.0), math.cos(theta / 2.0)) for _, (_, _, theta) in rows()]
+    tails = [f"{x!r},{y!r},0,0,0,{a!r},{b!r}" for (_, (x, y, _)), (a, b) in zip(rows(), q, strict=True)]
+    pose = ",".join(f"pose.position.{axis}" for axis in "xyz")
+    pose += "," + ",".join(f"pose.orientation.{axis}" for axis in "xyzw")
+    field = "field." + pose.replace(",", ",field.")
+    stamps = [stamp for stamp, _ in rows()]
+    lines = [f"{stamp + 7},{stamp},map,{tail}" for stamp, tail in zip(stamps, tails, strict=True)]
+    head = f"%time,field.header.stamp,field.header.frame_id,{field}"
+    assert "read as ns" in check(written(tmp_path / "a.csv", lines, head))
+    lines = [f"{stamp // 10**9},{stamp % 10**9},{tail}" for stamp, tail in zip(stamps, tails, strict=True)]
+    for names in ("header.stamp.sec,header.stamp.nanosec", "sec,nsec"):
+        assert check(written(tmp_path / "b.csv", lines, f"{names},{pose}")) == ""
+    with pytest.raises(EvaluationError, match=r"line 2: .* are no seconds and nanoseconds"):
+        written(tmp_path / "b.csv", [f"1.5,3,{tails[0]}"], f"sec,nsec,{pose}")
+
+
 def test_headings_in_degrees_are_known_by_the_direction_of_motion(tmp_path: Path) -> None:
     lines = [f"{seconds(stamp)} {x!r} {y!r} {math.degrees(theta)!r}" for stamp, (x, y, theta) in rows()]
     assert "only as degrees" in check(written(tmp_path / "a.txt", lines))

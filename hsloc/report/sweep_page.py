@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from html import escape
 from math import isfinite, nan
 from typing import TYPE_CHECKING, Any
@@ -20,19 +21,60 @@ _FIGURES = (("ape_m", "cm", "APE"), ("ape_deg", "°", ""), ("relations_m", "cm",
 _WORDS = ("good", "check", "failed")
 
 
+@dataclass(frozen=True, slots=True)
+class SweepCell:
+    """A log and a configuration: numbers of its rows in the table, one for each seed, and texts of their figures."""
+
+    rows: tuple[int, ...]
+    texts: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SweepMatrix:
+    """A sweep by logs and configurations."""
+
+    logs: tuple[str, ...]
+    configs: tuple[str, ...]
+    cells: tuple[tuple[SweepCell, ...], ...]
+    """By log, then by configuration."""
+    overall: tuple[tuple[str, ...], ...]
+    """By configuration: counts of verdicts, and the mean over the logs of which every configuration has an error."""
+
+
+def sweep_matrix(table: Sequence[Row]) -> SweepMatrix:
+    """From the rows of the sweep's table."""
+    logs, configs = (tuple(dict.fromkeys(str(row[name]) for row in table)) for name in ("log", "config"))
+    numbers: dict[tuple[str, str], list[int]] = {}
+    for k, row in enumerate(table):
+        numbers.setdefault((str(row["log"]), str(row["config"])), []).append(k)
+
+    def of(log: str, config: str) -> list[Row]:
+        return [table[k] for k in numbers.get((log, config), ())]
+
+    whole = [log for log in logs if all(_known(of(log, config), "ape_m") for config in configs)]
+    return SweepMatrix(
+        logs,
+        configs,
+        tuple(
+            tuple(SweepCell(tuple(numbers.get((log, each), ())), tuple(_texts(of(log, each)))) for each in configs)
+            for log in logs
+        ),
+        tuple(tuple(_overall([row for row in table if row["config"] == each], whole)) for each in configs),
+    )
+
+
 def sweep_page(table: Sequence[Row]) -> str:
     """The page, from the rows of the sweep's table: it holds all it shows, but for the reports that it links to."""
-    logs, configs = (list(dict.fromkeys(str(row[name]) for row in table)) for name in ("log", "config"))
-    seeds = len({row["seed"] for row in table})
+    found = sweep_matrix(table)
+    logs, configs, seeds = found.logs, found.configs, len({row["seed"] for row in table})
     head = "".join(f'<th scope="col" class="words">{escape(config or "default")}</th>' for config in configs)
     lines = []
-    for log in logs:
-        cells = [_cell(_of(table, log, config)) for config in configs]
-        lines.append(f'<tr><th scope="row" class="words">{escape(log)}</th>{"".join(cells)}</tr>')
+    for log, cells in zip(logs, found.cells, strict=True):
+        shown = "".join(_cell([table[k] for k in cell.rows], cell.texts) for cell in cells)
+        lines.append(f'<tr><th scope="row" class="words">{escape(log)}</th>{shown}</tr>')
     if len(logs) > 1:
-        whole = [log for log in logs if all(_known(_of(table, log, config), "ape_m") for config in configs)]
-        cells = [_overall([row for row in table if row["config"] == config], whole) for config in configs]
-        lines.append(f'<tr class="overall"><th scope="row" class="words">all logs</th>{"".join(cells)}</tr>')
+        shown = "".join(f'<td class="words">{_lines(texts)}</td>' for texts in found.overall)
+        lines.append(f'<tr class="overall"><th scope="row" class="words">all logs</th>{shown}</tr>')
     body = (
         f"<header><h1>Sweep</h1></header><main><p>{len(table)} runs: {len(logs)} logs, {len(configs)} configurations, "
         f'{seeds} seeds.</p><p class="muted">Absolute pose error (root mean square) of each log and configuration: '
@@ -45,18 +87,17 @@ def sweep_page(table: Sequence[Row]) -> str:
     return page_text("Sweep", body)
 
 
-def _of(table: Sequence[Row], log: str, config: str) -> list[Row]:
-    return [row for row in table if (row["log"], row["config"]) == (log, config)]
+def _lines(texts: Sequence[str]) -> str:
+    return "".join(f"<div>{escape(text)}</div>" for text in texts)
 
 
-def _cell(rows: Sequence[Row]) -> str:
+def _cell(rows: Sequence[Row], texts: Sequence[str]) -> str:
     """Verdicts of the runs, with links, and their figures."""
     if not rows:
         return f"<td>{DASH}</td>"
     links = " ".join(_link(row) for row in rows)
-    figures = "".join(f"<div>{escape(text)}</div>" for text in _texts(rows))
     errors = "".join(f'<div class="muted">{escape(str(row["error"]))}</div>' for row in rows if row["error"])
-    return f'<td class="words"><div>{links}</div>{figures}{errors}</td>'
+    return f'<td class="words"><div>{links}</div>{_lines(texts)}{errors}</td>'
 
 
 def _link(row: Row) -> str:
@@ -86,13 +127,12 @@ def _known(rows: Sequence[Row], name: str) -> list[float]:
     return [float(row[name]) for row in rows if row[name] is not None and isfinite(float(row[name]))]
 
 
-def _overall(rows: Sequence[Row], logs: Sequence[str]) -> str:
+def _overall(rows: Sequence[Row], logs: Sequence[str]) -> list[str]:
     """Counts of verdicts, and the mean over `logs` of the mean over seeds."""
     words = [str(row["verdict"] or row["state"]) for row in rows]
-    counts = ", ".join(f"{words.count(word)} {word}" for word in dict.fromkeys(words))
+    found = [", ".join(f"{words.count(word)} {word}" for word in dict.fromkeys(words))]
     means = [Spread.of(_known([row for row in rows if row["log"] == log], "ape_m")).mean for log in logs]
-    text = ""
     if means:
         mean = Spread(1, sum(means) / len(means), nan, nan, nan)
-        text = f"<div>{escape(f'APE {spread_text(mean)}, over {len(means)} logs')}</div>"
-    return f'<td class="words"><div>{escape(counts)}</div>{text}</td>'
+        found.append(f"APE {spread_text(mean)}, over {len(means)} logs")
+    return found

@@ -47,6 +47,7 @@ READ = {
     ("get", "/v1/schemas"),
     ("get", "/v1/sweeps"),
     ("get", "/v1/sweeps/{sweep_id}"),
+    ("get", "/v1/sweeps/{sweep_id}/matrix"),
     ("get", "/v1/sweeps/{sweep_id}/table"),
     ("get", "/v1/sweeps/{sweep_id}/table.csv"),
     ("get", "/v1/sweeps/{sweep_id}/table.md"),

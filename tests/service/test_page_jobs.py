@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 from live_service import submit, wait
@@ -84,6 +85,23 @@ def test_several_logs_are_several_jobs_or_one_and_the_table_finds_them(
     with live.client() as client:
         assert len(client.get("/v1/jobs").json()["jobs"]) == 5
         assert len(client.get("/v1/files").json()["files"]) == 3
+    page.go_back()
+    page.wait_for_selector("#home:not([hidden])")
+    page.select_option("#stored", "")
+    page.set_input_files("#log", [str(log) for log in logs[:2]])
+    page.check("input[value=jobs]")
+    page.click("summary >> text=Sweep: every log")
+    page.fill("#sweep-seeds", "0-1, 5")
+    page.fill("#sweep-configs", '{"few": {"hide": {"budget": 100}}, "many": {"hide": {"budget": 800}}}')
+    page.click("#go")
+    page.wait_for_function("() => document.querySelectorAll('#matrix .succeeded').length === 12", timeout=60_000)
+    assert page.locator("#matrix thead th").all_text_contents() == ["few", "many"]
+    assert page.locator("#matrix tbody th").all_text_contents() == ["alpha", "beta", "all logs"]
+    if folder := os.environ.get("HSLOC_SCREENSHOTS"):
+        page.screenshot(path=f"{folder}/11-sweep.png", full_page=True)
+    need_accessible(page)
+    page.click("#matrix a >> nth=0")
+    page.wait_for_selector("#job-state .succeeded")
 
 
 def name_and_label(page: Any) -> None:

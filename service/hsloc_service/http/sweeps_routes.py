@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import AwareDatetime, BaseModel, BeforeValidator, Field
 
+from hsloc.report.sweep_page import sweep_matrix
 from hsloc.sweep.table import as_csv, as_markdown
 from hsloc_service import config_schema
 from hsloc_service.config_schema import whole
@@ -130,6 +131,39 @@ def table(ctx: Ctx, who: Reader, sweep_id: SweepId) -> SweepTable:
     """The table, also while jobs run."""
     jobs, rows = ctx.sweeps.table(who, sweep_id)
     return SweepTable(jobs=jobs, rows=rows)
+
+
+class SweepMatrixView(BaseModel):
+    """The table by logs and configurations, as `sweep.html` shows it."""
+
+    name: str
+    ended: bool
+    logs: list[str]
+    configs: list[str]
+    cells: list[list[dict[str, Any]]] = Field(
+        description="by log and configuration: `runs` with job, seed, state and verdict, and `texts`"
+    )
+    overall: list[list[str]] = Field(description="texts of each configuration over all logs")
+
+
+@router.get("/{sweep_id}/matrix", responses=problems(404))
+def matrix(ctx: Ctx, who: Reader, sweep_id: SweepId) -> SweepMatrixView:
+    """The table as a matrix, with errors over seeds: mean, standard deviation, 95 % interval of the mean."""
+    state, (jobs, rows) = ctx.sweeps.get(who, sweep_id), ctx.sweeps.table(who, sweep_id)
+    found = sweep_matrix(rows)
+    shown = ("seed", "state", "verdict")
+    runs = [{"job": job} | {name: row[name] for name in shown} for job, row in zip(jobs, rows, strict=True)]
+    cells = [
+        [{"runs": [runs[k] for k in cell.rows], "texts": list(cell.texts)} for cell in line] for line in found.cells
+    ]
+    return SweepMatrixView(
+        name=state.row.name,
+        ended=state.has_ended,
+        logs=list(found.logs),
+        configs=list(found.configs),
+        cells=cells,
+        overall=[list(texts) for texts in found.overall],
+    )
 
 
 def _text(kind: str) -> dict[int | str, dict[str, Any]]:

@@ -1,5 +1,5 @@
 // The page: which part of it is shown, by the address. #job=ID&t=SECONDS, #shared=SECRET&t=SECONDS, #compare=ID,ID,
-// #files, #label=TEXT; else the jobs.
+// #sweep=ID, #sweeps, #files, #label=TEXT; else the jobs.
 
 import { get, hasToken, onToken, post, useToken } from "./api.js";
 import { $, bytes, guarded, notice } from "./dom.js";
@@ -10,6 +10,7 @@ import * as labels from "./labels.js";
 import { build } from "./options.js";
 import * as result from "./result.js";
 import * as share from "./share.js";
+import * as sweeps from "./sweeps.js";
 
 const EVERY_MS = 3000;
 const ID = /^[0-9a-f-]{36}$/; // of a job: what is in the address becomes part of a request's path
@@ -43,19 +44,22 @@ const useAgain = async (file) => { location.hash = ""; await form.use(file); $("
 function route(event) {
   const [, name, value = ""] = /^#(\w+)=?(.*)$/.exec(location.hash) ?? [];
   const [list, time] = value.split("&t="), ids = list.split(",").filter(Boolean);
-  const ofJobs = (name === "job" && ids.length === 1) || (name === "compare" && ids.length > 0);
+  const ofJobs = (name === "job" && ids.length === 1) || (name === "sweep" && ids.length === 1) || (name === "compare" && ids.length > 0);
   const isShared = name === "shared" && SECRET.test(list);
-  const part = isShared ? "job" : name === "files" || (ofJobs && ids.every((id) => ID.test(id))) ? name : "home";
+  const part = isShared ? "job" : name === "files" || name === "sweeps" || (ofJobs && ids.every((id) => ID.test(id))) ? name : "home";
   document.body.classList.toggle("visitor", isShared);
-  for (const each of ["home", "job", "compare", "files"]) $(each).hidden = each !== part;
+  for (const each of ["home", "job", "compare", "sweep", "sweeps", "files"]) $(each).hidden = each !== part;
   document.title = "hsloc: where was the robot?";
   result.leave();
+  sweeps.leave();
   comparison?.end();
   comparison = null;
   if (event) { notice(""); scrollTo(0, 0); }
   if (isShared) result.showShared(list, Number(time) || 0);
   else if (part === "job") result.show(ids[0], Boolean(event), Number(time) || 0);
   else if (part === "compare") guarded(() => compare(ids));
+  else if (part === "sweep") sweeps.show(ids[0]);
+  else if (part === "sweeps") guarded(sweeps.list);
   else if (part === "files") guarded(() => files.show(useAgain));
   else guarded(async () => { await labels.known(); await jobs.refresh(name === "label" ? decodeURIComponent(value) : undefined); });
 }
@@ -72,7 +76,7 @@ async function compare(ids) {
   if (runs.length && location.hash === address) comparison = new globalThis.ResultComparison($("comparison"), runs, seeds?.names.length ? seeds : null);
 }
 
-form.listen((made) => { if (made.length === 1) location.hash = `job=${made[0].id}`; else guarded(jobs.refresh); });
+form.listen((made) => { if (made.sweep) location.hash = `sweep=${made.sweep}`; else if (made.length === 1) location.hash = `job=${made[0].id}`; else guarded(jobs.refresh); });
 jobs.listen();
 files.listen(useAgain);
 labels.listen(result.renamed);

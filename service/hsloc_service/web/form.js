@@ -4,6 +4,7 @@ import { get, post } from "./api.js";
 import { $, bytes, element, guarded, notice, when } from "./dom.js";
 import * as inspection from "./inspect.js";
 import { chosen as chosenOptions } from "./options.js";
+import * as sweeps from "./sweeps.js";
 import { upload } from "./upload.js";
 
 let uploading = null;
@@ -97,8 +98,17 @@ async function requests() {
 }
 
 async function submit() {
-  const jobs = [];
+  const jobs = [], wanted = $("sweep-seeds").value.trim() || $("sweep-configs").value.trim();
   try {
+    if (wanted) {
+      const seeds = sweeps.seeds($("sweep-seeds").value.trim() || "0"), configs = sweeps.configs($("sweep-configs").value);
+      const found = await requests();
+      if (found.some((request) => request.logs)) throw new SyntaxError("a sweep runs each log by itself; choose \"a job for each\"");
+      if (found[0].resume) throw new SyntaxError("a sweep does not extend maps");
+      const { log, seed, ...run } = found[0];
+      const name = [...$("log").files].map((file) => file.name).join(", ").slice(0, 200);
+      return { sweep: (await sweeps.submit({ name, logs: found.map((request) => request.log), seeds, run, ...(configs ? { configs } : {}) })).id };
+    }
     for (const request of await requests()) {
       jobs.push(await post("/v1/jobs", request, { "Idempotency-Key": crypto.randomUUID ? crypto.randomUUID() : String(Math.random()) }));
     }

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 _UNSETTLED_M = 0.01
 """Another pass is made if 1 of 100 keyscans moved farther than this [m] in the last round: a fifth of a cell."""
+_CONTRADICTED = 3.0
+"""Residual [standard deviations] in the finished map from which on a loop contradicts it."""
 _RESIDUAL_SCANS = 400
 """Scans whose residuals are measured. Internal: a sample for the metrics, no pose depends on it."""
 
@@ -143,6 +145,9 @@ def _recorded(
         accepted = verified_stretches(accepted, gathered.ties)
     ranges = gathered.scans.ranges
     measured = max(int((~np.isnan(ranges)).sum()), 1)
+    torn = [loop for loop in loops if loop.reason.startswith(TORN)]
+    # A loop may have been torn by a slip that was found later.
+    _, _, chi = edge_errors(refined.poses, loop_edges(torn, reference, np.inf))
     return Recorded(
         stamps_ns=gathered.stamps_ns,
         poses=refined.poses,
@@ -153,7 +158,7 @@ def _recorded(
         pairs=refined.pairs,
         counts=refined.counts,
         loops=accepted,
-        torn=ends[[loop.reason.startswith(TORN) for loop in loops]],
+        torn=ends[[loop.reason.startswith(TORN) for loop in loops]][chi > _CONTRADICTED],
         no_return_share=float(np.isposinf(ranges).sum()) / measured,
         stretches=stretches,
     )

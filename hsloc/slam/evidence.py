@@ -77,9 +77,9 @@ class Recorded:
     `poses` (n, 3) are final. `motions` and `covariances` lead to each keyscan from the one before, as the front end
     had them; `refused` (n,) where it had not the scans' word. `odometry` (n, 3) is as recorded, None without any.
     `pairs` (m, 2) of keyscans that see the same walls, with `counts` (m, 5) as in `kernels.point_to_line.pair_terms`.
-    `loops` (k, 2) are pairs of keyscans that accepted loops join, `torn` (j, 2) those of loops that the solved graph
-    contradicted. `no_return_share` is the part of the beams that met nothing. `stretches` are what the scans alone
-    say of the motion along short parts of the path.
+    `loops` (k, 2) are pairs of keyscans that accepted loops join, `torn` (j, 2) those of loops that were contradicted
+    by the others, and are by the finished map. `no_return_share` is the part of the beams that met nothing. `stretches`
+    are what the scans alone say of the motion along short parts of the path.
     """
 
     stamps_ns: I64
@@ -170,9 +170,11 @@ def nothing_seen() -> Evidence:
 def _open_joints(r: Recorded) -> Reason | None:
     """Runs of steps that only odometry holds: one loop over several of them shares out their errors as it likes."""
     wrong = []
+    bridged = _bridged(r)
     for first, last in _runs(r.refused & ~r.spanned(_OPEN_LOOPS)):
         sigma = float(np.sqrt(np.trace(r.covariances[first : last + 1, :2, :2].sum(axis=0))))
-        if (last - first + 1 >= _OPEN_STEPS or sigma > _OPEN_SIGMA_M) and not _healed(r, first, last):
+        is_long = last - first + 1 >= _OPEN_STEPS or sigma > _OPEN_SIGMA_M
+        if is_long and not bridged[first : last + 1].all() and not _healed(r, first, last):
             wrong.append((first, last))
     if not wrong:
         return None
@@ -186,6 +188,31 @@ def _healed(r: Recorded, first: int, last: int) -> bool:
     across = (i < first) & (j >= last) & (j - i <= last - first + _HEALED_WITHIN)
     paired, conflict = r.counts[across, :2].sum(axis=0)
     return bool(paired >= _VISIT_SEEN and paired >= _HEALED * (paired + conflict))
+
+
+def _bridged(r: Recorded) -> Bools:
+    """Steps (n,) over which the scans agree in the finished map, and fix the motion: a slip there was measured.
+
+    Across each step keyscans near each other are paired and hardly look through walls of each other; and every stretch
+    that holds the step has its motion by the scans alone, to a half of what a slip would need to hide in.
+    """
+    n = len(r.poses)
+    i, j = r.pairs.min(axis=1), r.pairs.max(axis=1)
+    near = j - i <= _HEALED_WITHIN
+    across = np.zeros((n + 1, 2))
+    np.add.at(across, i[near] + 1, r.counts[near, :2])
+    np.add.at(across, j[near] + 1, -r.counts[near, :2])
+    paired, conflict = np.cumsum(across, axis=0)[:n].T
+    known = np.zeros(n + 1, dtype=np.int64)
+    weak = np.zeros(n + 1, dtype=np.int64)
+    first, last = r.stretches.ends.T
+    uncertain = r.stretches.sigma > 0.5 * _WEAK_M
+    for counted, chosen in ((known, np.ones(len(first), dtype=bool)), (weak, uncertain)):
+        np.add.at(counted, first[chosen] + 1, 1)
+        np.add.at(counted, last[chosen] + 1, -1)
+    observed = (np.cumsum(known) > 0) & (np.cumsum(weak) == 0)
+    agrees = (paired >= _VISIT_SEEN) & (paired >= _HEALED * (paired + conflict))
+    return np.asarray(agrees & observed[:n], dtype=np.bool_)
 
 
 def _second_visits(r: Recorded) -> Reason | None:
@@ -222,7 +249,9 @@ def _against_odometry(r: Recorded) -> Reason | None:
     off = (apart > _ODOMETRY_SHARE * length + 0.3) | (angle > _ODOMETRY_TURN + 0.2 * turn)
     open_steps = np.cumsum(~r.spanned())
     off &= open_steps[_WINDOW:] - open_steps[:-_WINDOW] == _WINDOW
-    wrong = [(first, min(last + _WINDOW, len(r.poses) - 1)) for first, last in _runs(off)]
+    ends = [(first, min(last + _WINDOW, len(r.poses) - 1)) for first, last in _runs(off)]
+    bridged = _bridged(r)
+    wrong = [(first, last) for first, last in ends if not bridged[first + 1 : last + 1].all()]
     if not wrong:
         return None
     text = f"map and odometry contradict each other over {len(wrong)} stretch(es) that no loop spans"

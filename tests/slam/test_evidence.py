@@ -93,6 +93,31 @@ def test_scans_around_refused_steps_may_agree_after_all(
     assert codes(around)[1] == codes_wanted
 
 
+@pytest.mark.parametrize(
+    ("sigma", "conflict", "wanted"),
+    [(0.01, 1.0, []), (0.1, 1.0, ["open-joint", "odometry"]), (0.01, 60.0, ["open-joint", "odometry"])],
+)
+def test_a_slip_that_the_scans_measured_step_by_step_is_no_doubt(
+    lap: Recorded, sigma: float, conflict: float, wanted: list[str]
+) -> None:
+    """The scans contradict the odometry over 20 steps, longer than any pair of keyscans, and agree with each other."""
+    refused, odometry = lap.refused.copy(), lap.poses.copy()
+    refused[140:160] = True
+    odometry[150:, 0] += 8.0
+    steps = np.arange(115, 185)
+    counts = np.tile((100.0, 1.0, 120.0, 0.0, 100.0), (len(steps), 1))
+    counts[steps == 149, 1] = conflict
+    slipped = replace(
+        lap,
+        refused=refused,
+        odometry=odometry,
+        pairs=np.vstack((lap.pairs, np.column_stack((steps, steps + 1)))),
+        counts=np.vstack((lap.counts, counts)),
+        stretches=Stretches(np.array([(110, 190)]), np.zeros((1, 3)), np.array((9.0,)), np.array((sigma,))),
+    )
+    assert codes(slipped)[1] == wanted
+
+
 def test_one_refused_step_matters_if_it_may_hide_much(lap: Recorded) -> None:
     refused = lap.refused.copy()
     refused[150] = True

@@ -95,6 +95,18 @@ OPTIONS: tuple[Option, ...] = (
         http="Id of a job of yours that built a map, which is extended: the new one is in its frame.",
     ),
     Option(
+        name="assert_loop", flag="--assert-loop", kind="topics", metavar="T1,T2", doors=ONE_RUN,
+        help="When mapping: the robot was at one place at these two times [s after the beginning of the log] "
+        "(repeatable).",
+        http="Times of one place when mapping, `t1,t2` in seconds after the beginning of the log; several with commas.",
+    ),
+    Option(
+        name="forbid_loop", flag="--forbid-loop", kind="topics", metavar="T1,T2", doors=ONE_RUN,
+        help="When mapping: the robot was at two places at these two times, however alike they look (repeatable).",
+        http="Times of two places that look alike, `t1,t2` in seconds after the beginning of the log; several with "
+        "commas.",
+    ),
+    Option(
         name="no_odometry", flag="--no-odom", kind="switch", default=False,
         help="Estimate motion from the scans alone, without reading the log's odometry; localise with --map or "
         "--mode localise, else build a map.",

@@ -12,6 +12,7 @@ from hsloc.errors import ConfigError
 from hsloc.log import ReadOptions, read_calibration
 from hsloc.model.pose2 import Pose2, wrap_angle
 from hsloc.options import ALIGNMENTS, BY_NAME, MATCHERS, MODES, OPTIONS, PRESETS, VERDICTS, merged
+from hsloc.slam.stated_loops import StatedLoops
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -34,10 +35,10 @@ class RunRequest:
     `initial_pose`, else the one that the log states for the time of the first event, else unknown; with `unknown_start`
     it is unknown whatever the log states. `reference` names poses to compare with, see `hsloc.replay.references`;
     otherwise they are those in the log. `alignment` and `relations` are for the evaluation. `own_matcher` is used
-    instead of the one that `config` names. `calibration` is a file of `hsloc calibrate`. `min_localised`, `max_ape`,
-    `max_warnings` and `fail_if` are limits that the result must keep, see `hsloc.analysis.quality`. `labels` are the
-    names of the logs in reports; with `bare_names` no folder is written into the results, so that they are the same
-    wherever the files are.
+    instead of the one that `config` names. `calibration` is a file of `hsloc calibrate`. `assert_loop` and
+    `forbid_loop` are pairs of times, see `hsloc.slam.stated_loops`. `min_localised`, `max_ape`, `max_warnings` and
+    `fail_if` are limits that the result must keep, see `hsloc.analysis.quality`. `labels` are the names of the logs in
+    reports; with `bare_names` no folder is written into the results, so that they are the same wherever the files are.
     """
 
     logs: tuple[Path, ...]
@@ -51,6 +52,8 @@ class RunRequest:
     preset: str = "default"
     labels: tuple[str, ...] = ()
     mode: str = "auto"
+    assert_loop: str | None = None
+    forbid_loop: str | None = None
     no_odometry: bool = False
     reference: str | None = None
     alignment: str | None = None
@@ -87,6 +90,12 @@ class RunRequest:
         if self.resume is not None and self.config.mapper != "graph":
             raise ConfigError(
                 f"a map is extended by the graph mapper; leave out --resume or --mapper {self.config.mapper}"
+            )
+        is_stated = StatedLoops.parsed(self.assert_loop, self.forbid_loop) != StatedLoops()
+        if is_stated and (self.resume is not None or self.mode == "localise" or self.config.mapper != "graph"):
+            raise ConfigError(
+                "loops are stated for the graph mapper and one log; leave out --assert-loop and --forbid-loop, or "
+                "--resume, --mode localise and --mapper"
             )
         if self.no_odometry and self.read.deskew:
             raise ConfigError("scans are deskewed with odometry; leave out --no-odom or --deskew")

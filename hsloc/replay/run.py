@@ -29,6 +29,7 @@ from hsloc.request import RunRequest
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.point_mapper import PointMapper
+from hsloc.slam.stated_loops import StatedLoops
 from hsloc.slam.time_offset import HINT_S, as_option, in_words, offset_warning, offsets_of_log
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -196,6 +197,8 @@ def _run_with(
     if progress is not None:
         progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
     if localise:
+        if request.assert_loop or request.forbid_loop:
+            raise ConfigError("loops are stated for a map that is built; add --mode slam, or leave them out")
         start, of_start = find_start(request, log, require_map(grid))
         warnings = (*warnings, *of_start)
         likelihood = LikelihoodField.from_grid(
@@ -349,7 +352,10 @@ def _mapper(request: RunRequest, state: MapState | None, lidar_only: bool) -> Ma
         begin = None if request.unknown_start else request.initial_pose
         resume = resumed(state, request.config, request.matcher, begin)
     return Mapper(
-        replace(request.config.graph_mapper, use_odometry=not lidar_only), np.random.default_rng(request.seed), resume
+        replace(request.config.graph_mapper, use_odometry=not lidar_only),
+        np.random.default_rng(request.seed),
+        resume,
+        StatedLoops.parsed(request.assert_loop, request.forbid_loop),
     )
 
 

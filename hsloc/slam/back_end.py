@@ -214,7 +214,9 @@ def _close_loops(
 ) -> tuple[F64, list[Loop], Edges]:
     """Poses of the keyscans with all loops closed, the loops, and those accepted as edges between keyscans."""
     p, places = parameters.loops, gathered.places
-    closer = LoopCloser(places, gathered.scans, p, rng, gathered.known, gathered.first_place)
+    closer = LoopCloser(
+        places, gathered.scans, p, rng, gathered.known, gathered.first_place, gathered.asserted, gathered.forbidden
+    )
     closer.close(progress)
     edges = loop_edges(closer.accepted, places.reference, p.robust)
     return solve_edges(places.expand(closer.poses), Edges.concatenate([gathered.chain, edges])), closer.loops, edges

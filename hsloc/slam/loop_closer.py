@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.errors import MapError
 from hsloc.model.pose2 import Pose2, relative_poses
 from hsloc.slam.loop_matcher import Loop, LoopMatcher
 from hsloc.slam.pose_graph import Edges, edge_errors, solve_edges
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 TORN = "torn"
 """How the reason begins for which such a loop is refused."""
+ASSERTED = "asserted"
+"""The reason of a loop that the user states."""
 _SWEEPS = 3
 """Times that all places are visited at most."""
 _WIDENED = (16.0, 8.0, 4.0, 2.0)
@@ -61,8 +64,13 @@ class LoopCloser:
         rng: Generator,
         known: tuple[Loop, ...] = (),
         first: int = 0,
+        asserted: tuple[tuple[int, int], ...] = (),
+        forbidden: tuple[tuple[int, int], ...] = (),
     ) -> None:
-        """`known` loops are believed, and places before `first` visited already."""
+        """`known` loops are believed, and places before `first` visited already.
+
+        Of `asserted` pairs of places the user knows that they are one place, of `forbidden` ones that they are not.
+        """
         self._places = places
         self._parameters = parameters
         self._matcher = LoopMatcher(places, scans, parameters, rng)
@@ -70,6 +78,8 @@ class LoopCloser:
         self._found = {(loop.first, loop.second): loop for loop in known}
         self._first = first
         self._unsolved = False
+        self._asserted = set(asserted)
+        self._forbidden = forbidden
 
     @property
     def loops(self) -> list[Loop]:
@@ -82,7 +92,12 @@ class LoopCloser:
         return [loop for loop in self.loops if loop.accepted]
 
     def close(self, progress: Callable[[float], None] | None = None) -> None:
-        """Visit all places in their order, and again as long as loops are found or refused."""
+        """Visit all places in their order, and again as long as loops are found or refused.
+
+        Raises MapError if the scans of two places disagree that are asserted to be one.
+        """
+        for old, place in sorted(self._asserted):
+            self._assert(old, place)
         if self._found:
             self.solve()
         for sweep in range(_SWEEPS):
@@ -135,6 +150,21 @@ class LoopCloser:
                 self.solve()
         return len(new)
 
+    def _assert(self, old: int, place: int) -> None:
+        """Measure a loop that the user asserts: that another pose would fit as well is decided by that."""
+        path_length = float(self._places.path_length[place] - self._places.path_length[old])
+        loop = self._search(old, place, path_length)
+        if not loop.accepted and not loop.is_ambiguous:
+            raise MapError(
+                f"--assert-loop: the scans of the two places disagree: {loop.reason}; give times at which the robot "
+                "was at one place, looking the same way"
+            )
+        self._found[old, place] = replace(loop, accepted=True, reason=ASSERTED)
+
+    def _is_forbidden(self, old: int, place: int) -> bool:
+        """Whether the user forbids a loop; a place is compared together with its neighbours."""
+        return any(abs(old - first) <= 1 and abs(place - second) <= 1 for first, second in self._forbidden)
+
     def _contradict(self, loops: list[Loop]) -> bool:
         """Whether one of these is off by more than noise in the graph as it is solved; if none is, solving can wait."""
         edges = loop_edges(loops, np.arange(len(self._places)), self._parameters.robust)
@@ -145,6 +175,8 @@ class LoopCloser:
         """Candidates that were not searched, or in a much wider window, and the path length to each."""
         unknown = []
         for old, path_length in self._candidates(place):
+            if self._is_forbidden(old, place):
+                continue
             before = self._found.get((old, place))
             if before is None or self._window(path_length)[0] < _NARROWER * before.window[0]:
                 unknown.append((old, path_length))
@@ -155,6 +187,7 @@ class LoopCloser:
         torn = 0
         while accepted := self.accepted:
             _, _, chi = edge_errors(self.poses, self.edges())
+            chi[[(loop.first, loop.second) in self._asserted for loop in accepted]] = 0.0
             worst = int(np.argmax(chi))
             if not chi[worst] > self._parameters.max_edge_chi:
                 break

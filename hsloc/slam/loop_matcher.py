@@ -112,6 +112,8 @@ class Loop:
     window: tuple[float, float]
     accepted: bool
     reason: str = ""
+    is_ambiguous: bool = False
+    """Whether it was refused for another pose that fits about as well, and for nothing else."""
 
 
 _CACHED = 48
@@ -167,7 +169,11 @@ class LoopMatcher:
                 reason = f"ambiguous in a wide window: fitness {fitness:.2f}, another pose {100.0 * rival:.0f} % of it"
         edge = np.diag((p.sigma_edge**2, p.sigma_edge**2, p.sigma_edge_angle**2))
         covariance: F64 = np.asarray(np.linalg.inv(information + prior), dtype=np.float64) + edge
-        return Loop(first, second, pose, covariance, fitness, rival, conflict, paired, window, not reason, reason)
+        # Another pose is looked for only where nothing else speaks against the loop.
+        is_ambiguous = bool(reason) and rival == rival
+        return Loop(
+            first, second, pose, covariance, fitness, rival, conflict, paired, window, not reason, reason, is_ambiguous
+        )
 
     def _registered(
         self, first: int, second: int, start: Pose2, centre: Pose2, prior: F64

@@ -13,6 +13,7 @@ from hsloc.slam.calibration import odometry_chi, odometry_scale
 from hsloc.slam.keyscans import KeyScans
 from hsloc.slam.loop_matcher import Loop
 from hsloc.slam.pose_graph import Edges
+from hsloc.slam.stated_loops import StatedLoops, stated_places
 from hsloc.slam.submaps import UNKNOWN_STEP, Submaps
 
 if TYPE_CHECKING:
@@ -69,6 +70,10 @@ class MapSession:
     known: tuple[Loop, ...] = ()
     first: int = 0
     first_place: int = 0
+    asserted: tuple[tuple[int, int], ...] = ()
+    """Pairs of places that are one, as the user states."""
+    forbidden: tuple[tuple[int, int], ...] = ()
+    """Pairs of places that are not."""
     ties: tuple[Tie, ...] = ()
     """Where the path has gaps, in the order of the keyscans after them: there the robot was followed on the map."""
 
@@ -76,6 +81,15 @@ class MapSession:
     def chain(self) -> Edges:
         """The front end's steps as edges."""
         return Edges.chain(self.motions[1:], self.covariances[1:], self.refused[1:])
+
+    def stated(self, loops: StatedLoops, first_ns: int) -> MapSession:
+        """The same with the loops that the user states, in seconds after `first_ns`. Raises ConfigError."""
+        if not loops.asserted and not loops.forbidden:
+            return self
+        seconds: F64 = np.asarray((self.stamps_ns - first_ns) * 1e-9, dtype=np.float64)
+        asserted = stated_places(loops.asserted, seconds, self.places, "--assert-loop")
+        forbidden = stated_places(loops.forbidden, seconds, self.places, "--forbid-loop")
+        return replace(self, asserted=tuple(asserted), forbidden=tuple(forbidden))
 
     def moved(self, T_map_front: Pose2) -> MapSession:
         """The same in the map's frame."""

@@ -22,6 +22,7 @@ from hsloc.slam.calibration import FLOOR
 from hsloc.slam.front_end import FrontEnd
 from hsloc.slam.known_map import KnownMap
 from hsloc.slam.map_session import MapSession, Tie, from_front_end
+from hsloc.slam.stated_loops import StatedLoops
 from hsloc.slam.trajectory_correction import EventLog
 
 if TYPE_CHECKING:
@@ -43,10 +44,18 @@ if TYPE_CHECKING:
 class Mapper:
     """An `Estimator` that builds its own map; `finish` gives the result of the whole log."""
 
-    def __init__(self, parameters: GraphMapperParameters, rng: Generator, resume: Resume | None = None) -> None:
+    def __init__(
+        self,
+        parameters: GraphMapperParameters,
+        rng: Generator,
+        resume: Resume | None = None,
+        stated_loops: StatedLoops | None = None,
+    ) -> None:
         self._parameters = parameters
         self._rng = rng
         self._resume = resume
+        self._stated_loops = StatedLoops() if stated_loops is None else stated_loops
+        self._first_ns: int | None = None
         self._matcher = FrontEnd(parameters.front_end, rng, parameters.use_odometry)
         self._track = EventLog(parameters.front_end.turn_length)
         self._scans: list[KeyScan] = []
@@ -63,6 +72,8 @@ class Mapper:
 
     def update(self, event: Odometry | PairedScan) -> Estimate:
         """Take an event; the estimate at its stamp, in the map as it is known so far (it drifts)."""
+        if self._first_ns is None:
+            self._first_ns = event.stamp_ns if isinstance(event, Odometry) else event.scan.stamp_ns
         if isinstance(event, Odometry):
             # Without odometry the message gives no motion: the pose is that of the last scan.
             T_odom_base = event.T_odom_base if self._parameters.use_odometry else self._T_last_scan
@@ -112,7 +123,8 @@ class Mapper:
 
     def _is_to_be_solved(self) -> bool:
         """Whether the map is to be solved now, so that the time for it grows with the log, not with its square."""
-        if self._resume is not None or not self._parameters.use_odometry:
+        stated = bool(self._stated_loops.asserted or self._stated_loops.forbidden)
+        if self._resume is not None or not self._parameters.use_odometry or stated:
             return False
         if self._solved is None:
             return len(self._scans) >= self._parameters.solve_after
@@ -136,10 +148,11 @@ class Mapper:
         """All keyscans so far, None without one."""
         if not self._scans and self._solved is None:
             return None
-        return from_front_end(
+        session = from_front_end(
             self._scans, np.array(self._stamps, dtype=np.int64), self._local, self._track, self._parameters,
             self._solved, tuple(self._ties),
         )  # fmt: skip
+        return session.stated(self._stated_loops, self._first_ns or 0)
 
     def _keep(self, scan: Scan, prepared: KeyScan, local: LocalMatch) -> None:
         self._scans.append(prepared)

@@ -119,6 +119,7 @@ EXAMPLES: dict[str, Any] = {
     "start_s": -2.5, "end_s": 60.125, "preset": "paper", "matcher": "icp", "mapper": "point", "seed": 77,
     "set": ["hide.budget=400", "localiser.fuse=true"], "stamps": "log", "slice": "-0.2,0.5",
     "scan_fix": "range_max=12", "time_offset": "/odom=-0.25", "wheels": "0.033,0.16",
+    "assert_loop": "12.5,140,3,9", "forbid_loop": "30,81",
 }  # fmt: skip
 
 

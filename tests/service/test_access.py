@@ -66,7 +66,6 @@ WRITE = {
     ("patch", "/v1/tus/{file_id}"),
     ("post", "/v1/files"),
     ("post", "/v1/sample-log"),
-    ("post", "/v1/inspect"),
     ("post", "/v1/jobs"),
     ("post", "/v1/jobs/{job_id}/cancel"),
     ("post", "/v1/jobs/{job_id}/rerun"),
@@ -118,7 +117,7 @@ class World:
             if method == "patch":
                 headers |= {"Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}
                 options["content"] = b"123"
-        elif path in ("/v1/jobs", "/v1/inspect") and method == "post":
+        elif path == "/v1/jobs" and method == "post":
             options["json"] = {"log": self.file}
         elif method == "patch":
             options["json"] = {"title": "another"}
@@ -168,7 +167,7 @@ def test_a_reader_may_read(world: World, method: str, path: str) -> None:
 
 @pytest.mark.parametrize(
     ("method", "path"),
-    sorted(r for r in READ | WRITE if "_id}" in r[1] or r in (("post", "/v1/jobs"), ("post", "/v1/inspect"))),
+    sorted(r for r in READ | WRITE if "_id}" in r[1] or r == ("post", "/v1/jobs")),
 )
 def test_another_tenant_finds_nothing(world: World, method: str, path: str) -> None:
     assert world.send(method, path, "other").status_code == 404

@@ -48,6 +48,12 @@ def test_jobs_are_found_by_title_labels_and_notes(make_client: Callable[..., Tes
 def test_a_log_is_read_before_it_is_run(make_client: Callable[..., TestClient], tmp_path: Path) -> None:
     client = make_client(worker_command=Settings().worker_command, sandbox="none", job_memory_bytes=4 << 30)
     log = upload(client, (RECORDINGS / "hall.mcap").read_bytes(), "hall.mcap")
+    reader = Tokens(client.app.state.context.database).issue("local", ("read",))  # type: ignore[attr-defined]
+    for path in ("/v1/inspect", "/v1/sample-log"):
+        for key, status in ((reader, 403), ("wrong", 401)):
+            headers = {"Authorization": f"Bearer {key}"}
+            assert client.post(path, json={"log": log}, headers=headers).status_code == status
+    client.headers["Authorization"] = f"Bearer {Tokens(client.app.state.context.database).issue('local')}"  # type: ignore[attr-defined]
     found = client.post("/v1/inspect", json={"log": log}).json()
     assert (found["format"], found["scan_topic"], found["odom_topic"]) == ("mcap", "/scan", "/odom")
     assert found["map_image"].startswith("data:image/png;base64,")

@@ -1,4 +1,4 @@
-"""What is in a log, and what is wrong with it, before it is run."""
+"""What is in a log, and what is wrong with it, before it is run; for the page."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from hsloc_service import config_schema as options
 from hsloc_service.errors import ServiceError, conflict
-from hsloc_service.http.context import Ctx, Writer, problems
+from hsloc_service.http.context import Ctx, Writer
 from hsloc_service.http.schemas import JobRequest
 from hsloc_service.stored_request import files_of, plain
 
@@ -34,7 +34,7 @@ class Inspection(BaseModel):
     map_image: str | None = Field(default=None, description="its picture, as a `data:` address")
 
 
-@router.post("/inspect", responses=problems(404, 409))
+@router.post("/inspect", include_in_schema=False)
 def inspect(ctx: Ctx, who: Writer, request: JobRequest) -> Inspection:
     """Read the log of a request without running it: topics, findings, the map. Nothing is kept."""
     if request.config is not None:

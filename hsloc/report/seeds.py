@@ -107,15 +107,28 @@ _SEED = re.compile(r"[-_, ]*seed[ =]?\d+$")
 
 
 def seed_groups(runs: Sequence[tuple[str, dict[str, Any]]]) -> list[SeedGroup]:
-    """From (name, view) of each run, in the order of their first runs; named by them and by the number of seeds."""
-    found: dict[Any, tuple[str, dict[Any, dict[str, Any]]]] = {}
+    """From (name, view) of each run, in the order of their first runs.
+
+    A group is called as its first run, with the number of seeds; where two would be called the same, also by the
+    numbers of their runs.
+    """
+    found: dict[Any, tuple[str, dict[Any, dict[str, Any]], list[int]]] = {}
     for k, (name, view) in enumerate(runs):
         of_run = view.get("run") or {"group": k, "seed": 0}
-        found.setdefault(of_run["group"], (name, {}))[1].setdefault(of_run["seed"], view)
-    return [
-        SeedGroup(name if len(views) < 2 else f"{_SEED.sub('', name)}: {len(views)} seeds", tuple(views.values()))
-        for name, views in found.values()
+        _, views, numbers = found.setdefault(of_run["group"], (name, {}, []))
+        views.setdefault(of_run["seed"], view)
+        numbers.append(k + 1)
+    names = [
+        name if len(views) < 2 else f"{_SEED.sub('', name)}: {len(views)} seeds" for name, views, _ in found.values()
     ]
+    return [
+        SeedGroup(name if names.count(name) < 2 else f"{name} ({_spans(numbers)})", tuple(views.values()))
+        for name, (_, views, numbers) in zip(names, found.values(), strict=True)
+    ]
+
+
+def _spans(numbers: Sequence[int]) -> str:
+    return f"{'run' if len(numbers) == 1 else 'runs'} {', '.join(map(str, numbers))}"
 
 
 def seed_rows(groups: Sequence[SeedGroup]) -> list[tuple[str, ...]]:

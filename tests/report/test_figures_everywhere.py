@@ -18,7 +18,7 @@ from hsloc.evaluation.metrics import format_json
 from hsloc.model.verdict import Verdict
 from hsloc.report.data import ReportParts
 from hsloc.report.html import comparison_rows, read_runs, write_report_html
-from hsloc.report.seeds import Spread, spread_text
+from hsloc.report.seeds import Spread, seed_groups, spread_text
 from hsloc.report.summary import ResultSummary
 from hsloc.run_metrics import RunTimings
 from hsloc_service.execution.worker import summarise
@@ -118,3 +118,5 @@ def test_the_interval_of_a_mean_holds_it_as_often_as_it_says() -> None:
     assert 0.88 <= held / runs <= 0.99  # 0.95 within three standard deviations of 120 draws
     assert spread_text(Spread(3, 0.0123, 0.002, 0.0104, 0.0141), "9.9 mm") == "1.23 ± 0.20 cm [1.04, 1.41]"
     assert spread_text(Spread.of([0.5]), "50.0 %") == "50.0 %"
+    views = [(f"a, seed {k % 2}", {"run": {"seed": k % 2, "group": k // 2}, "summary": None}) for k in range(4)]
+    assert [group.name for group in seed_groups(views)] == ["a: 2 seeds (runs 1, 2)", "a: 2 seeds (runs 3, 4)"]

@@ -10,7 +10,7 @@ fit are weighed down.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import atan2, radians
+from math import atan2, pi, radians
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -159,6 +159,11 @@ def estimate(laser: Track, odometry: Track, nominal_mounting: Pose2) -> Estimate
         values[3:5] = nominal[3:5]
     while True:
         found, certain = problem.solve(values, free)
+        if found.values[0] < 0.0 and free[0] and free[3:6].all():
+            # The same motion, seen from a base that drives backwards: mounted the other way round.
+            values = found.values * (-1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0)
+            values[5] = wrap_angle(float(found.values[5]) + pi)
+            found, certain = problem.solve(values, free)
         reasons = {
             name: ONE_SIDED if one_sided and name in ("x", "y") else NEEDS[k]
             for k, name in enumerate(NAMES)

@@ -74,6 +74,16 @@ def test_what_the_motion_does_not_determine_is_named_and_kept(rates: NDArray[np.
     assert np.isnan(found.sigmas[[NAMES.index(name) for name in missing]]).all()
 
 
+def test_a_laser_that_is_mounted_backwards_and_is_lost_at_first() -> None:
+    """A start that is off by half a turn is found, however the equations come to it: scales are positive."""
+    t = np.arange(3000) * 0.02
+    laser, odometry = tracks(0.9 * np.sin(t) + 0.3 * np.sin(2.7 * t))
+    laser.poses[:40, :2] += np.random.default_rng(1).normal(0.0, 3.0, (40, 2))
+    found = estimate(laser, odometry, Pose2(0.0, 0.0, 0.0))
+    assert abs(found.values[0] - 1.02) < 0.005
+    assert np.abs(found.values[3:6] - (0.21, -0.06, 3.0)).max() < 0.01
+
+
 def test_outliers_are_weighed_down() -> None:
     t = np.arange(3000) * 0.02
     laser, odometry = tracks(0.9 * np.sin(t))

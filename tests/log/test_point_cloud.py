@@ -11,6 +11,7 @@ from log_builders import SECOND, START, write_raw
 from rosbags.typesys import Stores, get_typestore
 
 from hsloc.errors import ConfigError, TopicError
+from hsloc.log import check_log
 from hsloc.log.messages.point_cloud import BEAMS, CloudMessage, object_point_cloud, point_cloud, slice_of
 from hsloc.log.reader import open_log
 from hsloc.log.summary import ReadOptions
@@ -123,3 +124,7 @@ def test_a_log_of_clouds_is_read_as_scans(tmp_path: Path) -> None:
         hits = scan.ranges[np.isfinite(scan.ranges)]
         assert len(hits) == 400
         np.testing.assert_allclose(hits, 2.0, atol=1e-5)
+    assert not [finding for finding in check_log(log).findings if finding.code == "no_scan"]
+    unread = open_log(path, ReadOptions(require_odometry=False, require_scan=False))
+    (finding,) = [finding for finding in check_log(unread).findings if finding.code == "no_scan"]
+    assert "--slice" in finding.remedy

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from hsloc.log.checks.findings import NANOSECONDS, Finding, Findings, Intervals, Place, Severity
 from hsloc.log.checks.topics import OdometryCheck, ScanCheck, TopicCheck
 from hsloc.log.messages.decode import OdometryMessage, ScanMessage
+from hsloc.log.messages.definitions import POINT_CLOUD2
 from hsloc.log.session.transform_topics import MAP_FRAME
 from hsloc.warnings import WarningCode
 
@@ -124,10 +125,13 @@ _CHECKED_HERE = (WarningCode.TOPIC_MISSING, WarningCode.TOPIC_AMBIGUOUS, Warning
 
 def _check_summary(summary: LogSummary, has_scans: bool, findings: Findings) -> None:
     """What was missing or had to be assumed when the log was opened."""
-    if not has_scans:
+    clouds = [topic.topic for topic in summary.topics if topic.typename == POINT_CLOUD2 and topic.count]
+    if not has_scans and not (clouds and summary.scan_topic):
         findings.add(
             Severity.ERROR, "no_scan", "", "no scans (sensor_msgs/msg/LaserScan)",
-            "record the laser's topic; `hsloc info` lists what there is",
+            f"read the point clouds on {clouds[0]} with --slice LOW,HIGH, the heights of walls above the base [m]"
+            if clouds
+            else "record the laser's topic; `hsloc info` lists what there is",
         )  # fmt: skip
     elif summary.scan_topic is None:
         findings.add(

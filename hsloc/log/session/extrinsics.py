@@ -162,7 +162,7 @@ class Extrinsics:
                 WarningCode.EXTRINSICS_ASSUMED,
                 f"no transform from {base or 'the base'} to {laser or 'the laser'} in {self._topics.names}: the laser "
                 "is assumed to be at the origin of the base",
-                "give --laser-pose x,y,yaw",
+                "give --laser-pose x,y,yaw, which hsloc calibrate finds",
             )
         )
         return Mounting(IDENTITY), "identity"

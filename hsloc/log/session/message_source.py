@@ -78,7 +78,8 @@ class RosSource:
 
     def observations(self, losses: Losses) -> Iterator[Observation]:
         """As `Source.observations`."""
-        kinds = (definitions.LASER_SCAN, definitions.ODOMETRY, definitions.TF_MESSAGE)
+        scans = (definitions.LASER_SCAN, definitions.MULTI_ECHO_LASER_SCAN)
+        kinds = (*scans, definitions.ODOMETRY, definitions.TF_MESSAGE)
         for number, container in enumerate(self._containers):
             chosen = {
                 channel.id: (channel.topic, self._survey.decoder(number, channel))

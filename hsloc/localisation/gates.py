@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from hsloc.model.pose2 import Pose2
 
+_LEAST_TRUST = 0.05
+"""Part of the information of the worst match that is accepted."""
 _WEIGHT_OF_NEW = 0.05
 """Weight of a new match in the usual fitness: its memory is about 20 matches."""
 
@@ -76,6 +78,16 @@ class MatchGate:
         limits = self._limits
         usual = limits.min_fitness if self.usual is None else self.usual
         return wide >= max(refused + limits.recovery_gain, limits.recovery_fitness_ratio * usual)
+
+    def trust(self, fitness: float) -> float:
+        """Part of the information of an accepted match that counts: all at the usual fitness, little at the least.
+
+        A match that fits worse than usual is often a local optimum beside the right one, where wheels slip.
+        """
+        if self.usual is None:
+            return 1.0
+        least = self._limits.min_fitness_ratio * self.usual
+        return min(max((fitness - least) / max(self.usual - least, 1e-9), _LEAST_TRUST), 1.0)
 
     def accept(self, fitness: float) -> None:
         """Count an accepted match."""

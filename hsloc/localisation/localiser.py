@@ -243,6 +243,7 @@ class Localiser:
         information = match_information(points, self._field, match.pose, self._wall_variance())
         if p.fuse:
             if information is not None:
+                information = self._match_gate.trust(match.fitness) * information
                 self._innovations.add(difference(match.pose, predicted), information, propagated, noise)
             pose, covariance = fuse_match(predicted, covariance, match, information)
         else:

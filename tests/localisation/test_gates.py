@@ -63,3 +63,13 @@ def test_a_restart_takes_the_fitness_of_the_place_that_was_found() -> None:
     gate.restart(0.8)
     assert gate.refusals == 0
     assert gate.usual == 0.8
+
+
+def test_a_match_that_fits_worse_than_usual_counts_less() -> None:
+    gate = MatchGate(LIMITS)
+    assert gate.trust(0.5) == 1.0
+    gate.accept(0.9)
+    least = LIMITS.min_fitness_ratio * 0.9
+    assert gate.trust(0.95) == gate.trust(0.9) == 1.0
+    assert gate.trust((0.9 + least) / 2.0) == pytest.approx(0.5)
+    assert 0.0 < gate.trust(least) < 0.1

@@ -41,7 +41,7 @@ def sweep_in_processes(
     """As `sweep`, in `jobs` processes.
 
     If one dies, the executor loses all that were under way: these are run again, each in a process of its own, so
-    that only the guilty one fails. On KeyboardInterrupt the processes are told, and end without leaving halves.
+    that only the guilty one fails. On KeyboardInterrupt the processes are interrupted, and leave no incomplete folder.
     """
 
     def tell(outcome: Outcome) -> None:

@@ -38,7 +38,7 @@ class BackupReport(NamedTuple):
     """Jobs whose results were copied; those in an object store stay there."""
     bytes: int
     deleted: int
-    """Uploads and jobs that somebody deleted while the backup was made, and that are not in it."""
+    """Uploads and jobs that were deleted while the backup was made, and that are not in it."""
 
 
 def back_up(data: Path, target: Path) -> BackupReport:

@@ -18,7 +18,7 @@ class ServiceError(Exception):
 
 
 def not_found(what: str, ident: str) -> ServiceError:
-    """Also the answer for what belongs to somebody else."""
+    """Also the answer for what belongs to another tenant."""
     return ServiceError(404, "not_found", f"there is no {what} {ident[:64]!r}")
 
 

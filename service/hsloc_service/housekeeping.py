@@ -160,7 +160,7 @@ class Housekeeping:
 def reconcile(database: Database, storage: Storage, deletions: DeletionQueue) -> int:
     """Compare uploads, attempts and results of the data folder with the database; how many entries were quarantined.
 
-    For the start only, when no job runs and nobody uploads.
+    For the start only, when no job runs and no upload is received.
     """
     if not database.shared:  # else other servers may receive them just now; and none of those was that old
         for file_id in reopen_uploads(database):

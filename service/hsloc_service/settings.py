@@ -213,7 +213,7 @@ def _check_names(environment: Mapping[str, str]) -> None:
 def from_environment(environment: Mapping[str, str] = os.environ, **changes: Any) -> Settings:
     """Settings from `HSLOC_<NAME>` variables; `changes` (those that are not None) stand above them.
 
-    The folder is `HSLOC_SERVE_DATA`: elsewhere `HSLOC_DATA` is where somebody keeps logs, no place to write to.
+    The folder is `HSLOC_SERVE_DATA`: elsewhere `HSLOC_DATA` is a folder of logs, not to be written to.
     Raises SettingsError for a value that cannot be used, and for a variable `HSLOC_...` that is no setting.
     """
     _check_names(environment)

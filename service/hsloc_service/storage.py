@@ -17,7 +17,7 @@ from hsloc_service.errors import is_disk_full, no_space
 from hsloc_service.settings import SettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
 BALLAST = "ballast"
@@ -122,6 +122,16 @@ def hash_file(path: Path, sync: bool = False) -> tuple[int, str]:
             os.fchmod(file.fileno(), 0o600)
             os.fsync(file.fileno())
     return size, digest.hexdigest()
+
+
+def write_hashed(path: Path, blocks: Iterable[bytes]) -> str:
+    """Write a file; the SHA-256 of what was written."""
+    digest = hashlib.sha256()
+    with path.open("wb") as file:
+        for block in blocks:
+            digest.update(block)
+            file.write(block)
+    return digest.hexdigest()
 
 
 def sync_folder(path: Path | str) -> None:

@@ -134,7 +134,7 @@ class WebhookSender:
             self._database.lock(session, f"secret {due.tenant}")
             secret = secret_of(session, due.tenant)
             if self._database.shared:
-                due.next_at = now + 2.0 * WITHIN_S  # nobody else tries it meanwhile; if we die, somebody does
+                due.next_at = now + 2.0 * WITHIN_S  # then another server tries it, if this one died
         status, error = self._post(due, secret)
         with self._database.write() as session:
             row = session.get(DeliveryRow, due.id, with_for_update=True)

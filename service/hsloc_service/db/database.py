@@ -126,7 +126,7 @@ class Database:
 
     @contextmanager
     def elected(self, name: str) -> Iterator[bool]:
-        """Whether this server does what only one does at a time: nobody else is told so while the block runs."""
+        """Whether this server does what only one does at a time: False for all others while the block runs."""
         if not self.shared:
             yield True
             return
@@ -168,9 +168,13 @@ def notify(session: Session, message: str) -> None:
         session.execute(text("SELECT pg_notify(:channel, :message)"), {"channel": CHANNEL, "message": message})
 
 
+UNREACHABLE = (OperationalError, InterfaceError)
+"""What a database raises that is away, restarted or locked, which passes."""
+
+
 def is_unreachable(error: Exception) -> bool:
     """Whether PostgreSQL was away or restarted, which passes."""
-    return isinstance(error, OperationalError | InterfaceError)
+    return isinstance(error, UNREACHABLE)
 
 
 def open_database(settings: Settings) -> Database:

@@ -78,7 +78,7 @@ class Heartbeat:
         except DBAPIError as error:
             if not self._leases.database.shared or not is_unreachable(error):
                 raise
-            # Until the lease ends nobody takes the job; a database that restarts is back by then.
+            # Until the lease ends no other worker takes the job; a database that restarts is back by then.
             return None if time.monotonic() < self._held_until else "lost"
         self._held_until = now + self._leases.lease_s
         self._lines = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import threading
 import uuid
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING
 from sqlalchemy import select
 
 from hsloc_service.db.tables import FileRow
+from hsloc_service.storage import write_hashed
 from hsloc_service.stored_request import files_of
 
 if TYPE_CHECKING:
@@ -59,12 +59,12 @@ class InputCache:
         try:
             for row in rows:
                 fetch = partial(self._fetch, row.id, self._folder / digests[row.id])
-                retry.retry("fetch", fetch, parts.limit_s(row.size or 0))
+                retry.retry("fetch", fetch, parts.timeout_of(row.size or 0))
             yield {ident: self._folder / digest for ident, digest in digests.items()}
         finally:
             with self._lock:
                 self._used.subtract(digests.values())
-                self._used += Counter()  # drops those that nobody uses
+                self._used += Counter()  # drops those that are not in use
                 self._evict()
 
     def _fetch(self, file_id: str, path: Path) -> None:
@@ -75,13 +75,9 @@ class InputCache:
             return
         self._folder.mkdir(mode=0o700, exist_ok=True)
         # Where a worker that starts removes what one that was killed has left.
-        copy, digest = self._storage.work / f"input-{uuid.uuid4().hex}", hashlib.sha256()
+        copy = self._storage.work / f"input-{uuid.uuid4().hex}"
         try:
-            with copy.open("wb") as file:
-                for block in self._parts.blocks(file_id):
-                    digest.update(block)
-                    file.write(block)
-            if digest.hexdigest() != path.name:
+            if write_hashed(copy, self._parts.blocks(file_id)) != path.name:
                 raise OSError(f"upload {file_id} is not what was stored")
             copy.chmod(0o400)
             copy.rename(path)

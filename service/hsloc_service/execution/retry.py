@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import time
 from typing import TYPE_CHECKING, TypeVar
 
-from hsloc_service.call_timeout import MIN_BYTES_PER_S, start_call
+from hsloc_service.call_timeout import start_call
 from hsloc_service.errors import StoreError
 from hsloc_service.logs import log
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hsloc_service.results.store import ResultStore
 
 T = TypeVar("T")
 TICK_S = 0.05
@@ -70,10 +68,3 @@ class Retry:
         reason = self._cancel_reason()
         if reason is not None:
             raise Interrupted(reason)
-
-
-def transfer_timeout_s(store: ResultStore, sizes: list[int], call_timeout_s: float) -> float:
-    """Time limit for a transfer of files of these sizes; infinite for the data folder, a local disk."""
-    if store.url is None:
-        return math.inf
-    return call_timeout_s * (1 + len(sizes)) + sum(sizes) / MIN_BYTES_PER_S

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import random
@@ -16,10 +15,10 @@ from hsloc_service.execution.heartbeat import Heartbeat
 from hsloc_service.execution.job_process import JobProcess
 from hsloc_service.execution.outcome import Outcome, interrupted
 from hsloc_service.execution.processes import linked_files
-from hsloc_service.execution.retry import Interrupted, Retry, transfer_timeout_s
+from hsloc_service.execution.retry import Interrupted, Retry
 from hsloc_service.logs import log
-from hsloc_service.results.store import BLOCK, collect
-from hsloc_service.storage import safe_name
+from hsloc_service.results.store import BLOCK, collect, transfer_timeout_s
+from hsloc_service.storage import safe_name, write_hashed
 from hsloc_service.stored_request import MAP_STATE, UPLOADS, logs_of
 
 if TYPE_CHECKING:
@@ -135,13 +134,9 @@ def prepare(
 
 def download(store: ResultStore, source: Source, folder: Path) -> None:
     """Copy the saved map of an earlier job into the folder. Raises OSError if it is not what its manifest says."""
-    digest = hashlib.sha256()
-    with (folder / MAP_STATE).open("wb") as file:
-        for start in range(0, source.size, BLOCK):
-            block = store.read(source.folder, MAP_STATE, start, min(BLOCK, source.size - start))
-            digest.update(block)
-            file.write(block)
-    if digest.hexdigest() != source.sha256:
+    starts = range(0, source.size, BLOCK)
+    blocks = (store.read(source.folder, MAP_STATE, start, min(BLOCK, source.size - start)) for start in starts)
+    if write_hashed(folder / MAP_STATE, blocks) != source.sha256:
         raise OSError(f"{MAP_STATE} of {source.folder} is not what was stored")
 
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from hsloc.run_metrics import RunMetrics, RunTimings
 
 EVERY_S = 0.25
-"""Progress is told this often at most."""
+"""Shortest time between two lines of progress [s]."""
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 _SUMMARISED = ("verdict", "run", "log", "scans", "localised", "ape", "relations", "losses")
 """Keys of metrics.json that the job's row holds, too."""

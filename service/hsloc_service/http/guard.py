@@ -13,12 +13,12 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from anyio import to_thread
-from sqlalchemy.exc import InterfaceError, OperationalError
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import Message
 
 from hsloc_service.auth import ANYBODY, Principal
+from hsloc_service.db.database import UNREACHABLE
 from hsloc_service.errors import BrokenAnswer, ServiceError, busy
 from hsloc_service.http import metrics
 from hsloc_service.logs import log, request_id
@@ -129,7 +129,7 @@ class Guard:
         client = (scope.get("client") or ("unknown", 0))[0]
         try:
             who = await (self._visitor(path) if path.startswith(SHARED_PREFIX) else self._principal(headers))
-        except (OperationalError, InterfaceError) as error:
+        except UNREACHABLE as error:
             log("database.error", error=str(error.orig))
             raise ServiceError(503, "database", "the database is busy", {"Retry-After": "1"}) from error
         if who is None:

@@ -215,7 +215,7 @@ class Leases:
         return None
 
     def _may_run(self, session: Session, tenant: str) -> bool:
-        """Whether one more job of the tenant may run; nobody else begins one until the transaction ends."""
+        """Whether one more job of the tenant may run; no other server begins one until the transaction ends."""
         self.database.lock(session, f"running {tenant}")
         count = select(func.count()).where(JobRow.tenant == tenant, JobRow.state.in_(("running", "cancelling")))
         return (session.scalar(count) or 0) < self.max_running
@@ -307,7 +307,7 @@ def _turns(session: Session, waiting: Iterable[ColumnElement[bool]]) -> list[tup
 
 
 def _held(session: Session, claim: Claim) -> JobRow | None:
-    """The job, if the claim still holds; nobody else changes it then until the transaction ends."""
+    """The job, if the claim still holds; no other transaction changes it before this one ends."""
     return session.scalar(
         select(JobRow)
         .where(

@@ -327,7 +327,7 @@ def _need_map(session: Session, job: JobRow) -> None:
 
 
 def _job(session: Session, who: Principal, job_id: str, lock: bool = False) -> JobRow:
-    """A job of the principal; with `lock` nobody else changes it until the transaction ends."""
+    """A job of the principal; with `lock` no other transaction changes it before this one ends."""
     query = select(JobRow).where(JobRow.id == job_id, JobRow.tenant == who.tenant)
     job = session.scalar(query.with_for_update() if lock else query)
     if job is None:

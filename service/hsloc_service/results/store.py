@@ -7,6 +7,7 @@ abandoned attempt left behind is found by `names` and removed.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import stat
@@ -14,9 +15,11 @@ from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+from hsloc_service.call_timeout import MIN_BYTES_PER_S
 from hsloc_service.storage import hash_file, remove_tree, sync_folder
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
 
@@ -133,7 +136,7 @@ class FolderStore:
         remove_tree(self._root / checked_result(name))
 
     def names(self) -> list[str]:
-        """The folders with the names of results; anything else is somebody's, and left alone."""
+        """The folders with the names of results; anything else is left alone."""
         return [entry.name for entry in os.scandir(self._root) if _RESULT_NAME.match(entry.name)]
 
 
@@ -154,6 +157,13 @@ class _FileReader:
 
     def close(self) -> None:
         os.close(self._descriptor)
+
+
+def transfer_timeout_s(store: ResultStore, sizes: Sequence[int], call_timeout_s: float) -> float:
+    """Time limit for a transfer of files of these sizes [B]; infinite for the data folder, a local disk."""
+    if store.url is None:
+        return math.inf
+    return call_timeout_s * (1 + len(sizes)) + sum(sizes) / MIN_BYTES_PER_S
 
 
 def collect(output: Path) -> list[Asset]:

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, NamedTuple
 from sqlalchemy import delete, select
 from sqlalchemy.exc import SQLAlchemyError
 
-from hsloc_service.call_timeout import MIN_BYTES_PER_S, call_within
+from hsloc_service.call_timeout import call_within
 from hsloc_service.db.tables import FileRow, UploadPartRow
 from hsloc_service.errors import ServiceError, StoreError, not_found
-from hsloc_service.results.store import BLOCK, Asset
+from hsloc_service.results.store import BLOCK, Asset, transfer_timeout_s
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -56,7 +56,7 @@ class UploadParts:
         number = secrets.randbelow(10**9)
         name = f"{file_id}.{number}"
         asset = Asset(ASSET, size, "", "application/octet-stream")
-        call_within(self.limit_s(size), lambda: self.store.publish(staged, name, [asset]))
+        call_within(self.timeout_of(size), lambda: self.store.publish(staged, name, [asset]))
         try:
             self._record(UploadPartRow(file_id=file_id, start=start, size=size, number=number), last)
         except (ServiceError, SQLAlchemyError):
@@ -135,9 +135,9 @@ class UploadParts:
     def _remove(self, name: str) -> None:
         call_within(self.timeout_s, lambda: self.store.remove(name))
 
-    def limit_s(self, size: int) -> float:
+    def timeout_of(self, size: int) -> float:
         """Time limit for a transfer of this size [s]."""
-        return 2.0 * self.timeout_s + size / MIN_BYTES_PER_S
+        return transfer_timeout_s(self.store, [size], self.timeout_s)
 
 
 class Staging:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.states import localisation_reasons
+from hsloc.localisation.states import localisation_reasons, spans_of
 from hsloc.model.estimate import Status
 from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.slam.time_offset import Headings, find_offset, offset_warning, offsets_of_log
@@ -154,13 +154,7 @@ def _share(result: Result) -> float:
 def _unplaced(result: Result) -> tuple[tuple[float, float], ...]:
     """Spans in which no scan found a place."""
     without = np.isin(result.diagnostics.status, ("searching", "rejected"))
-    return _times(result.diagnostics.stamps_ns, _runs(without), result)
-
-
-def _runs(rows: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First and last row of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], rows, [False]))))
-    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]
+    return _times(result.diagnostics.stamps_ns, spans_of(without), result)
 
 
 def _times(

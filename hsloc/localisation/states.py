@@ -249,7 +249,7 @@ def localisation_reasons(rows: StateRows, trajectory: Trajectory) -> tuple[Verdi
         part = share.get(state, 0.0)
         if part <= (TOLERATED_PREDICTED if state is State.PREDICTED else TOLERATED_SHARE):
             continue
-        spans = _spans(np.array([each is state for each in rows.state]))
+        spans = spans_of(np.array([each is state for each in rows.state]))
         firsts = [first for first, _ in spans]
         start = int(trajectory.stamps_ns.min())
         seconds = ((trajectory.stamps_ns - start) / 1e9).tolist()
@@ -266,7 +266,7 @@ def localisation_reasons(rows: StateRows, trajectory: Trajectory) -> tuple[Verdi
     return tuple(reasons)
 
 
-def _spans(rows: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def spans_of(rows: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """First and last row of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], rows, [False]))))
     return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]

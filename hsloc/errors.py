@@ -2,7 +2,7 @@
 
 ::
 
-    HslocError                  anything a user can be told; the command line maps it to exit code 1
+    HslocError                  anything reported to a user; the command line maps it to exit code 1
     ├── LogError                a log cannot be opened, or holds nothing that can be used
     │   ├── LogFormatError      not a log of a known format, or damaged beyond use
     │   └── TopicError          no scan or odometry topic, or several to choose from

@@ -1,4 +1,4 @@
-"""`hsloc`: the command line's front door.
+"""`hsloc`: the command line.
 
 Only argparse is imported here. A command is a module `hsloc.cli.<name>` with `HELP: str`,
 `add_arguments(parser)` and `run(arguments) -> int`; it is imported when it is called, and its heavy imports

@@ -1,4 +1,4 @@
-"""Compiled kernels on arrays, the only code that numba compiles; each has a naive twin in the tests."""
+"""Compiled kernels on arrays, the only code that numba compiles; each has a plain version in the tests."""
 
 from hsloc.kernels.cache import choose_cache
 

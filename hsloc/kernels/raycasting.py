@@ -1,4 +1,4 @@
-"""Rays against line segments and circles, exactly: the eye of the simulated robot.
+"""Rays against line segments and circles, exactly: what the simulated lidar measures.
 
 Serves the simulator alone. The localiser matches against a grid and has no ray caster; were one shared between
 them, the errors of a discretisation would cancel and flatter the results.

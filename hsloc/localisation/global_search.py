@@ -43,7 +43,7 @@ class RelocaliserResult:
 class GlobalSearch(Protocol):
     """Finds an unknown pose from several scans.
 
-    Law: the same scans since `start` and the same state of its random generator give the same results.
+    Contract: the same scans since `start` and the same state of its random generator give the same results.
     """
 
     def start(self, usual_explained: float | None = None) -> None:

@@ -31,7 +31,7 @@ _STRAIGHT = 1e-6
 class MotionModel(Protocol):
     """How uncertain a motion is.
 
-    Law: the covariance is symmetric and positive semidefinite, depends on the motion alone, and is zero for none.
+    Contract: the covariance is symmetric and positive semidefinite, depends on the motion alone, and is zero for none.
     """
 
     def covariance(self, motion: Pose2) -> F64:

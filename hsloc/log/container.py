@@ -83,7 +83,7 @@ def guarded(complaint: str, remedy: str, losses: Losses | None) -> Iterator[None
 class Container(Protocol):
     """A file, or a folder that is one recording.
 
-    Law: `runs` yields every readable message of the wanted channels exactly once, in the order of
+    Contract: `runs` yields every readable message of the wanted channels exactly once, in the order of
     (log time, position) as far as a bounded memory allows; what it cannot read it counts in `losses`. It raises
     nothing but LogError. `losses_at_opening` holds what was already lost when the file was opened.
     """

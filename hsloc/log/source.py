@@ -23,7 +23,7 @@ class Observation(NamedTuple):
 class Source(Protocol):
     """A log's events in a total order.
 
-    Law: `events` yields (effective stamp, event); called twice it yields the same twice. It raises nothing but
+    Contract: `events` yields (effective stamp, event); called twice it yields the same twice. It raises nothing but
     LogError, and counts what it cannot read in `losses`. `losses_at_opening` were already found at opening.
     """
 

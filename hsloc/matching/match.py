@@ -55,7 +55,7 @@ class Match:
 class Matcher(Protocol):
     """Finds the pose in a window that fits a scan best.
 
-    Law: the same points, field, window and state of `rng` give the same Match; the pose lies in the
+    Contract: the same points, field, window and state of `rng` give the same Match; the pose lies in the
     window (ICP, which knows none, excepted); nothing but `rng` changes.
     """
 

@@ -25,7 +25,7 @@ _COLLECT_AFTER = 50_000
 
 
 class Estimator(Protocol):
-    """Localiser or mapper. Law: the same events and seed give the same estimates; the truth never reaches it."""
+    """Localiser or mapper. Contract: the same events and seed give the same estimates; the truth never reaches it."""
 
     def update(self, event: Odometry | PairedScan) -> Estimate:
         """Take the next event; the estimate at its stamp."""

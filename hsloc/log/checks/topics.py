@@ -51,7 +51,7 @@ class TopicCheck:
         self._count += 1
         if message.stamp_ns == 0 < log_time_ns:
             self._findings.add(
-                Severity.WARNING, "stamp_zero", place, "messages have no stamp; the log's time stands in",
+                Severity.WARNING, "stamp_zero", place, "messages have no stamp; the log's time is used instead",
                 "have the driver stamp its messages, or wait for /clock before recording",
             )  # fmt: skip
             return

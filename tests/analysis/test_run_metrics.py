@@ -242,6 +242,6 @@ def test_a_job_keeps_all_warnings_of_the_run() -> None:
         RunWarning(WarningCode.SCANS_WITHOUT_PLACE, "x" * 600, "check the map"),
     )
     metrics = sample_metrics(warnings=warnings)
-    summary = summarise(metrics, RunTimings(seconds={}, times_real_time=None, evaluations_per_second=None))
+    summary = summarise(metrics, RunTimings(seconds={"replay": 1.0}, times_real_time=None, evaluations_per_second=None))
     assert [each["code"] for each in summary["warnings"]] == ["clocks_apart", "scans_without_place"]
     assert summary["warnings"][1] == {"code": "scans_without_place", "text": "x" * 500, "remedy": "check the map"}

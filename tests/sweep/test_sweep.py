@@ -123,7 +123,7 @@ def test_what_goes_wrong_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     runs = plan([tmp_path / "missing.mcap", tmp_path / "broken.mcap", HALL, OFFICE], DEFAULT, read=SHORT)
     outcomes = sweep_in_threads(runs, tmp_path / "out")
     assert states(outcomes) == [FAILED, FAILED, FAILED, DONE]
-    assert "missing.mcap: cannot be read" in outcomes[0].error
+    assert "missing.mcap: no such file" in outcomes[0].error
     assert "is not an MCAP" in outcomes[1].error
     assert "exists already" in outcomes[2].error
     assert (tmp_path / "out" / "hall-default-seed0" / "thesis.tex").exists()

@@ -5,6 +5,7 @@ import { get, hasToken, onToken, post, useToken } from "./api.js";
 import { $, bytes, guarded, notice } from "./dom.js";
 import * as files from "./files.js";
 import * as form from "./form.js";
+import { offerTopics } from "./inspect.js";
 import * as jobs from "./jobs.js";
 import * as labels from "./labels.js";
 import { build } from "./options.js";
@@ -35,7 +36,10 @@ $("token-form").addEventListener("submit", (event) => {
 async function about() {
   const info = await guarded(() => get("/v1/info"));
   if (info) $("server").textContent = `version ${info.version}, ${bytes(info.free_bytes)} free, ${info.tenant}`;
-  if (info && !$("options").children.length) build($("options"), (await guarded(() => get("/v1/options")))?.run ?? []);
+  const options = info && (await guarded(() => get("/v1/options")))?.run;
+  if (!options || $("options").children.length) return;
+  build($("options"), options);
+  offerTopics();
 }
 
 // --- parts of the page -----------------------------------------------------------------------------------------------

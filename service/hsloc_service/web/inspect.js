@@ -3,7 +3,7 @@
 import { $, duration, element } from "./dom.js";
 
 const TYPES = { "read.scan_topic": /Scan|PointCloud|Echo/i, "read.odom_topic": /Odometry|JointState|TFMessage|FrameTransform|Twist/i, "read.truth_topic": /Pose|Odometry|TFMessage|Transform/i };
-let map = null;
+let map = null, topics = [];
 
 const list = (title, lines) => {
   if (!lines.length) return [];
@@ -12,7 +12,8 @@ const list = (title, lines) => {
   return [element("h3", title), all];
 };
 
-function pickFrom(topics) {
+// Offers the topics of the log that was looked at in the form, which may be made only after that.
+export function offerTopics() {
   for (const [option, types] of Object.entries(TYPES)) {
     const control = document.querySelector(`[data-option="${option}"]`);
     if (!control) continue;
@@ -45,16 +46,17 @@ export async function show(found) {
   const summary = `${duration(found.duration_s)}, ${found.format}: ${read.map(([what, topic]) => `${what} ${topic ?? "none"}`).join(", ")}; ${found.view ? "a map" : "no map: one will be built"}`;
   const findings = (found.findings ?? []).map((each) => [`${each.severity}: ${each.topic ? `${each.topic}: ` : ""}${each.text}${each.count > 1 ? ` (${each.count} times)` : ""}${each.remedy ? `; ${each.remedy}` : ""}`, each.severity]);
   const verdict = found.findings === null ? "not checked: the log is larger than 1 GB" : findings.length ? "" : "nothing is wrong with it";
-  const topics = element("details"), table = element("table");
+  const listed = element("details"), table = element("table");
   for (const topic of found.topics) {
     const row = table.insertRow();
     for (const text of [topic.topic, topic.type, `${topic.count} messages`, `${topic.rate_hz.toFixed(1)} Hz`]) row.insertCell().textContent = text;
   }
-  topics.append(element("summary", `${found.topics.length} topics`), table);
+  listed.append(element("summary", `${found.topics.length} topics`), table);
   box.replaceChildren(element("p", summary), ...(verdict ? [element("p", verdict, "quiet")] : []),
-    ...list("Check", findings), ...list("Warnings", found.warnings.map((text) => [text, ""])), topics);
+    ...list("Check", findings), ...list("Warnings", found.warnings.map((text) => [text, ""])), listed);
   box.hidden = false;
-  pickFrom(found.topics);
+  topics = found.topics;
+  offerTopics();
   await showMap(found);
 }
 

@@ -96,7 +96,15 @@ function render(job, isMine = true) {
   }
   const settings = Object.fromEntries(Object.entries(job.request).filter(([, value]) => value !== null));
   $("job-request").lastElementChild.textContent = JSON.stringify(settings, null, 2);
-  const buttons = [];
+  offer(job, isMine);
+  $("job-describe").hidden = !isMine;
+}
+
+// What can be done with a job. While it runs the buttons stay, so that progress does not take the focus from them.
+function offer(job, isMine) {
+  const box = $("job-buttons"), of = isMine && ACTIVE.includes(job.state) ? job.id : "", buttons = [];
+  if (of && box.dataset.of === of) return;
+  box.dataset.of = of;
   if (ACTIVE.includes(job.state)) {
     buttons.push(button("Cancel", async () => { await post(`/v1/jobs/${job.id}/cancel`); render(await get(`/v1/jobs/${job.id}`)); }));
   } else {
@@ -107,8 +115,7 @@ function render(job, isMine = true) {
       location.hash = "";
     }));
   }
-  $("job-buttons").replaceChildren(...(isMine ? buttons : []));
-  $("job-describe").hidden = !isMine;
+  box.replaceChildren(...(isMine ? buttons : []));
 }
 
 // The view of a result, and the picture of its map; `base` is the address of its files.

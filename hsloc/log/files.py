@@ -180,11 +180,6 @@ def unpacked_head(path: Path, head: bytes) -> bytes:
         return b""
 
 
-def is_archive(head: bytes) -> bool:
-    """Whether bytes are the beginning of a zip or tar archive, which holds files."""
-    return head.startswith(ZIP) or _is_tar(head)
-
-
 def unpack(path: Path, head: bytes, folder: Path) -> Path:
     """Unpack a file into `folder`: the file that was packed, or a folder with the files of the archive.
 

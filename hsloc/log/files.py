@@ -202,7 +202,7 @@ def unpack(path: Path, head: bytes, folder: Path) -> Path:
         return found
     except _BROKEN as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
-        raise LogFormatError(f"{path}: its compression is damaged or ends too early ({reason})") from error
+        raise _damaged(path, reason) from error
     except OSError as error:
         raise LogError(
             f"{path}: cannot be unpacked into {folder} ({error.strerror or error}); set TMPDIR to a folder with space"
@@ -218,6 +218,10 @@ def _is_tar(head: bytes) -> bool:
     return head[_TAR_AT : _TAR_AT + len(_TAR)] == _TAR
 
 
+def _damaged(path: Path, reason: object) -> LogFormatError:
+    return LogFormatError(f"{path}: its compression is damaged or ends too early ({reason})")
+
+
 @contextmanager
 def _opened(path: Path, head: bytes) -> Iterator[BinaryIO]:
     """What a packed file holds, as a stream; a tar file as it is."""
@@ -231,7 +235,7 @@ def _opened(path: Path, head: bytes) -> Iterator[BinaryIO]:
             with path.open("rb") as file, zstandard.ZstdDecompressor(max_window_size=1 << 31).stream_reader(file) as s:
                 yield cast("BinaryIO", s)
         except zstandard.ZstdError as error:
-            raise LogFormatError(f"{path}: its compression is damaged or ends too early ({error})") from error
+            raise _damaged(path, error) from error
     elif head.startswith(_LZ4):
         import lz4.frame
 
@@ -239,7 +243,7 @@ def _opened(path: Path, head: bytes) -> Iterator[BinaryIO]:
             with lz4.frame.open(path, "rb") as stream:
                 yield cast("BinaryIO", stream)
         except RuntimeError as error:
-            raise LogFormatError(f"{path}: its compression is damaged or ends too early ({error})") from error
+            raise _damaged(path, error) from error
     elif head.startswith((_BZIP2, _XZ)):
         try:
             with bz2.open(path, "rb") if head.startswith(_BZIP2) else lzma.open(path, "rb") as stream:
@@ -247,7 +251,7 @@ def _opened(path: Path, head: bytes) -> Iterator[BinaryIO]:
         except OSError as error:
             if error.errno is not None:  # bz2 raises one without a number for data that are damaged
                 raise
-            raise LogFormatError(f"{path}: its compression is damaged or ends too early ({error})") from error
+            raise _damaged(path, error) from error
     else:
         with path.open("rb") as plain:
             yield plain

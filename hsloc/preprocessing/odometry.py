@@ -31,15 +31,15 @@ if TYPE_CHECKING:
     from hsloc.model.events import Event
 
 _LEAST_TURN, _MAX_TURN = 0.8, 10.0
-"""A step is a jump as `hsloc check` tells it, or if it turns by more than this (rad), and faster than this (rad/s)."""
+"""A step is a jump as `hsloc check` has it, or if it turns by more than this (rad), and faster than this (rad/s)."""
 _MOST = 20
-"""So many jumps are mended; after more of them the odometry is taken for broken."""
+"""Number of jumps that are mended; after more of them the odometry is taken for broken."""
 
 FROZEN_S = 3.0
-"""Odometry that is at rest for so long (s) while the scans change is frozen. A robot at 0.1 m/s
+"""Odometry that is at rest for this long (s) while the scans change is frozen. A robot at 0.1 m/s
 has gone 0.3 m by then, more than scans can hide; wheel encoders tick many times."""
 _COMPARED_S = 1.0
-"""Scans are compared with one that is at least so old (s)."""
+"""Scans are compared with one that is at least this old (s)."""
 _CHANGED_M = 0.1
 """A beam has changed if its range differs by more than this (m), several times the noise of common lidars ..."""
 _CHANGED_PART = 0.05
@@ -52,7 +52,7 @@ _STILL_M, _STILL_RAD = 0.01, 0.01
 """Changes (m, rad) below which odometry is at rest: the noise of a sensor that measures no motion. Scans that change
 have moved ten times as far."""
 _TURNED, _TURNS = 1.5, 15
-"""Rotation of the scans (rad) in so many comparisons after which a heading that never changed will not change any more.
+"""Rotation of the scans (rad) in this number of comparisons after which a heading that never changed never will.
 Of 1,114 comparisons on Intel's log in which the robot drove straight 13 show a rotation, each alone."""
 _CLEAR, _WIDEST = 0.2, 1.2
 """Smallest and largest rotation (rad) between two scans that is looked for."""
@@ -134,7 +134,7 @@ class OdometryWatch:
     def __init__(self, events: Iterable[Event]) -> None:
         self._events = events
         self._pose: Pose2 | None = None
-        self._told_ns = 0
+        self._latest_ns = 0
         self._since_ns = 0
         self._old: tuple[int, NDArray[np.float32]] | None = None
         self._moving_ns = 0
@@ -155,7 +155,7 @@ class OdometryWatch:
 
     def _follow(self, event: Odometry) -> None:
         pose, last = event.T_odom_base, self._pose
-        self._told_ns = event.stamp_ns
+        self._latest_ns = event.stamp_ns
         if (
             last is None
             or hypot(pose.x - last.x, pose.y - last.y) > _STILL_M
@@ -189,7 +189,7 @@ class OdometryWatch:
         before, self._old = self._old[1], (scan.stamp_ns, scan.ranges)
         if both.sum() < _MIN_BEAMS or self._pose is None or step < 0:
             return
-        if scan.stamp_ns - self._told_ns > _COMPARED_S * 1e9:  # odometry that is missing does not stand still
+        if scan.stamp_ns - self._latest_ns > _COMPARED_S * 1e9:  # odometry that is missing does not stand still
             self._moving_ns = 0
             return
         if not self._turns:

@@ -117,7 +117,7 @@ def _exact(recent: deque[Odometry], stamp_ns: int) -> Pose2 | None:
 
 
 def _at(stamp_ns: int, recent: deque[Odometry], following: Odometry | None, first: Pose2) -> Pose2:
-    """The odometry at a stamp: exact, else between neighbours in the log that enclose it, else the last one told."""
+    """The odometry at a stamp: exact, else between neighbours in the log that enclose it, else the last one."""
     exact = _exact(recent, stamp_ns)
     if exact is not None:
         return exact

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     Stamped = tuple[TopicClock, Event]
 
 _LONGEST_S = 1.0
-"""A velocity holds for so long (s) at most: publishers that fall silent do so when the robot stands."""
+"""A velocity holds for this long (s) at most: publishers that fall silent do so when the robot stands."""
 MAX_ABS = 1e7
 """Coordinates beyond (metres) are taken for damage; the Earth's circumference is 4e7."""
 
@@ -275,7 +275,7 @@ class MotionFeed:
         if step is None:
             self._losses.invalid_messages[self.topic] += 1
             return ()
-        if self._last_ns is None or not -_LONGEST_S <= seconds < 0.0:  # a clock that was set back starts anew
+        if self._last_ns is None or not -_LONGEST_S <= seconds < 0.0:  # a clock that was set back starts again
             self._last_ns = stamp
         self._pose = _along_arc(self._pose, *step)
         if not self._has_position:

@@ -21,7 +21,7 @@ import numpy as np
 
 from hsloc.kernels.beams import wall_normals, wall_rows
 from hsloc.kernels.fitness import point_scores
-from hsloc.matching.covariance import MAX_GAP, POINT_SIGMA
+from hsloc.matching.covariance import CORRELATED, MAX_GAP, POINT_SIGMA
 from hsloc.matching.local_refinement import refine
 from hsloc.matching.window import Window
 
@@ -54,8 +54,6 @@ _ROBUST_M = 0.1
 """Distance from the wall at which a point counts by half (m): Cauchy's weight."""
 _LARGEST_PRIOR = 0.1
 """Standard deviation of the scale before anything is known; larger ones are not followed by the localiser."""
-_CORRELATED = 30.0
-"""Number of points that count as one, as in the covariance of a match."""
 _MOST_CELLS_OFF = 1.5
 """A point farther from its wall than this many cells shows something else than how the wall is drawn."""
 _LEAST_OF_ROW = 5
@@ -199,7 +197,7 @@ class MapScaleEstimator:
 
     def _prior(self) -> F64:
         """Information (2, 2) about scale and offset before the first scan, in the unit of the sums."""
-        variance = _CORRELATED * (self._squares / self._weight if self._weight > 0.0 else POINT_SIGMA**2)
+        variance = CORRELATED * (self._squares / self._weight if self._weight > 0.0 else POINT_SIGMA**2)
         return np.diag((variance / _LARGEST_PRIOR**2, variance / self._field.resolution**2))
 
     def _solve(self) -> F64:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _CELL_SIGMA = 1.0 / np.sqrt(12.0)
 """Standard deviation of a wall's place within its cell, in cells. Internal: that of a uniform distribution."""
-_CORRELATED = 30.0
+CORRELATED = 30.0
 """Number of beams that count as one. Internal: neighbouring beams see one wall with one error of the map, and
 a covariance is only compared with that of the odometry, whose parameters are what is to be set."""
 
@@ -44,7 +44,7 @@ def match_covariance(information: F64, n_points: int, fitness: float, field: Lik
     variance = (_CELL_SIGMA * field.resolution) ** 2 + residual**2
     half = np.minimum(window.half_widths(), (np.inf, np.inf, np.pi))
     prior = np.diag(3.0 / half**2)
-    covariance: F64 = np.linalg.inv(slope / (variance * _CORRELATED) + prior)
+    covariance: F64 = np.linalg.inv(slope / (variance * CORRELATED) + prior)
     angle = field.T_map_field.theta
     if angle != 0.0:
         c, s = np.cos(angle), np.sin(angle)

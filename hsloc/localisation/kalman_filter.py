@@ -67,14 +67,7 @@ def predict_covariance(covariance: F64, pose: Pose2, motion: Pose2, motion_covar
 def fuse(prediction: Pose2, covariance: F64, measured: Pose2, measured_covariance: F64) -> tuple[Pose2, F64]:
     """The EKF's update with a measured pose: `K = P (P + R)^-1`."""
     gain = np.linalg.solve((covariance + measured_covariance).T, covariance.T).T
-    innovation = np.array(
-        (
-            measured.x - prediction.x,
-            measured.y - prediction.y,
-            wrap_angle(measured.theta - prediction.theta),
-        )
-    )
-    pose = Pose2.from_array(prediction.to_array() + gain @ innovation)
+    pose = Pose2.from_array(prediction.to_array() + gain @ difference(measured, prediction))
     updated = (np.eye(3) - gain) @ covariance
     return pose, 0.5 * (updated + updated.T)
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.model.pose2 import compose_poses, relative_poses, wrap_angle, wrap_angles
+from hsloc.localisation.kalman_filter import difference
+from hsloc.model.pose2 import compose_poses, relative_poses, wrap_angles
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -133,8 +134,7 @@ def delayed(index: F64, odometry: F64, delay: float) -> F64:
 
 def odometry_chi(motion: Pose2, found: Pose2, noise: OdometryNoise) -> float:
     """How far a step of the odometry is off, in standard deviations of the noise that is assumed."""
-    error = found.to_array() - motion.to_array()
-    error[2] = wrap_angle(error[2])
+    error = difference(found, motion)
     return float(np.sqrt(error @ np.linalg.solve(noise.covariance(motion) + FLOOR, error)))
 
 

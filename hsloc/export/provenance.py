@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import platform
 import shlex
-from hashlib import file_digest
+from dataclasses import replace
+from hashlib import file_digest, sha256
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
 from hsloc.config import dump, preset
 from hsloc.options import OPTIONS, written
-from hsloc.replay.map_and_start import map_files
+from hsloc.replay.map_and_start import map_files, state_file
 from hsloc.report.data import Provenance
 from hsloc.version import __version__
 
@@ -32,7 +33,23 @@ def provenance(result: Result) -> Provenance:
         hashes |= {path.name: _sha256(path) for path in map_files(result.request.map_path)}
     if result.request.calibration is not None:
         hashes[result.request.calibration.name] = _sha256(result.request.calibration)
-    return Provenance(command(result.request), dump(result.request.config), versions, hashes)
+    return Provenance(command(result.request), dump(result.request.config), versions, hashes, _options(result))
+
+
+def _options(result: Result) -> dict[str, Any]:
+    """What `Provenance.options` has: files that the run was computed from by their content, others by their names."""
+    request, grid = result.request, result.grid if result.true_grid is None else result.true_grid
+    values = replace(request, bare_names=True).to_values()
+    found = {option.name: values.get(option.name) for option in OPTIONS if option.place in ("run", "read")}
+    del found["seed"]
+    if request.map_path is not None:
+        cells = sha256(grid.cells.tobytes()).hexdigest()
+        found["map"] = (cells, grid.resolution, grid.origin, grid.occupied_threshold)
+    if request.resume is not None:
+        found["resume"] = _sha256(state_file(request.resume))
+    if request.calibration is not None:
+        found["calibration"] = _sha256(request.calibration)
+    return found
 
 
 def _sha256(path: Path) -> str:

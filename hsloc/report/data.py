@@ -30,13 +30,15 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, slots=True)
 class Provenance:
     """What it takes to repeat the run: the command as typed, the effective configuration as text, the versions
-    of the programs, and the sha256 of the input files, both by name.
+    of the programs, and the sha256 of the input files, both by name; and the options that decide its result, but for
+    the seed and the configuration, the same wherever the files are.
     """
 
     command: str = ""
     config: str = ""
     versions: Mapping[str, str] = field(default_factory=dict)
     hashes: Mapping[str, str] = field(default_factory=dict)
+    options: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

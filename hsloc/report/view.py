@@ -7,12 +7,9 @@ bounded length, however long the run was.
 from __future__ import annotations
 
 import hashlib
-import re
-import shlex
 from base64 import b64encode
 from dataclasses import replace
 from io import BytesIO
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -97,20 +94,10 @@ def view_of(parts: ReportParts, data: ReportData | None = None) -> ReportView:
     return ReportView(values, png)
 
 
-_NOT_DECISIVE = re.compile(r" --(seed|out|config|set)[= ]('[^']*'|\S+)")
-
-
 def _run(metrics: RunMetrics, provenance: Provenance) -> dict[str, Any]:
-    """The seed of the run, and a hash of all else that decides its result: log, options and configuration.
-
-    Where the files stand and how the configuration was given decide nothing.
-    """
-    parts = [word.rpartition("=") for word in shlex.split(_NOT_DECISIVE.sub("", provenance.command))]
-    words = [flag + Path(value).name for flag, _, value in parts]
-    config = [line for line in provenance.config.splitlines() if not line.startswith("#")]
-    identity = replace(metrics.run, seed=0)
-    digest = hashlib.sha256("\n".join((repr(identity), *words, *config)).encode("utf-8", "surrogateescape"))
-    return {"seed": metrics.run.seed, "group": digest.hexdigest()[:16]}
+    """The seed of the run, and a hash of all else that decides its result: log, options and configuration."""
+    identity = (replace(metrics.run, seed=0), dict(provenance.options), provenance.config)
+    return {"seed": metrics.run.seed, "group": hashlib.sha256(repr(identity).encode()).hexdigest()[:16]}
 
 
 def _end(data: ReportData) -> float:

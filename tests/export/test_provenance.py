@@ -14,13 +14,18 @@ import numpy as np
 import pytest
 from paths import RECORDINGS
 
+from hsloc.analysis.analyse import analyse
 from hsloc.cli.arguments import run_request
 from hsloc.cli.main import build_parser, main
 from hsloc.evaluation import write_tum
 from hsloc.export.provenance import command
+from hsloc.export.results_folder import report_parts
 from hsloc.log import ReadOptions, open_log
-from hsloc.model import Trajectory, Truth
+from hsloc.maps import save_map
+from hsloc.model import OccupancyGrid, Trajectory, Truth
 from hsloc.options import OPTIONS
+from hsloc.replay.run import run
+from hsloc.report.view import view_of
 from hsloc.request import RunRequest
 
 if TYPE_CHECKING:
@@ -136,3 +141,32 @@ def test_every_option_survives_the_line(option: Option) -> None:
     assert any(word.startswith(written_as) for word in words)
     arguments = build_parser().parse(words[1:])
     assert run_request(arguments) == request
+
+
+def in_view(log: Path, **options: Any) -> tuple[str, int]:
+    """Group and seed of a short run."""
+    result = run(RunRequest.from_values([log], {"end_s": 1.0, **options}))
+    found = view_of(report_parts(result, analyse(result))).values["run"]
+    return found["group"], found["seed"]
+
+
+def test_runs_are_one_group_wherever_their_files_are_and_not_with_another_map(tmp_path: Path) -> None:
+    grid = open_log(RECORDINGS / "office.mcap", ReadOptions()).map()
+    assert grid is not None
+    wider = OccupancyGrid(grid.cells, 1.01 * grid.resolution, grid.origin)
+    for name, each in (("a", grid), ("it's", grid), ("wider", wider)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "office.mcap").symlink_to(RECORDINGS / "office.mcap")
+        save_map(each, tmp_path / name / "floor")
+    first, seed = in_view(tmp_path / "a" / "office.mcap", map=tmp_path / "a" / "floor.yaml", seed=3)
+    assert seed == 3
+    there = {"map": tmp_path / "it's" / "floor.yaml", "bare_names": True}
+    assert in_view(tmp_path / "it's" / "office.mcap", **there) == (first, 0)
+    assert in_view(tmp_path / "a" / "office.mcap", map=tmp_path / "wider" / "floor.yaml")[0] != first
+    assert in_view(tmp_path / "a" / "office.mcap", **there, alignment="se2")[0] != first
+
+
+def test_a_name_that_only_bash_reads_has_a_report(tmp_path: Path) -> None:
+    log = tmp_path / os.fsdecode(b"B\xfc'ro.mcap")
+    log.symlink_to(RECORDINGS / "office.mcap")
+    assert len(in_view(log)[0]) == 16

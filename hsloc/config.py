@@ -18,6 +18,7 @@ from hsloc.matching.exact import Exact
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.hide import Hide
 from hsloc.matching.icp import Icp
+from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.options import MAPPERS, MATCHER_ALIASES, MATCHERS, PRESETS
 from hsloc.parameters import LARGEST, NonNegative, OneOf, Parameters, Positive, check, hints, plain
 from hsloc.slam.parameters import GraphMapperParameters
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from hsloc.matching.match import Matcher
+    from hsloc.model.occupancy_grid import OccupancyGrid
 
 T = TypeVar("T")
 
@@ -67,6 +69,10 @@ class Config(Parameters):
         """The matcher that is chosen."""
         chosen: Matcher = getattr(self, self.matcher)
         return chosen
+
+    def make_field(self, grid: OccupancyGrid) -> LikelihoodField:
+        """The field of a map. Raises MapError for a map without an occupied cell, and for one that is too large."""
+        return LikelihoodField.from_grid(grid, self.likelihood_field.sigma, self.likelihood_field.margin)
 
 
 def preset(name: str) -> Config:

@@ -15,7 +15,6 @@ from hsloc.config import Config
 from hsloc.errors import MapError
 from hsloc.localisation.localiser import Localiser
 from hsloc.log import open_log
-from hsloc.matching import LikelihoodField
 from hsloc.replay.engine import replay
 from hsloc.replay.map_and_start import find_map
 from hsloc.replay.run import run
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from hsloc.matching import Match, Matcher, Window
+    from hsloc.matching import LikelihoodField, Match, Matcher, Window
     from hsloc.model import Event
 
 
@@ -112,7 +111,7 @@ def _parts(request: RunRequest) -> dict[str, float]:
     if grid is None:
         raise MapError(f"{request.logs[0]}: the log has no /map")
     config = Config()
-    field = LikelihoodField.from_grid(grid, config.likelihood_field.sigma, config.likelihood_field.margin)
+    field = config.make_field(grid)
     stated = log.initial_pose()
     matcher = _Timed(config.make_matcher())
     rng = np.random.default_rng(0)

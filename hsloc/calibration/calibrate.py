@@ -14,7 +14,6 @@ from hsloc.calibration.estimator import Track, Undetermined, estimate
 from hsloc.errors import LogError, TopicError
 from hsloc.localisation.localiser import Localiser
 from hsloc.log import open_log
-from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.model.calibration import Calibration, LidarCalibration, corrected_odometry
 from hsloc.model.estimate import Status
 from hsloc.model.events import Odometry, PairedScan, Scan
@@ -222,7 +221,7 @@ def _mapped(scans: Iterable[PairedScan], config: Config) -> Poses:
 
 def _localised(scans: Iterable[PairedScan], config: Config, given: GivenMap) -> Poses:
     """The scans that were matched with the map, predicted from scan to scan."""
-    field = LikelihoodField.from_grid(given.grid, config.likelihood_field.sigma, config.likelihood_field.margin)
+    field = config.make_field(given.grid)
     localiser = Localiser.from_parameters(
         given.grid, field, config.make_matcher(), config.localiser, np.random.default_rng(0), given.T_map_laser
     )

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from hsloc.errors import MapError
 from hsloc.maps import read_map, read_metadata
-from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.model.events import Odometry
 from hsloc.slam.map_state import STATE_FILE, fingerprint, read_state
 from hsloc.slam.parameters import Resume
@@ -105,8 +104,7 @@ def read_saved_map(path: Path) -> MapState:
 
 def resumed(state: MapState, config: Config, matcher: Matcher, begin: Pose2 | None = None) -> Resume:
     """A saved map to go on from, with the field to search it by; `begin` is the first pose in it, if that is known."""
-    field = LikelihoodField.from_grid(state.grid, config.likelihood_field.sigma, config.likelihood_field.margin)
-    return Resume(state, field, matcher, config.localiser.relocaliser, begin)
+    return Resume(state, config.make_field(state.grid), matcher, config.localiser.relocaliser, begin)
 
 
 def load_state(request: RunRequest) -> tuple[MapState | None, tuple[RunWarning, ...]]:

@@ -14,7 +14,6 @@ from hsloc.errors import ConfigError, LogError
 from hsloc.interrupts import interrupts_held_back
 from hsloc.kernels.cache import compilation_reported
 from hsloc.log import LogSummary, Losses, open_log
-from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.matching.window import Window
 from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
     from hsloc.localisation.map_scale import MapScale
     from hsloc.localisation.states import StateRows
     from hsloc.log import Log
+    from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
     from hsloc.model.estimate import ScanDiagnostics
     from hsloc.model.events import Event
@@ -201,9 +201,7 @@ def _run_with(
             raise ConfigError("loops are stated for a map that is built; add --mode slam, or leave them out")
         start, of_start = find_start(request, log, require_map(grid))
         warnings = (*warnings, *of_start)
-        likelihood = LikelihoodField.from_grid(
-            require_map(grid), request.config.likelihood_field.sigma, request.config.likelihood_field.margin
-        )
+        likelihood = request.config.make_field(require_map(grid))
         localiser = _localiser(request, require_map(grid), likelihood, start)
         estimator: Estimator = localiser
     else:

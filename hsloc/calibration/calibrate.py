@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from hsloc.calibration.estimator import Estimate
     from hsloc.config import Config
     from hsloc.log import Log, LogSummary
+    from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.model.events import Event
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.request import RunRequest
@@ -139,7 +140,8 @@ def _given_map(request: RunRequest, log: Log, nominal: Pose2) -> tuple[GivenMap 
         return None, ()
     grid, of_grid = load_grid(request.map_path)
     start, of_start = find_start(request, log, grid)
-    return GivenMap(grid, None if start is None else start @ nominal), (*of_grid, *of_start)
+    likelihood = request.config.make_field(grid)
+    return GivenMap(grid, likelihood, None if start is None else start @ nominal), (*of_grid, *of_start)
 
 
 def _is_settled(before: Estimate, now: Estimate) -> bool:
@@ -151,9 +153,10 @@ def _is_settled(before: Estimate, now: Estimate) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GivenMap:
-    """A map in which the laser is localised, and where the laser is at the first event; None if that is unknown."""
+    """A map in which the laser is localised, its field, and where the laser is at the first event; None if unknown."""
 
     grid: OccupancyGrid
+    likelihood: LikelihoodField
     T_map_laser: Pose2 | None = None
 
 
@@ -221,9 +224,13 @@ def _mapped(scans: Iterable[PairedScan], config: Config) -> Poses:
 
 def _localised(scans: Iterable[PairedScan], config: Config, given: GivenMap) -> Poses:
     """The scans that were matched with the map, predicted from scan to scan."""
-    field = config.make_field(given.grid)
     localiser = Localiser.from_parameters(
-        given.grid, field, config.make_matcher(), config.localiser, np.random.default_rng(0), given.T_map_laser
+        given.grid,
+        given.likelihood,
+        config.make_matcher(),
+        config.localiser,
+        np.random.default_rng(0),
+        given.T_map_laser,
     )
     moving = with_laser_odometry(
         (event.scan for event in scans), config.graph_mapper.front_end, np.random.default_rng(1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
+from abc import ABC, abstractmethod
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any, Protocol, cast
 from urllib.parse import quote
@@ -40,7 +41,42 @@ _RUN = 1024
 """Messages in one run."""
 
 
-class BagContainer:
+class _Bag(ABC):
+    """What both kinds have in common; `shown` is the name for messages to people, where the file is a copy."""
+
+    def __init__(self, shown: Path) -> None:
+        self.path = shown
+        self.channels: dict[int, Channel] = {}
+        self.statistics: dict[int, TopicStatistics] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.losses_at_opening = Losses()
+        self.warnings: list[RunWarning] = []
+
+    @abstractmethod
+    def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
+        """As `Container.messages`."""
+
+    def runs(self, wanted: Collection[int], losses: Losses) -> Iterator[list[RawMessage]]:
+        """As `Container.runs`."""
+        return in_runs(self.messages(wanted, losses), _RUN)
+
+    def verify(self) -> Losses:
+        """Read everything and count what is damaged."""
+        losses = self.losses_at_opening.copy()
+        for _ in self.messages(self.channels, losses):
+            pass
+        return losses
+
+    def _require_some(self, damage: Losses) -> None:
+        """Raise LogFormatError where counting met damage before the first message.
+
+        What is damaged further on is counted when it is read for its own sake.
+        """
+        if damage.reasons and not self.statistics:
+            raise LogFormatError(damage.reasons[0])
+
+
+class BagContainer(_Bag):
     """A ROS 1 bag, whatever its name. `shown` is the name for messages to people, where the file is a copy of another.
 
     The decoders get the definitions that the bag carries, as with MCAP; rosbags is asked for raw messages alone.
@@ -51,21 +87,12 @@ class BagContainer:
     profile = "ros1"
 
     def __init__(self, path: Path, shown: Path | None = None) -> None:
-        self.path = shown or path
+        super().__init__(shown or path)
         self._file = path
-        self.channels: dict[int, Channel] = {}
-        self.statistics: dict[int, TopicStatistics] = {}
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.losses_at_opening = Losses()
-        self.warnings: list[RunWarning] = []
         with self._guarded(), self._reader() as reader:
             for number, connection in enumerate(reader.connections):
                 self.channels[number] = self._channel(number, connection)
             self._count(reader)
-
-    def runs(self, wanted: Collection[int], losses: Losses) -> Iterator[list[RawMessage]]:
-        """As `Container.runs`."""
-        return in_runs(self.messages(wanted, losses), _RUN)
 
     def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
         """As `Container.messages`; rosbags yields in the order of time."""
@@ -79,13 +106,6 @@ class BagContainer:
                 number = numbers[self._key(connection)]
                 if number in chosen:  # A damaged bag yields messages of connections that were not asked for.
                     yield max(log_time, 0), position, number, data
-
-    def verify(self) -> Losses:
-        """Read everything and count what is damaged."""
-        losses = self.losses_at_opening.copy()
-        for _ in self.messages(self.channels, losses):
-            pass
-        return losses
 
     def _reader(self) -> _Reader:
         from rosbags.rosbag1 import Reader
@@ -113,9 +133,7 @@ class BagContainer:
             for connection, log_time, _ in reader.messages(reader.connections):
                 number = numbers[self._key(connection)]
                 self.statistics.setdefault(number, TopicStatistics()).add(log_time, log_time, 1, 0)
-        # What is damaged further on is counted when it is read for its own sake.
-        if damage.reasons and not self.statistics:
-            raise LogFormatError(damage.reasons[0])
+        self._require_some(damage)
         counted, promised = sum(item.count for item in self.statistics.values()), reader.message_count
         if not damage.reasons and counted < promised:
             self.losses_at_opening.truncated_files += 1
@@ -125,7 +143,7 @@ class BagContainer:
         return guarded(f"{self.path}: cannot be read as a {self.format}", "`rosbag reindex`", losses)
 
 
-class Db3Container:
+class Db3Container(_Bag):
     """A `.db3` file. `shown` is the name for messages to people, where the file is a copy of another.
 
     Raises LogFormatError where it is no bag, whatever SQLite raises.
@@ -135,24 +153,15 @@ class Db3Container:
     profile = "ros2"
 
     def __init__(self, path: Path, shown: Path | None = None) -> None:
-        self.path = shown or path
+        super().__init__(shown or path)
         self._scratch = Scratch()
         self._file = self._with_its_log(path)
         self._is_copy = self._file != path
-        self.channels: dict[int, Channel] = {}
-        self.statistics: dict[int, TopicStatistics] = {}
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.losses_at_opening = Losses()
-        self.warnings: list[RunWarning] = []
         self._in_order_of_time = True
         self._lowest, self._highest = -(1 << 63), (1 << 63) - 1
         with self._guarded(), self._connected() as connection:
             self._read_topics(connection)
             self._count(connection)
-
-    def runs(self, wanted: Collection[int], losses: Losses) -> Iterator[list[RawMessage]]:
-        """As `Container.runs`."""
-        return in_runs(self.messages(wanted, losses), _RUN)
 
     def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
         """As `Container.messages`."""
@@ -174,13 +183,6 @@ class Db3Container:
                     log_time = max(log_time, last)
                 last = log_time
                 yield max(log_time, 0), number, channel, data
-
-    def verify(self) -> Losses:
-        """Read everything and count what is damaged."""
-        losses = self.losses_at_opening.copy()
-        for _ in self.messages(self.channels, losses):
-            pass
-        return losses
 
     def _with_its_log(self, path: Path) -> Path:
         """The file to open: the path itself, or a copy of it together with its write-ahead log or rollback journal."""
@@ -244,9 +246,7 @@ class Db3Container:
                     log_time = last.get(number, low)
                 last[number] = log_time
                 statistics.add(max(log_time, 0), max(log_time, 0), 1, 0)
-        # What is damaged further on is counted when it is read for its own sake.
-        if damage.reasons and not self.statistics:
-            raise LogFormatError(damage.reasons[0])
+        self._require_some(damage)
 
     def _guarded(self, losses: Losses | None = None) -> AbstractContextManager[None]:
         return guarded(

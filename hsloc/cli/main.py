@@ -130,8 +130,6 @@ def _joined(words: Sequence[str]) -> list[str]:
 
 def build_parser() -> Parser:
     """The parser of all commands."""
-    from hsloc.cli.main import Parser
-
     parser = Parser(
         prog="hsloc",
         description="Where was the robot? Offline localisation and mapping for recorded 2D-lidar logs.",

@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import EvaluationError
 
@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate each estimate and print one table, or JSON."""
-    from hsloc.evaluation.metrics import format_json
+    from hsloc.evaluation.metrics import compare, format_json
     from hsloc.evaluation.relations import read_relations
     from hsloc.evaluation.rpe import Delta
     from hsloc.replay.references import read_reference
@@ -98,17 +98,13 @@ def run(arguments: argparse.Namespace) -> int:
     relations = None if arguments.relations is None else read_relations(arguments.relations)
     warnings: list[RunWarning] = []
     reference = None if alone or own else read_reference(files[0], (), warnings)
-    results = {
-        path: _evaluate(
-            path,
-            read_reference(_inside(path, "trajectory.tum"), (), warnings),
-            read_reference(_inside(path, "reference.tum"), (), warnings) if own else reference,
-            relations,
-            delta,
-            arguments,
-        )
-        for path in files[0 if alone or own else 1 :]
-    }
+    read: dict[str, tuple[Trajectory, Trajectory | None]] = {}
+    results: dict[str, Result] = {}
+    for path in files[0 if alone or own else 1 :]:
+        estimate = read_reference(_inside(path, "trajectory.tum"), (), warnings)
+        truth = read_reference(_inside(path, "reference.tum"), (), warnings) if own else reference
+        read[path] = estimate, truth
+        results[path] = _evaluate(path, estimate, truth, relations, delta, arguments)
     for warning in dict.fromkeys(warnings):
         print(f"hsloc: warning: {warning}", file=sys.stderr)
     wanted = [name for name in ("save_results", "plot", "save_plot") if getattr(arguments, name)]
@@ -117,7 +113,11 @@ def run(arguments: argparse.Namespace) -> int:
             option = f"--{wanted[0].replace('_', '-')}"
             print(f"hsloc eval: error: {option} needs a reference to take errors from", file=sys.stderr)
             return 2
-        comparisons = {path: _compared(arguments, path, None if own else files[0]) for path in results}
+        comparisons = {
+            path: compare(estimate, truth, **_pairing(arguments))
+            for path, (estimate, truth) in read.items()
+            if truth is not None
+        }
         _draw(arguments, comparisons)
         if arguments.save_results is not None:
             _save(arguments, comparisons, None if own else files[0], delta)
@@ -162,33 +162,20 @@ def _evaluate(
     try:
         evaluation = None
         if reference is not None:
-            evaluation = evaluate(
-                estimate,
-                reference,
-                alignment=arguments.alignment,
-                max_difference_s=arguments.t_max_diff,
-                association=arguments.association,
-                offset_s=arguments.t_offset,
-                deltas=(delta,),
-            )
+            evaluation = evaluate(estimate, reference, **_pairing(arguments), deltas=(delta,))
         return evaluation, None if relations is None else evaluate_relations(estimate, relations)
     except EvaluationError as error:
         raise EvaluationError(f"{path}: {error}") from error
 
 
-def _compared(arguments: argparse.Namespace, path: str, reference: str | None) -> Comparison:
-    """The poses of an estimate, paired with the reference; None: with that in its own folder of results."""
-    from hsloc.evaluation.metrics import compare
-    from hsloc.replay.references import read_reference
-
-    return compare(
-        read_reference(_inside(path, "trajectory.tum")),
-        read_reference(_inside(path, "reference.tum") if reference is None else reference),
-        alignment=arguments.alignment,
-        max_difference_s=arguments.t_max_diff,
-        association=arguments.association,
-        offset_s=arguments.t_offset,
-    )
+def _pairing(arguments: argparse.Namespace) -> dict[str, Any]:
+    """How poses are paired with the reference and moved onto it: arguments of `evaluate` and `compare`."""
+    return {
+        "alignment": arguments.alignment,
+        "max_difference_s": arguments.t_max_diff,
+        "association": arguments.association,
+        "offset_s": arguments.t_offset,
+    }
 
 
 def _draw(arguments: argparse.Namespace, comparisons: Mapping[str, Comparison]) -> None:

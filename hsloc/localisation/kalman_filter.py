@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hsloc.model.pose2 import Pose2, compose_poses, wrap_angle, wrap_angles
+from hsloc.model.pose2 import Pose2, compose_poses, rotated, wrap_angle, wrap_angles
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -57,10 +57,8 @@ def transition(pose: Pose2, motion: Pose2) -> F64:
 
 def predict_covariance(covariance: F64, pose: Pose2, motion: Pose2, motion_covariance: F64) -> F64:
     """Covariance of `pose @ motion` in the map frame: `F P F^T + V M V^T`, all (3, 3)."""
-    c, s = cos(pose.theta), sin(pose.theta)
     f = transition(pose, motion)
-    v = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
-    result: F64 = f @ covariance @ f.T + v @ motion_covariance @ v.T
+    result: F64 = f @ covariance @ f.T + rotated(motion_covariance, pose.theta)
     return result
 
 
@@ -184,8 +182,7 @@ def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> Smoo
             continue
         motion = here.T_odom_base.between(following.T_odom_base)
         noise = motion_model.covariance(motion)
-        turned = predict_covariance(np.zeros((3, 3)), here.T_map_base, motion, noise)
-        variances[k + 1] = following.noise_scale * np.diag(turned)
+        variances[k + 1] = following.noise_scale * np.diag(rotated(noise, here.T_map_base.theta))
         noise = max(following.noise_scale, 1.0) * noise
         predicted = here.T_map_base @ motion
         variance = predict_covariance(here.covariance, here.T_map_base, motion, noise) + _NO_NOISE

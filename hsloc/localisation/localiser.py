@@ -26,7 +26,7 @@ from hsloc.matching.local_refinement import refine
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Evidence, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
-from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.model.pose2 import IDENTITY, Pose2, rotated
 from hsloc.parameters import Angle, Count, NonNegative, OneOf, Parameters, Positive, Ratio
 
 if TYPE_CHECKING:
@@ -223,8 +223,7 @@ class Localiser:
         if not self._match_gate.is_fresh and not self._motion_gate.is_open(motion):
             return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
         propagated = predict_covariance(self._covariance, self._T_map_match, motion, np.zeros((3, 3)))
-        noise = self._motion_model.covariance(motion)
-        noise = predict_covariance(np.zeros((3, 3)), self._T_map_match, motion, noise)
+        noise = rotated(self._motion_model.covariance(motion), self._T_map_match.theta)
         covariance = propagated + max(self._innovations.noise_scale, 1.0) * noise
         points = paired.points_base()
         for each in (self._monitor, self._map_scale):

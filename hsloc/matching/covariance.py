@@ -6,13 +6,13 @@ a measurement: along a corridor it would shrink with every scan. The information
 
 from __future__ import annotations
 
-from math import cos, sin
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.kernels.beams import wall_information, wall_normals, wall_rows
 from hsloc.kernels.fitness import point_scores
+from hsloc.model.pose2 import rotated
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,9 +47,7 @@ def match_covariance(information: F64, n_points: int, fitness: float, field: Lik
     covariance: F64 = np.linalg.inv(slope / (variance * CORRELATED) + prior)
     angle = field.T_map_field.theta
     if angle != 0.0:
-        c, s = np.cos(angle), np.sin(angle)
-        rotation = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
-        covariance = rotation @ covariance @ rotation.T
+        covariance = rotated(covariance, angle)
     return 0.5 * (covariance + covariance.T)
 
 
@@ -90,7 +88,5 @@ def match_information(
     )
     angle = field.T_map_field.theta
     if angle != 0.0:
-        c, s = cos(angle), sin(angle)
-        rotation = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
-        information = rotation @ information @ rotation.T
+        information = rotated(information, angle)
     return information

@@ -104,6 +104,14 @@ class Pose2:
 IDENTITY = Pose2()
 
 
+def rotated(covariance: Array, angle: float) -> Array:
+    """A covariance or information (3, 3) of (x, y, theta), seen from a frame in which its own is turned by `angle`."""
+    c, s = cos(angle), sin(angle)
+    turn = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
+    result: Array = turn @ covariance @ turn.T
+    return result
+
+
 def relative_poses(first: Array, second: Array) -> Array:
     """`first^-1 @ second` row by row, for arrays of poses of shape (n, 3); theta is wrapped."""
     c, s = np.cos(first[:, 2]), np.sin(first[:, 2])

@@ -21,7 +21,7 @@ from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.matching.hide import Hide
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Status
-from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle
+from hsloc.model.pose2 import IDENTITY, Pose2, rotated, wrap_angle
 from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive, Ratio
 from hsloc.slam.calibration import FLOOR, odometry_chi, odometry_scale
 from hsloc.slam.keyscans import SURPRISE, MovingScan, RecentScans, ScanRegistration, fused_covariance, moving_scans
@@ -266,8 +266,7 @@ class FrontEnd:
     def _matched(self, points: F64, scans: tuple[MovingScan, ...], motion: Pose2, covariance: F64) -> LocalMatch:
         key = self._T_map_key
         predicted = key @ motion
-        turn = _turn(key.theta)
-        in_map = turn @ covariance @ turn.T
+        in_map = rotated(covariance, key.theta)
         found, evaluations = self._search(points, scans, predicted, in_map)
         fitness = self._maps[0][0].field.fitness(points, found.pose)
         if reason := found.refusal():
@@ -278,7 +277,7 @@ class FrontEnd:
         # What is measured is the pose in the local map; the step to it also holds what the refused steps may hide.
         after_refusal = self._match_gate.refusals > 0
         self._match_gate.accept(fitness)
-        fused = turn.T @ fused_covariance(found, in_map) @ turn + FLOOR
+        fused = rotated(fused_covariance(found, in_map), -key.theta) + FLOOR
         self._weigh_odometry(motion, key.between(found.pose))
         return LocalMatch(
             found.pose,
@@ -393,8 +392,3 @@ class FrontEnd:
                 local.add(moved, _KNOWN)
             self._recent.add(found.pose, scans)
         return replace(found, scans=scans)
-
-
-def _turn(theta: float) -> F64:
-    c, s = np.cos(theta), np.sin(theta)
-    return np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))

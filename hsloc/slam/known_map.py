@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.model.pose2 import Pose2
+from hsloc.model.pose2 import Pose2, rotated
 from hsloc.slam.keyscans import KeyScan, MovingScan, register_onto
 
 if TYPE_CHECKING:
@@ -85,9 +85,7 @@ class KnownMap:
     def anchor(self, row: int, pose: Pose2, covariance: F64) -> Anchor:
         """A scan at `pose`, with `covariance` (3, 3) in the map, as seen from a keyscan."""
         at = self.pose(row)
-        c, s = np.cos(at.theta), np.sin(at.theta)
-        turn = np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)))
-        return Anchor(row, at.between(pose), turn @ covariance @ turn.T)
+        return Anchor(row, at.between(pose), rotated(covariance, -at.theta))
 
     def posed(self, row: int) -> tuple[F64, MovingScan]:
         """A keyscan and its solved pose (3,), for a scan to be registered onto."""

@@ -182,13 +182,14 @@ class CloudFeed:
 
 
 class OdometryFeed:
-    """nav_msgs/Odometry to Odometry, or to Truth."""
+    """Messages with a pose to Odometry, or to Truth; the covariance of all but nav_msgs/Odometry is unknown."""
 
-    typename = definitions.ODOMETRY
-
-    def __init__(self, clock: TopicClock, losses: Losses, is_truth: bool, T_child_base: Pose2 | None = None) -> None:
+    def __init__(
+        self, clock: TopicClock, losses: Losses, typename: str, is_truth: bool, T_child_base: Pose2 | None = None
+    ) -> None:
         """`T_child_base` leads from the frame that the messages speak of to the base, where these differ."""
         self.topic = clock.topic
+        self.typename = typename
         self.clocks = (clock,)
         self._clock = clock
         self._losses = losses
@@ -229,17 +230,6 @@ class OdometryFeed:
             return Arrivals(self._clock, places, log_times, stamps, list(map(Truth, stamps, poses)))
         events = list(map(Odometry, stamps, poses, columns.covariances))
         return Arrivals(self._clock, places, log_times, stamps, events)
-
-
-class PoseFeed(OdometryFeed):
-    """geometry_msgs/PoseStamped and PoseWithCovarianceStamped to Truth, or to Odometry, whose covariance is unknown."""
-
-    def __init__(
-        self, clock: TopicClock, losses: Losses, typename: str, is_truth: bool, T_child_base: Pose2 | None = None
-    ) -> None:
-        """As `OdometryFeed`."""
-        super().__init__(clock, losses, is_truth, T_child_base)
-        self.typename = typename
 
 
 class MotionFeed:

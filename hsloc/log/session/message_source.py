@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from hsloc.log.container import in_runs
 from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import Undecodable, canonical_type, column_decoder_for, is_decodable
-from hsloc.log.session.event_builders import CloudFeed, MotionFeed, OdometryFeed, PoseFeed, ScanFeed, TransformFeed
+from hsloc.log.session.event_builders import CloudFeed, MotionFeed, OdometryFeed, ScanFeed, TransformFeed
 from hsloc.log.session.log_session import FirstMessage, LogSession
 from hsloc.log.session.ordering import KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH, Arrivals, Reorder, TopicClock, one_by_one
 from hsloc.log.session.topic_selection import TF
@@ -105,7 +105,7 @@ class RosSource:
             clock = self._clock(choice.odom, KIND_ODOMETRY, survey.odom, losses)
             kind = survey.odom_kind
             if kind.motion is None:
-                feeds.append(_pose_feed(clock, losses, kind.typename, False, survey.T_child_base))
+                feeds.append(OdometryFeed(clock, losses, kind.typename, False, survey.T_child_base))
             else:
                 motion = kind.motion(survey.options, survey.mountings.of_frame)
                 feeds.append(MotionFeed(clock, losses, kind, motion, survey.T_child_base))
@@ -121,7 +121,7 @@ class RosSource:
             tf_truth = self._clock(TF, KIND_TRUTH, None, losses)
         elif choice.truth is not None:
             clock = self._clock(choice.truth, KIND_TRUTH, survey.truth, losses)
-            feeds.append(_pose_feed(clock, losses, survey.truth_kind.typename, True, survey.T_truth_base))
+            feeds.append(OdometryFeed(clock, losses, survey.truth_kind.typename, True, survey.T_truth_base))
         if tf_odometry is not None or tf_truth is not None:
             frames = survey.tf_frames or (None, survey.mountings.base_frame or BASE_FRAMES[0])
             feeds.append(TransformFeed(TF, frames, tf_odometry, tf_truth, losses, survey.T_child_base))
@@ -216,14 +216,6 @@ def _by_route(batch: list[RawMessage], routes: Mapping[int, Route]) -> Iterable[
     for place, message in enumerate(batch):
         found[routes[message[2]]].append(place)
     return found.items()
-
-
-def _pose_feed(
-    clock: TopicClock, losses: Losses, typename: str, is_truth: bool, T_child_base: Pose2 | None
-) -> OdometryFeed:
-    if typename == definitions.ODOMETRY:
-        return OdometryFeed(clock, losses, is_truth, T_child_base)
-    return PoseFeed(clock, losses, typename, is_truth, T_child_base)
 
 
 def _added(parts: Iterable[Losses]) -> Losses:

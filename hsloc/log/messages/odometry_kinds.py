@@ -253,6 +253,6 @@ POSE_TYPES = tuple(kind.typename for kind in ODOMETRY_KINDS if kind.motion is No
 """Types that hold poses: these may be the truth, too."""
 
 
-def kind_among(typenames: Collection[str]) -> OdometryKind | None:
-    """The kind that is read of messages of these types."""
-    return next((kind for kind in ODOMETRY_KINDS if kind.typename in typenames), None)
+def kind_among(typenames: Collection[str]) -> OdometryKind:
+    """The kind that is read of messages of these types; that of nav_msgs/Odometry where none is."""
+    return next((kind for kind in ODOMETRY_KINDS if kind.typename in typenames), ODOMETRY_KINDS[0])

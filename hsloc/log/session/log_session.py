@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hsloc.log.messages import definitions, foxglove
 from hsloc.log.messages.decoders import Undecodable, canonical_type, decoder_for, is_decodable
-from hsloc.log.messages.odometry_kinds import ODOMETRY_KINDS, POSE_TYPES, kind_among
+from hsloc.log.messages.odometry_kinds import POSE_TYPES, kind_among
 from hsloc.log.session.extrinsics import Extrinsics, calibrated_mountings
 from hsloc.log.session.scan_geometry import ScanFixes, ScanSurvey, survey
 from hsloc.log.session.split_recordings import check_parts
@@ -163,8 +163,7 @@ class LogSession:
 
     def _kind(self, topic: str | None) -> OdometryKind:
         """The kind of odometry that a topic holds; that of poses where it holds none."""
-        types = {canonical_type(channel.typename) for _, channel in self.channels(topic)} if topic else set()
-        return kind_among(types) or ODOMETRY_KINDS[0]
+        return kind_among({canonical_type(channel.typename) for _, channel in self.channels(topic)} if topic else ())
 
     def _survey(self, topic: str) -> ScanSurvey:
         """A look at the first scans of a topic, with what the user overrides."""

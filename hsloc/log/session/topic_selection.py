@@ -159,7 +159,7 @@ def _odometry_candidates(channels: Sequence[Channel], options: ReadOptions) -> t
 
 def _kind_on(channels: Sequence[Channel], topic: str) -> OdometryKind:
     """The kind that is read of a topic, one of the candidates."""
-    return kind_among({canonical_type(c.typename) for c in channels if c.topic == topic}) or ODOMETRY_KINDS[0]
+    return kind_among({canonical_type(c.typename) for c in channels if c.topic == topic})
 
 
 def _pick(
@@ -220,9 +220,9 @@ def _not_there(
         trouble = f"{named} is {other.typename or 'of no type'} ({other.message_encoding}), not {typename}"
     else:
         trouble = f"no topic {named}"
-    kind = None if other is None else kind_among({canonical_type(other.typename)})
-    if kind is not None and kind.missing(options):
-        return f"{where}: odometry is made of {named} with {kind.missing(options)}"
+    missing = "" if other is None else kind_among({canonical_type(other.typename)}).missing(options)
+    if missing:
+        return f"{where}: odometry is made of {named} with {missing}"
     remedy = f"{flag} may be {', '.join(candidates[:_LISTED])}" if candidates else f"it holds {listed(channels)}"
     return f"{where}: {trouble}; {remedy}"
 

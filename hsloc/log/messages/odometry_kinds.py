@@ -6,6 +6,7 @@ Of a topic with several types the first of the table counts.
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from math import isfinite
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -134,6 +135,7 @@ class WheelMotion(Motion):
         return 0.5 * self._radius * (left + right), 0.0, self._radius * (right - left) / self._track
 
 
+@lru_cache(maxsize=64)
 def wheels_of(names: tuple[str, ...]) -> tuple[list[int], list[int]] | None:
     """The joints of the left and of the right wheels, by their names; None where one side has none."""
     wheels = [k for k, name in enumerate(names) if "wheel" in name.lower() and "caster" not in name.lower()]

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -54,14 +53,14 @@ WIDE = 2.1
 SETTINGS_THAT_STAY = ("backend", "backend_fallback", "interactive", "toolbar", "webagg", "tk.", "savefig.directory")
 
 Box = tuple[float, float, float, float]
-FORMATS = (".png", ".svg", ".pdf")
+_PLOT: dict[str, Any] = {"figsize": (13.0, 6.5), "layout": "constrained"}
 _INKS = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE)
-_METADATA: dict[str, dict[str, str | None]] = {
+FORMATS: dict[str, dict[str, str | None]] = {
     ".png": {"Software": None},
     ".svg": {"Date": None},
     ".pdf": {"CreationDate": None},
 }
-"""Without the time, so that the same errors give the same bytes."""
+"""Kinds of picture, without the time, so that the same errors give the same bytes."""
 
 
 def draw_report(path: str | Path, parts: ReportParts) -> None:
@@ -191,7 +190,7 @@ def draw_comparisons(comparisons: Mapping[str, Comparison], figure: Figure | Non
 
     A single estimate is coloured by its error, as evo does.
     """
-    figure = Figure(figsize=(13.0, 6.5), layout="constrained") if figure is None else figure
+    figure = Figure(**_PLOT) if figure is None else figure
     grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
     paths, translation = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     rotation = figure.add_subplot(grid[1, 1], sharex=translation)
@@ -236,21 +235,21 @@ def _by_error(figure: Figure, axes: Axes, path: NDArray[np.float64], error: NDAr
 
 def save_plot(path: Path, comparisons: Mapping[str, Comparison]) -> None:
     """Write the figure as PNG, SVG or PDF, by the name's ending. Raises OutputError."""
-    if path.suffix.lower() not in FORMATS:
+    kind = path.suffix.lower()
+    if kind not in FORMATS:
         raise OutputError(f"{path}: unknown kind of picture; name a file that ends in {', '.join(FORMATS)}")
     try:
-        with rc_context({"svg.hashsalt": "hsloc"}):  # else ids of an SVG differ from one time to the next
-            draw_comparisons(comparisons).savefig(path, dpi=140, metadata=_METADATA[path.suffix.lower()])
+        with matplotlib.rc_context({"svg.hashsalt": "hsloc"}):  # else ids of an SVG differ from one time to the next
+            draw_comparisons(comparisons).savefig(path, dpi=140, metadata=FORMATS[kind])
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}; choose another file") from error
 
 
 def show_plot(comparisons: Mapping[str, Comparison]) -> None:
     """Open the figure in a window, and wait until it is closed. Raises OutputError where there is none to open."""
-    import matplotlib
     from matplotlib import pyplot
 
     if matplotlib.get_backend().lower() == "agg":
         raise OutputError("--plot: there is no display, or no toolkit for windows (tkinter); use --save-plot FILE.png")
-    draw_comparisons(comparisons, pyplot.figure(figsize=(13.0, 6.5), layout="constrained"))
+    draw_comparisons(comparisons, pyplot.figure(**_PLOT))
     pyplot.show()

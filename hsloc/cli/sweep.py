@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hsloc.cli.arguments import add_no_progress, add_options, values
+from hsloc.cli.arguments import add_no_progress, add_options, service_client, values
 from hsloc.cli.progress import ProgressLine
 from hsloc.options import BY_NAME, MATCHER_ALIASES
 
@@ -130,8 +129,12 @@ def _plan(arguments: argparse.Namespace) -> list[SweepRun]:
     logs: list[Path | RemoteLog] = []
     for place in arguments.log:
         logs += remote_logs(place.url) if isinstance(place, UrlFolder) else [place]
-    common = {name: value for name, value in values(arguments).items() if not BY_NAME[name].varied and name != "set"}
-    return plan(logs, configs(arguments), arguments.seeds, **common)
+    return plan(logs, configs(arguments), arguments.seeds, **_common(arguments))
+
+
+def _common(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Options that are the same in all runs."""
+    return {name: value for name, value in values(arguments).items() if not BY_NAME[name].varied and name != "set"}
 
 
 def _sweep(arguments: argparse.Namespace, runs: list[SweepRun]) -> list[Outcome]:
@@ -154,12 +157,11 @@ def _sweep(arguments: argparse.Namespace, runs: list[SweepRun]) -> list[Outcome]
 def _sweep_by_service(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """Upload the logs, have a service do the runs, and wait for the table."""
     from hsloc.cli.submit import request_of
-    from hsloc.client import Client
     from hsloc.config import differences, nested, preset
     from hsloc.errors import HslocError
     from hsloc.sweep.runs import DONE, FAILED
 
-    client = Client(arguments.service, os.environ.get("HSLOC_TOKEN"))
+    client = service_client(arguments.service)
     varied_options = {
         label: {
             "preset": base,
@@ -179,8 +181,8 @@ def _sweep_by_service(arguments: argparse.Namespace) -> list[dict[str, Any]]:
                 line.show("upload", len(uploads) / (len(uploads) + 1), path.name)
             return uploads[path]
 
-        given = {name: value for name, value in values(arguments).items() if not BY_NAME[name].varied and name != "set"}
-        request = {"run": request_of(given, upload), "configs": varied_options, "seeds": list(arguments.seeds)}
+        run = request_of(_common(arguments), upload)
+        request = {"run": run, "configs": varied_options, "seeds": list(arguments.seeds)}
         sweep = client.submit_sweep([upload(path) for path in arguments.log], **request)
 
         def show(now: dict[str, Any]) -> None:

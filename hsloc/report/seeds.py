@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import dataclass
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hsloc.report.table import DASH, format_angle, format_length, format_share
+from hsloc.report.table import DASH, LENGTHS, format_angle, format_length, format_share
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,7 +21,7 @@ LEVEL = 0.95
 """Coverage of the intervals."""
 RESAMPLES = 4000
 """Of the bootstrap: the ends of an interval vary by about 1 % of its length with the seed of the resampling."""
-_LENGTHS = {"mm": 1e3, "cm": 1e2, "m": 1.0, "km": 1e-3}
+_LENGTHS = {unit: factor for _, factor, unit in LENGTHS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,15 +134,17 @@ def _spans(numbers: Sequence[int]) -> str:
 
 def seed_rows(groups: Sequence[SeedGroup]) -> list[tuple[str, ...]]:
     """A line for the verdicts, and one for each number of a figure: its name, then its spread in each group."""
-    verdicts = []
-    for group in groups:
-        words = [str((view["summary"] or {}).get("verdict", "")) for view in group.views]
-        verdicts.append(", ".join(f"{words.count(word)} {word}" for word in dict.fromkeys(words)))
+    verdicts = (counted([str((view["summary"] or {}).get("verdict", "")) for view in group.views]) for group in groups)
     figures = [[_figures(view) for view in group.views] for group in groups]
     names = dict.fromkeys(name for group in figures for each in group for name in each)
     return [("verdict", *verdicts)] + [
         (name, *(_cell([each[name] for each in group if name in each]) for group in figures)) for name in names
     ]
+
+
+def counted(words: Sequence[str]) -> str:
+    """`2 good, 1 check`: how often each word is there, in the order of the first ones."""
+    return ", ".join(f"{count} {word}" for word, count in Counter(words).items())
 
 
 def _figures(view: dict[str, Any]) -> dict[str, dict[str, Any]]:

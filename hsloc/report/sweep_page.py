@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from hsloc.report.html import page_text
-from hsloc.report.seeds import Spread, spread_text
+from hsloc.report.seeds import Spread, counted, spread_text
 from hsloc.report.table import DASH
 
 if TYPE_CHECKING:
@@ -129,8 +129,7 @@ def _known(rows: Sequence[Row], name: str) -> list[float]:
 
 def _overall(rows: Sequence[Row], logs: Sequence[str]) -> list[str]:
     """Counts of verdicts, and the mean over `logs` of the mean over seeds."""
-    words = [str(row["verdict"] or row["state"]) for row in rows]
-    found = [", ".join(f"{words.count(word)} {word}" for word in dict.fromkeys(words))]
+    found = [counted([str(row["verdict"] or row["state"]) for row in rows])]
     means = [Spread.of(_known([row for row in rows if row["log"] == log], "ape_m")).mean for log in logs]
     if means:
         mean = Spread(1, sum(means) / len(means), nan, nan, nan)

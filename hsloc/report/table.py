@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from hsloc.run_metrics import MapMetrics, RunMetrics, ScanCounts
 
 DASH = "–"
+LENGTHS = ((0.00095, 1e3, "mm"), (0.9995, 1e2, "cm"), (1e3, 1.0, "m"), (np.inf, 1e-3, "km"))
+"""Units of lengths: below which number of metres each is used, how many of it are a metre, its name."""
 STATUS_WORDS: dict[str, str] = {
     Status.MATCHED: "matched",
     Status.RELOCALISED: "relocalised",
@@ -67,7 +69,7 @@ def format_length(metres: float | None) -> str:
         return DASH
     if metres == 0.0:
         return "0 m"
-    for limit, factor, unit in ((0.00095, 1e3, "mm"), (0.9995, 1e2, "cm"), (1e3, 1.0, "m"), (np.inf, 1e-3, "km")):
+    for limit, factor, unit in LENGTHS:
         if abs(metres) < limit:
             return f"{_three_figures(metres * factor)} {unit}"
     return DASH

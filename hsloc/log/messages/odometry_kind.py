@@ -1,8 +1,7 @@
 """A kind of odometry: one type of message, how it is read, when it is chosen, and what it says of the motion.
 
 To read another type as odometry, write an `OdometryKind` in `odometry_kinds` and add it to the table there; its fields
-belong into `definitions.FIELDS`. Topic selection, warnings, decoders and events follow
-from the table.
+belong into `definitions.FIELDS`. Topic selection, warnings, decoders and events follow from the table.
 """
 
 from __future__ import annotations
@@ -57,15 +56,15 @@ class OdometryKind:
     """One type of message that odometry is read from.
 
     `from_object` makes a tuple with `stamp_ns`, `frame_id` and `child_frame_id` of a message object. `motion` makes
-    what sums up the messages; without one the messages are poses. `rank_of` says of a topic's name and the options
-    when it is read without being named. `says` is the warning's text where a log has nothing better, with the topic in
-    place of `{}`. `missing` names the option without which the kind cannot be read, or nothing. Without
+    what sums up the messages; without one the messages are poses. `rank_of` says of a topic's name when it is read
+    without being named. `says` is the warning's text where a log has nothing better, with the topic in place of `{}`.
+    `missing` names the option without which the kind cannot be read and is not ranked, or nothing. Without
     `has_position` the messages give the heading alone.
     """
 
     typename: str
     from_object: Callable[[Any], Any]
-    rank_of: Callable[[str, ReadOptions], Rank]
+    rank_of: Callable[[str], Rank]
     motion: Callable[[ReadOptions, Mounting3], Motion] | None = None
     says: str = ""
     missing: Callable[[ReadOptions], str] = lambda _: ""

@@ -66,7 +66,7 @@ class VelocityMotion(Motion):
         return half * (before[0] + now[0]), half * (before[1] + now[1]), half * (before[2] + now[2])
 
 
-def _velocity_rank(topic: str, _: ReadOptions) -> Rank:
+def _velocity_rank(topic: str) -> Rank:
     # What is commanded is not what was driven.
     return Rank.NEVER if "cmd" in topic.lower() else Rank.VELOCITY
 
@@ -75,7 +75,7 @@ def _velocity_kind(typename: str, *, has_stamp: bool = True) -> OdometryKind:
     return OdometryKind(
         typename,
         object_velocity,
-        _velocity_rank if has_stamp else lambda *_: Rank.NEVER,
+        _velocity_rank if has_stamp else lambda _: Rank.NEVER,
         lambda *_: VelocityMotion(),
         says="there is no odometry; it is made of the velocities on {}",
     )
@@ -155,7 +155,7 @@ _WHEEL_KINDS = (
     OdometryKind(
         definitions.JOINT_STATE,
         object_joints,
-        lambda _, options: Rank.NEVER if options.wheels is None else Rank.REQUESTED,
+        lambda _: Rank.REQUESTED,
         _wheel_motion,
         missing=lambda options: "--wheels RADIUS,TRACK" if options.wheels is None else "",
     ),
@@ -229,7 +229,7 @@ _IMU_KINDS = (
     OdometryKind(
         definitions.IMU,
         object_imu,
-        lambda *_: Rank.HEADING,
+        lambda _: Rank.HEADING,
         lambda _, mounting: ImuMotion(mounting),
         says="there is no odometry; rotations are predicted by {}, translations by the scans",
         has_position=False,
@@ -237,14 +237,14 @@ _IMU_KINDS = (
 )
 
 
-def _named_like_odometry(topic: str, _: ReadOptions) -> Rank:
+def _named_like_odometry(topic: str) -> Rank:
     # Poses may be of anything: they count if their name says so.
     parts = topic.lower().split("/")
     return Rank.POSE if "odom" in parts or "odometry" in parts else Rank.NEVER
 
 
 ODOMETRY_KINDS = (
-    OdometryKind(definitions.ODOMETRY, object_odometry, lambda *_: Rank.ODOMETRY),
+    OdometryKind(definitions.ODOMETRY, object_odometry, lambda _: Rank.ODOMETRY),
     OdometryKind(definitions.POSE_STAMPED, object_pose, _named_like_odometry),
     OdometryKind(definitions.POSE_WITH_COVARIANCE_STAMPED, object_pose, _named_like_odometry),
     *VELOCITY_KINDS,

@@ -150,7 +150,7 @@ def _odometry_candidates(channels: Sequence[Channel], options: ReadOptions) -> t
     found: dict[Rank, list[str]] = {}
     for kind in ODOMETRY_KINDS:
         for topic in () if kind.missing(options) else of_type(channels, kind.typename):
-            found.setdefault(kind.rank_of(topic, options), []).append(topic)
+            found.setdefault(kind.rank_of(topic), []).append(topic)
     if options.odom_topic is not None:
         return Rank.NEVER, [topic for _, topics in sorted(found.items()) for topic in topics]
     rank = min(found, default=Rank.NEVER)

@@ -137,6 +137,15 @@ class KeyScans:
     def __len__(self) -> int:
         return len(self.start) - 1
 
+    def prepared(self, index: int) -> KeyScan:
+        """One of them by itself; its arrays are views."""
+        hits = slice(self.start[index], self.start[index + 1])
+        beams = slice(self.table_start[index], self.table_start[index + 1])
+        return KeyScan(
+            self.points[hits], self.normals[hits], self.centroids[hits], self.hit_of_beam[beams], self.ranges[beams],
+            self.geometry[index],
+        )  # fmt: skip
+
     def scan(self, index: int) -> Scan:
         """The scan again, its hits where its beams ended; stamp, limits and corrections for motion are not kept."""
         x, y, theta, angle_min, increment = (float(value) for value in self.geometry[index])

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.model.pose2 import Pose2, rotated
-from hsloc.slam.keyscans import KeyScan, MovingScan, register_onto
+from hsloc.slam.keyscans import MovingScan, register_onto
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -89,19 +89,9 @@ class KnownMap:
 
     def posed(self, row: int) -> tuple[F64, MovingScan]:
         """A keyscan and its solved pose (3,), for a scan to be registered onto."""
-        return self._poses[row], self._prepared(row)
-
-    def _prepared(self, row: int) -> MovingScan:
-        found = self._moving.get(row)
-        if found is None:
-            s = self._scans
-            hits, beams = slice(s.start[row], s.start[row + 1]), slice(s.table_start[row], s.table_start[row + 1])
-            scan = KeyScan(
-                s.points[hits], s.normals[hits], s.centroids[hits], s.hit_of_beam[beams], s.ranges[beams],
-                s.geometry[row],
-            )  # fmt: skip
-            found = self._moving[row] = MovingScan.of(scan)
-        return found
+        if row not in self._moving:
+            self._moving[row] = MovingScan.of(self._scans.prepared(row))
+        return self._poses[row], self._moving[row]
 
     def explained(self, points: F64) -> float:
         """Share of points (n, 2) in the map (m) that lie where keyscans had hits; n at least 1."""

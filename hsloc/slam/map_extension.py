@@ -80,7 +80,7 @@ def _verified(both: MapSession, scan: int, parameters: GraphMapperParameters, rn
     """Accepted loops between the places around a keyscan and those of the old map; none if too few are."""
     first_place = both.first_place
     closer = LoopCloser(both.places, both.scans, parameters.loops, rng, first=first_place)
-    place = int(np.searchsorted(both.places.start, scan, side="right")) - 1
+    place = both.places.place_of(scan)
     tried = range(max(place - _AROUND, first_place), min(place + _AROUND + 1, len(both.places)))
     loops: list[Loop] = []
     connected = 0

@@ -212,7 +212,7 @@ def _between_places(
     i: int, j: int, T_i_j: Pose2, covariance: F64, poses: F64, places: Submaps, reason: str = "of the saved map"
 ) -> Loop:
     """What was measured between two keyscans as an accepted loop between the places that contain them."""
-    first, second = (int(np.searchsorted(places.start, k, side="right")) - 1 for k in (i, j))
+    first, second = places.place_of(i), places.place_of(j)
     a, b = (Pose2.from_array(poses[places.reference[place]]) for place in (first, second))
     T_first_second = a.between(Pose2.from_array(poses[i])) @ T_i_j @ Pose2.from_array(poses[j]).between(b)
     nan = float("nan")

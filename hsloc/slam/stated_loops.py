@@ -60,6 +60,6 @@ def stated_places(
                     f"{flag} {pair[0]:g},{pair[1]:g}: no scan of the map was taken about {time:g} s; the scans last "
                     f"from {seconds.min():.1f} to {seconds.max():.1f} s"
                 )
-        first, second = sorted(int(np.searchsorted(places.start, row, side="right")) - 1 for row in rows)
+        first, second = sorted(places.place_of(row) for row in rows)
         found.append((first, second))
     return found

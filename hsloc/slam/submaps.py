@@ -104,6 +104,10 @@ class Submaps:
             np.concatenate((first.piece, first.piece[-1] + 1 + second.piece)),
         )
 
+    def place_of(self, scan: int) -> int:
+        """The submap that holds a keyscan."""
+        return int(np.searchsorted(self.start, scan, side="right")) - 1
+
     def members(self, place: int, around: int) -> range:
         """Keyscans of a place and of `around` places before and after."""
         same = np.flatnonzero(self.piece[max(place - around, 0) : place + around + 1] == self.piece[place])

@@ -86,14 +86,6 @@ def _tar(source: Path, target: Path) -> None:
         archive.add(source, f"bag/{source.name}")
 
 
-def _gzip(source: Path, target: Path) -> None:
-    target.write_bytes(gzip.compress(source.read_bytes()))
-
-
-def _zstd(source: Path, target: Path) -> None:
-    target.write_bytes(zstandard.compress(source.read_bytes()))
-
-
 def _with(*compress: Callable[[bytes], bytes]) -> Callable[[Path, Path], None]:
     def pack(source: Path, target: Path) -> None:
         data = source.read_bytes()
@@ -102,6 +94,9 @@ def _with(*compress: Callable[[bytes], bytes]) -> Callable[[Path, Path], None]:
         target.write_bytes(data)
 
     return pack
+
+
+_gzip, _zstd = _with(gzip.compress), _with(zstandard.compress)
 
 
 @pytest.mark.parametrize(

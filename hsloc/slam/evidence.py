@@ -101,12 +101,14 @@ class Recorded:
 
     def spanned(self, loops: int = 1) -> Bools:
         """Steps (n,) between the two ends of this number of accepted loops: a wrong step would have kept them open."""
-        change = np.zeros(len(self.poses) + 1, dtype=np.int64)
-        if len(self.loops):
-            low, high = self.loops.min(axis=1), self.loops.max(axis=1)
-            np.add.at(change, low + 1, 1)
-            np.add.at(change, high + 1, -1)
-        return np.asarray(np.cumsum(change)[: len(self.poses)] >= loops)
+        return np.asarray(self.summed_across(self.loops, np.ones(len(self.loops))) >= loops)
+
+    def summed_across(self, pairs: I64, weights: F64) -> F64:
+        """For each step (n, ...) the sum of the `weights` (m, ...) of the pairs (m, 2) of keyscans around it."""
+        change = np.zeros((len(self.poses) + 1, *weights.shape[1:]))
+        np.add.at(change, pairs.min(axis=1) + 1, weights)
+        np.add.at(change, pairs.max(axis=1) + 1, -weights)
+        return np.asarray(np.cumsum(change, axis=0)[: len(self.poses)], dtype=np.float64)
 
 
 _SECOND_VISIT_M = 12.0
@@ -149,10 +151,11 @@ _MOST_NAMED = 20
 
 def weigh(recorded: Recorded) -> Evidence:
     """The verdict on a map of at least one keyscan."""
+    bridged = _bridged(recorded)
     found = [
-        _open_joints(recorded),
+        _open_joints(recorded, bridged),
         _second_visits(recorded),
-        _against_odometry(recorded),
+        _against_odometry(recorded, bridged),
         _slips(recorded),
         _unobserved(recorded),
         _torn_loops(recorded),
@@ -167,10 +170,9 @@ def nothing_seen() -> Evidence:
     return Evidence.of([Reason("blind", "no scan had enough returns: there is no map", "failed")])
 
 
-def _open_joints(r: Recorded) -> Reason | None:
+def _open_joints(r: Recorded, bridged: Bools) -> Reason | None:
     """Runs of steps that only odometry holds: one loop over several of them shares out their errors as it likes."""
     wrong = []
-    bridged = _bridged(r)
     for first, last in _runs(r.refused & ~r.spanned(_OPEN_LOOPS)):
         sigma = float(np.sqrt(np.trace(r.covariances[first : last + 1, :2, :2].sum(axis=0))))
         is_long = last - first + 1 >= _OPEN_STEPS or sigma > _OPEN_SIGMA_M
@@ -196,23 +198,12 @@ def _bridged(r: Recorded) -> Bools:
     Across each step keyscans near each other are paired and hardly look through walls of each other; and every stretch
     that holds the step has its motion by the scans alone, to a half of what a slip would need to hide in.
     """
-    n = len(r.poses)
-    i, j = r.pairs.min(axis=1), r.pairs.max(axis=1)
-    near = j - i <= _HEALED_WITHIN
-    across = np.zeros((n + 1, 2))
-    np.add.at(across, i[near] + 1, r.counts[near, :2])
-    np.add.at(across, j[near] + 1, -r.counts[near, :2])
-    paired, conflict = np.cumsum(across, axis=0)[:n].T
-    known = np.zeros(n + 1, dtype=np.int64)
-    weak = np.zeros(n + 1, dtype=np.int64)
-    first, last = r.stretches.ends.T
-    uncertain = r.stretches.sigma > 0.5 * _WEAK_M
-    for counted, chosen in ((known, np.ones(len(first), dtype=bool)), (weak, uncertain)):
-        np.add.at(counted, first[chosen] + 1, 1)
-        np.add.at(counted, last[chosen] + 1, -1)
-    observed = (np.cumsum(known) > 0) & (np.cumsum(weak) == 0)
+    near = np.abs(r.pairs[:, 1] - r.pairs[:, 0]) <= _HEALED_WITHIN
+    paired, conflict = r.summed_across(r.pairs[near], r.counts[near, :2]).T
     agrees = (paired >= _VISIT_SEEN) & (paired >= _HEALED * (paired + conflict))
-    return np.asarray(agrees & observed[:n], dtype=np.bool_)
+    uncertain = r.stretches.sigma > 0.5 * _WEAK_M
+    known, weak = r.summed_across(r.stretches.ends, np.column_stack((np.ones(len(uncertain)), uncertain))).T
+    return np.asarray(agrees & (known > 0) & (weak == 0), dtype=np.bool_)
 
 
 def _second_visits(r: Recorded) -> Reason | None:
@@ -235,7 +226,7 @@ def _second_visits(r: Recorded) -> Reason | None:
     return _reason(r, "second-visit", text, wrong, failed=share > _FAILED_SHARE)
 
 
-def _against_odometry(r: Recorded) -> Reason | None:
+def _against_odometry(r: Recorded, bridged: Bools) -> Reason | None:
     """Stretches over which map and odometry differ by what no calibration explains, and that no loop spans."""
     if r.odometry is None or len(r.poses) <= _WINDOW:
         return None
@@ -250,7 +241,6 @@ def _against_odometry(r: Recorded) -> Reason | None:
     open_steps = np.cumsum(~r.spanned())
     off &= open_steps[_WINDOW:] - open_steps[:-_WINDOW] == _WINDOW
     ends = [(first, min(last + _WINDOW, len(r.poses) - 1)) for first, last in _runs(off)]
-    bridged = _bridged(r)
     wrong = [(first, last) for first, last in ends if not bridged[first + 1 : last + 1].all()]
     if not wrong:
         return None

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.states import localisation_reasons, spans_of
+from hsloc.localisation.states import localisation_reasons
 from hsloc.model.estimate import Status
-from hsloc.model.verdict import Verdict, VerdictReason
+from hsloc.model.verdict import Verdict, VerdictReason, spans_of
 from hsloc.slam.time_offset import Headings, find_offset, offset_warning, offsets_of_log
 from hsloc.trajectory_io.tum import NS_PER_S
 from hsloc.warnings import RunWarning, WarningCode

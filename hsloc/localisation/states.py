@@ -10,7 +10,7 @@ import numpy as np
 
 from hsloc.localisation.track_evidence import TrackRow, smooth, usual_explained
 from hsloc.model.estimate import Evidence, State, Status
-from hsloc.model.verdict import Verdict, VerdictReason
+from hsloc.model.verdict import Verdict, VerdictReason, spans_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -264,9 +264,3 @@ def localisation_reasons(rows: StateRows, trajectory: Trajectory) -> tuple[Verdi
             )
         )
     return tuple(reasons)
-
-
-def spans_of(rows: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First and last row of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], rows, [False]))))
-    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]

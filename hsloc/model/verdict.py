@@ -6,8 +6,12 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+    from numpy.typing import NDArray
 
 
 class Verdict(StrEnum):
@@ -43,3 +47,9 @@ def verdict_of(reasons: Iterable[VerdictReason]) -> Verdict:
     """The worst verdict of the reasons; good where there is none."""
     order = (Verdict.GOOD, Verdict.CHECK, Verdict.FAILED)
     return max((reason.verdict for reason in reasons), key=order.index, default=Verdict.GOOD)
+
+
+def spans_of(rows: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last row of each run of True: what a reason names the places and times of."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], rows, [False]))))
+    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from hsloc.model.pose2 import relative_poses, wrap_angles
+from hsloc.model.verdict import spans_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -173,7 +174,7 @@ def nothing_seen() -> Evidence:
 def _open_joints(r: Recorded, bridged: Bools) -> Reason | None:
     """Runs of steps that only odometry holds: one loop over several of them shares out their errors as it likes."""
     wrong = []
-    for first, last in _runs(r.refused & ~r.spanned(_OPEN_LOOPS)):
+    for first, last in spans_of(r.refused & ~r.spanned(_OPEN_LOOPS)):
         sigma = float(np.sqrt(np.trace(r.covariances[first : last + 1, :2, :2].sum(axis=0))))
         is_long = last - first + 1 >= _OPEN_STEPS or sigma > _OPEN_SIGMA_M
         if is_long and not bridged[first : last + 1].all() and not _healed(r, first, last):
@@ -218,7 +219,7 @@ def _second_visits(r: Recorded) -> Reason | None:
     if not known.any():
         return None
     bad = known & (paired < _INCONSISTENT * (paired + conflict))
-    wrong = [run for run in _runs(bad) if way[run[1]] - way[max(run[0] - 1, 0)] >= _INCONSISTENT_M]
+    wrong = [run for run in spans_of(bad) if way[run[1]] - way[max(run[0] - 1, 0)] >= _INCONSISTENT_M]
     if not wrong:
         return None
     share = sum(last - first + 1 for first, last in wrong) / int(known.sum())
@@ -240,7 +241,7 @@ def _against_odometry(r: Recorded, bridged: Bools) -> Reason | None:
     off = (apart > _ODOMETRY_SHARE * length + 0.3) | (angle > _ODOMETRY_TURN + 0.2 * turn)
     open_steps = np.cumsum(~r.spanned())
     off &= open_steps[_WINDOW:] - open_steps[:-_WINDOW] == _WINDOW
-    ends = [(first, min(last + _WINDOW, len(r.poses) - 1)) for first, last in _runs(off)]
+    ends = [(first, min(last + _WINDOW, len(r.poses) - 1)) for first, last in spans_of(off)]
     wrong = [(first, last) for first, last in ends if not bridged[first + 1 : last + 1].all()]
     if not wrong:
         return None
@@ -308,7 +309,7 @@ def _blind(r: Recorded) -> Reason | None:
     if share < _BLIND_SHARE:
         return None
     text = f"{100.0 * share:.0f} % of the path was driven with too few returns: the lidar sees too little here"
-    return _reason(r, "blind", text, _runs(long), failed=share > 0.5)
+    return _reason(r, "blind", text, spans_of(long), failed=share > 0.5)
 
 
 def _no_returns(r: Recorded) -> Reason | None:
@@ -328,9 +329,3 @@ def _reason(r: Recorded, code: str, text: str, runs: list[tuple[int, int]], *, f
         tuple((float(r.poses[last, 0]), float(r.poses[last, 1])) for _, last in named),
         tuple((float(seconds[max(first - 1, 0)]), float(seconds[last])) for first, last in named),
     )
-
-
-def _runs(flags: Bools) -> list[tuple[int, int]]:
-    """First and last index of each run of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], flags, [False])).astype(np.int8)))
-    return [(int(first), int(end) - 1) for first, end in zip(edges[::2], edges[1::2], strict=True)]

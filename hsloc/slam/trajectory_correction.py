@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.kalman_filter import predict_covariance
 from hsloc.model.pose2 import Pose2, compose_poses, relative_poses, wrap_angles
 from hsloc.slam.calibration import OdometryCalibration, apply, calibrate
 
@@ -63,8 +64,8 @@ class EventLog:
 
     def calibrated(self, key_poses: F64) -> OdometryCalibration:
         """Calibration of the odometry by the final poses of the keyscans."""
-        known, poses = self._known(key_poses)
-        return calibrate(self._index(), np.array(self._poses).reshape(-1, 3), known, poses)
+        odometry = np.array(self._poses).reshape(-1, 3)
+        return calibrate(self._index(), odometry, self._known(), self._known_poses(key_poses))
 
     def corrected(self, key_poses: F64, calibration: OdometryCalibration | None = None) -> tuple[F64, F64]:
         """Poses in the map of all odometry messages (k, 3) and of all scans (m, 3).
@@ -78,7 +79,7 @@ class EventLog:
             return odometry[~is_scan], odometry[is_scan]
         if calibration is not None:
             odometry = apply(calibration, self._index(), odometry)
-        keys, key_poses = self._known(key_poses)
+        keys, key_poses = self._known(), self._known_poses(key_poses)
         before, after, fraction = self._between(odometry, keys)
         from_before = compose_poses(key_poses[before], relative_poses(odometry[keys[before]], odometry))
         from_after = compose_poses(key_poses[after], relative_poses(odometry[keys[after]], odometry))
@@ -97,43 +98,39 @@ class EventLog:
         if len(self._keys) == 0:
             unknown = np.full((len(is_scan), 3, 3), np.nan)
             return unknown[~is_scan], unknown[is_scan]
-        keys, _ = self._known(key_poses)
         known = self._known_covariances(key_poses, key_covariances)
-        before, after, fraction = self._between(np.array(self._poses).reshape(-1, 3), keys)
+        before, after, fraction = self._between(np.array(self._poses).reshape(-1, 3), self._known())
         part = fraction[:, None, None]
         found = (1.0 - part) * known[before] + part * known[after]
         return found[~is_scan], found[is_scan]
 
-    def _known(self, key_poses: F64) -> tuple[I64, F64]:
-        """Events (n,) whose poses (n, 3) are known: keyscans and anchored scans, in the order of the log."""
-        keys = np.array(self._keys, dtype=np.int64)
-        if not self._anchors:
-            return keys, key_poses
-        rows = np.array([anchor.keyscan for anchor in self._anchors])
-        seen_from = np.array([anchor.T_key_scan.to_array() for anchor in self._anchors])
-        events = np.concatenate((keys, self._anchored))
-        poses = np.concatenate((key_poses, compose_poses(key_poses[rows], seen_from)))
-        order = np.argsort(events, kind="stable")
-        return events[order], poses[order]
+    def _known(self) -> I64:
+        """Events (n,) whose poses are known: keyscans and anchored scans, in the order of the log."""
+        return np.sort(np.array([*self._keys, *self._anchored], dtype=np.int64))
+
+    def _known_poses(self, key_poses: F64) -> F64:
+        """Poses (n, 3) of what `_known` lists."""
+        rows = [anchor.keyscan for anchor in self._anchors]
+        seen_from = np.array([anchor.T_key_scan.to_array() for anchor in self._anchors]).reshape(-1, 3)
+        return self._in_order(key_poses, compose_poses(key_poses[rows], seen_from))
 
     def _known_covariances(self, key_poses: F64, key_covariances: F64) -> F64:
         """Covariances (n, 3, 3) of what `_known` lists: an anchored scan's is propagated from its keyscan's."""
-        if not self._anchors:
-            return key_covariances
-        rows = np.array([anchor.keyscan for anchor in self._anchors])
-        offset = np.array([anchor.T_key_scan.to_array() for anchor in self._anchors])
-        c, s = np.cos(key_poses[rows, 2]), np.sin(key_poses[rows, 2])
-        by_pose = np.tile(np.eye(3), (len(rows), 1, 1))
-        by_pose[:, 0, 2] = -s * offset[:, 0] - c * offset[:, 1]
-        by_pose[:, 1, 2] = c * offset[:, 0] - s * offset[:, 1]
-        by_offset = np.tile(np.eye(3), (len(rows), 1, 1))
-        by_offset[:, 0, 0], by_offset[:, 0, 1], by_offset[:, 1, 0], by_offset[:, 1, 1] = c, -s, s, c
-        measured = np.array([anchor.covariance for anchor in self._anchors])
-        anchored = by_pose @ key_covariances[rows] @ by_pose.transpose(0, 2, 1)
-        anchored += by_offset @ measured @ by_offset.transpose(0, 2, 1)
-        order = np.argsort(np.concatenate((self._keys, self._anchored)), kind="stable")
-        ordered: F64 = np.concatenate((key_covariances, anchored))[order]
-        return ordered
+        anchored = [
+            predict_covariance(
+                key_covariances[anchor.keyscan],
+                Pose2.from_array(key_poses[anchor.keyscan]),
+                anchor.T_key_scan,
+                anchor.covariance,
+            )
+            for anchor in self._anchors
+        ]
+        return self._in_order(key_covariances, np.array(anchored).reshape(-1, 3, 3))
+
+    def _in_order(self, of_keys: F64, of_anchored: F64) -> F64:
+        """Values of the keyscans and of the anchored scans in the order of the log."""
+        values: F64 = np.concatenate((of_keys, of_anchored))[np.argsort([*self._keys, *self._anchored], kind="stable")]
+        return values
 
     def _between(self, odometry: F64, keys: I64) -> tuple[I64, I64, F64]:
         """Of each event the keyscans before and after it, and the part of the path between them that was driven."""

@@ -27,6 +27,7 @@ from hsloc.replay.map_and_start import map_file, state_file
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
 from hsloc.run_metrics import RunMetrics, RunTimings
+from hsloc.sweep import log_labels
 from hsloc.sweep.remote import RemoteLog, UrlFolder
 from hsloc.version import __version__
 
@@ -111,17 +112,6 @@ def plan(
                 request = RunRequest.from_values(parts, values)
                 runs.append(SweepRun(f"{label}-{name}-seed{seed}".replace("/", "_"), label, name, request, remote))
     return runs
-
-
-def log_labels(names: Sequence[str]) -> list[str]:
-    """What logs with these names are called in a table: without endings, each once."""
-    counts: dict[str, int] = {}
-    labels = []
-    for name in names:
-        label = name.split(".")[0] or "log"
-        counts[label] = counts.get(label, 0) + 1
-        labels.append(label if counts[label] == 1 else f"{label}-{counts[label]}")
-    return labels
 
 
 def sweep(

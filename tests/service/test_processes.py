@@ -6,6 +6,8 @@ import errno
 import os
 import re
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -215,3 +217,12 @@ def test_what_cannot_be_started_is_not_tried_again_at_once(client: TestClient, m
     ended = wait(client, submit(client))
     assert (ended["state"], ended["reason"], len(tries)) == ("crashed", "attempts", 3)
     assert tries[2] - tries[0] > 1.5
+
+
+def test_a_server_loads_nothing_that_only_jobs_need() -> None:
+    code = (
+        "import sys; import hsloc_service.main; "
+        "heavy = {'numpy', 'numba', 'scipy', 'matplotlib', 'PIL', 'fsspec', 'mcap', 'rosbags'} & set(sys.modules);"
+        "sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

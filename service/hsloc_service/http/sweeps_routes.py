@@ -7,7 +7,6 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import AwareDatetime, BaseModel, BeforeValidator, Field
 
-from hsloc.report.sweep_page import sweep_matrix
 from hsloc.sweep.table import as_csv, as_markdown
 from hsloc_service import config_schema
 from hsloc_service.config_schema import whole
@@ -149,6 +148,8 @@ class SweepMatrixView(BaseModel):
 @router.get("/{sweep_id}/matrix", responses=problems(404))
 def matrix(ctx: Ctx, who: Reader, sweep_id: SweepId) -> SweepMatrixView:
     """The table as a matrix, with errors over seeds: mean, standard deviation, 95 % interval of the mean."""
+    from hsloc.report.sweep_page import sweep_matrix  # with numpy, which the server does not load at its start
+
     state, (jobs, rows) = ctx.sweeps.get(who, sweep_id), ctx.sweeps.table(who, sweep_id)
     found = sweep_matrix(rows)
     shown = ("seed", "state", "verdict")

@@ -13,7 +13,6 @@ from pydantic import AwareDatetime, BaseModel, Field
 from sqlalchemy import func, select, text
 
 from hsloc.options import describe
-from hsloc.report.html import ComparedRun, over_seeds
 from hsloc.version import __version__
 from hsloc_service import audit
 from hsloc_service import config_schema as job_options
@@ -158,6 +157,8 @@ def compare(
     job: Annotated[list[Annotated[str, Field(pattern=UUID_PATTERN)]], Query(max_length=MAX_COMPARED)],
 ) -> SeedTable:
     """Figures over jobs that differ in their seed alone: mean, standard deviation, 95 % interval of the mean."""
+    from hsloc.report.html import ComparedRun, over_seeds  # with numpy, which the server does not load at its start
+
     runs = []
     for row in (ctx.jobs.get(who, ident) for ident in dict.fromkeys(job)):
         found = row.summary or {}

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sqlalchemy import func, select
 
-from hsloc.sweep.runs import log_labels
+from hsloc.sweep import log_labels
 from hsloc.sweep.table import COLUMNS
 from hsloc_service.audit import note
 from hsloc_service.db.tables import ACTIVE, IdempotencyRow, JobRow, SweepRow

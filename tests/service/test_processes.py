@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from live_service import free_port, submit, wait
+from live_service import free_port, submit, upload, wait
 
 from hsloc_service.execution import job_process
 from hsloc_service.execution.processes import marked
@@ -217,6 +217,12 @@ def test_what_cannot_be_started_is_not_tried_again_at_once(client: TestClient, m
     ended = wait(client, submit(client))
     assert (ended["state"], ended["reason"], len(tries)) == ("crashed", "attempts", 3)
     assert tries[2] - tries[0] > 1.5
+
+
+@pytest.mark.parametrize("word", [b"fifo", b"hard-link"])
+def test_an_inspection_reads_only_files_of_the_process(client: TestClient, word: bytes) -> None:
+    found = client.post("/v1/inspect", json={"log": upload(client, word)}).json()
+    assert (found["format"], found["view"], found["map_image"]) == (word.decode(), None, None)
 
 
 def test_a_server_loads_nothing_that_only_jobs_need() -> None:

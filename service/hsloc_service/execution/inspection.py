@@ -15,6 +15,7 @@ from hsloc_service.execution.job_process import JobProcess
 from hsloc_service.execution.retry import Interrupted, Retry
 from hsloc_service.execution.supervisor import prepare
 from hsloc_service.jobs.leases import Claim
+from hsloc_service.results.store import is_plain_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -106,9 +107,9 @@ def _view_in(folder: Path) -> dict[str, Any]:
 
 
 def _read(path: Path, most: int) -> bytes:
-    """Raises OSError for a link, and ValueError for what is too large."""
-    if path.is_symlink():
-        raise OSError(f"{path.name} is a link")
+    """Raises OSError for what is no file of its own, and ValueError for what is too large."""
+    if not is_plain_file(path):
+        raise OSError(f"{path.name} is no plain file")
     with path.open("rb") as file:
         content = file.read(most + 1)
     if len(content) > most:

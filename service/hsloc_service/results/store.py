@@ -173,16 +173,22 @@ def collect(output: Path) -> list[Asset]:
     """
     assets: list[Asset] = []
     for path in sorted(output.iterdir()):
-        found = path.lstat()
-        # A second name of a file could be one of the server's own, such as its database.
-        plain = stat.S_ISREG(found.st_mode) and found.st_nlink == 1 and _ASSET_NAME.match(path.name) is not None
-        if not plain or len(assets) >= MAX_ASSETS:
+        if not is_plain_file(path) or _ASSET_NAME.match(path.name) is None or len(assets) >= MAX_ASSETS:
             remove_tree(path)
             continue
         size, digest = hash_file(path, sync=True)
         media = MEDIA_TYPES.get(path.suffix.lower(), "application/octet-stream")
         assets.append(Asset(path.name, size, digest, media))
     return assets
+
+
+def is_plain_file(path: Path) -> bool:
+    """Whether it is a regular file with no second name, which could be one of the server's own, such as its database.
+
+    Raises OSError where nothing is there.
+    """
+    found = path.lstat()
+    return stat.S_ISREG(found.st_mode) and found.st_nlink == 1
 
 
 def checked_asset(name: str) -> str:

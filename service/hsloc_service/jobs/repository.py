@@ -106,19 +106,14 @@ class Jobs:
         there, 409 for a key that was used for another request, 422 for a job without a map to extend, 429 when too
         many wait, 507 when the disk or the quota is full.
         """
-        digest = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
+        digest = request_digest(request)
         with self.database.write() as session:
             self.database.lock_tenant(session, who.tenant)
-            known = None if key is None else session.get(IdempotencyRow, (who.tenant, key))
-            if known is not None:
-                if known.sha256 != digest:
-                    raise conflict("idempotency", "this Idempotency-Key was used for a different request")
-                return Submitted(_job(session, who, known.job_id), created=False)
+            if (known := made_before(session, who, key, digest)) is not None:
+                return Submitted(_job(session, who, known), created=False)
             self.need_room(session, who)
             job = self.insert(session, who, request)
-            if key is not None:
-                now = time.time()
-                session.add(IdempotencyRow(tenant=who.tenant, key=key, sha256=digest, job_id=job.id, created=now))
+            remember_key(session, who, key, digest, job.id)
             return Submitted(job, created=True)
 
     def rerun(self, who: Principal, job_id: str, request: dict[str, Any]) -> JobRow:
@@ -267,6 +262,28 @@ class Jobs:
         session.flush()
         record(session, job, "state", {"state": "queued"})
         return job
+
+
+def request_digest(request: Any) -> str:
+    """What is kept of a request, to know it again."""
+    return hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
+
+
+def made_before(session: Session, who: Principal, key: str | None, digest: str) -> str | None:
+    """Id of what an earlier request with this Idempotency-Key made. Raises ServiceError 409 if it was another one."""
+    known = None if key is None else session.get(IdempotencyRow, (who.tenant, key))
+    if known is None:
+        return None
+    if known.sha256 != digest:
+        raise conflict("idempotency", "this Idempotency-Key was used for a different request")
+    return known.job_id
+
+
+def remember_key(session: Session, who: Principal, key: str | None, digest: str, made: str) -> None:
+    """Record what a request with an Idempotency-Key made."""
+    if key is not None:
+        row = IdempotencyRow(tenant=who.tenant, key=key, sha256=digest, job_id=made, created=time.time())
+        session.add(row)
 
 
 def joined_labels(labels: Iterable[str]) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 import uuid
 from collections import Counter
@@ -15,9 +13,9 @@ from sqlalchemy import func, select
 from hsloc.sweep import log_labels
 from hsloc.sweep.table import COLUMNS
 from hsloc_service.audit import note
-from hsloc_service.db.tables import ACTIVE, IdempotencyRow, JobRow, SweepRow
+from hsloc_service.db.tables import ACTIVE, JobRow, SweepRow
 from hsloc_service.errors import conflict, not_found
-from hsloc_service.jobs.repository import base_job, delete_job
+from hsloc_service.jobs.repository import base_job, delete_job, made_before, remember_key, request_digest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -61,23 +59,17 @@ class Sweeps:
 
         Raises ServiceError as `Jobs.submit` does.
         """
-        content = json.dumps([name, [run._asdict() for run in runs]], sort_keys=True)
-        digest = hashlib.sha256(content.encode()).hexdigest()
+        digest = request_digest([name, [run._asdict() for run in runs]])
         with self.jobs.database.write() as session:
             self.jobs.database.lock_tenant(session, who.tenant)
-            known = None if key is None else session.get(IdempotencyRow, (who.tenant, key))
-            if known is not None:
-                if known.sha256 != digest:
-                    raise conflict("idempotency", "this Idempotency-Key was used for a different request")
-                return _state(session, _sweep(session, who, known.job_id)), []
+            if (known := made_before(session, who, key, digest)) is not None:
+                return _state(session, _sweep(session, who, known)), []
             self.jobs.need_room(session, who, len(runs))
             row = SweepRow(id=str(uuid.uuid4()), tenant=who.tenant, name=name, created=time.time(), runs={})
             made = [(run, self.jobs.insert(session, who, run.request, sweep=row.id)) for run in runs]
             row.runs = _named(made)
             session.add(row)
-            if key is not None:
-                now = time.time()
-                session.add(IdempotencyRow(tenant=who.tenant, key=key, sha256=digest, job_id=row.id, created=now))
+            remember_key(session, who, key, digest, row.id)
             session.flush()
             return _state(session, row), list(row.runs)
 

@@ -77,7 +77,7 @@ class Sweeps:
         """Sweeps, newest first."""
         query = select(SweepRow).where(SweepRow.tenant == who.tenant).order_by(SweepRow.created.desc(), SweepRow.id)
         with self.jobs.database.read() as session:
-            return [_state(session, row) for row in session.scalars(query.limit(limit).offset(offset))]
+            return _states(session, session.scalars(query.limit(limit).offset(offset)).all())
 
     def get(self, who: Principal, sweep_id: str) -> SweepState:
         """One sweep."""
@@ -141,10 +141,18 @@ def _sweep(session: Session, who: Principal, sweep_id: str) -> SweepRow:
 
 
 def _state(session: Session, row: SweepRow) -> SweepState:
-    query = select(JobRow.state, func.count().label("jobs")).where(JobRow.sweep == row.id).group_by(JobRow.state)
-    states = Counter({found.state: found.jobs for found in session.execute(query)})
-    states["deleted"] = len(row.runs) - states.total()
-    return SweepState(row, {state: count for state, count in sorted(states.items()) if count})
+    return _states(session, [row])[0]
+
+
+def _states(session: Session, rows: Sequence[SweepRow]) -> list[SweepState]:
+    """Sweeps with the states of their jobs, by one query."""
+    found: dict[str | None, Counter[str]] = {row.id: Counter() for row in rows}
+    query = select(JobRow.sweep, JobRow.state, func.count()).where(JobRow.sweep.in_(found))
+    for sweep_id, state, jobs in session.execute(query.group_by(JobRow.sweep, JobRow.state)):
+        found[sweep_id][state] = jobs
+    for row in rows:
+        found[row.id]["deleted"] = len(row.runs) - found[row.id].total()
+    return [SweepState(row, {state: jobs for state, jobs in sorted(found[row.id].items()) if jobs}) for row in rows]
 
 
 def _table_row(run: dict[str, Any], job: JobRow | None) -> dict[str, Any]:

@@ -174,11 +174,7 @@ class Jobs:
         """Ask for the end of a job. A waiting job is cancelled at once; a running one when its processes are dead."""
         with self.database.write() as session:
             job = _job(session, who, job_id, lock=True)
-            if job.state == "queued":
-                finish_job(session, job, "cancelled", "cancelled", "cancelled before it started")
-            elif job.state == "running":
-                job.cancel, job.state = True, "cancelling"
-                record(session, job, "state", {"state": "cancelling"})
+            cancel_job(session, job)
             return job
 
     def describe(self, who: Principal, job_id: str, changes: Mapping[str, Any]) -> JobRow:
@@ -316,6 +312,15 @@ def finish_job(session: Session, job: JobRow, state: str, reason: str | None, me
     job.owner = job.lease_until = None
     record(session, job, "state", {"state": state, "reason": reason, "message": message})
     queue_webhook(session, job, "job.ended")
+
+
+def cancel_job(session: Session, job: JobRow) -> None:
+    """Cancel a waiting job, and ask for the end of a running one; the row is locked."""
+    if job.state == "queued":
+        finish_job(session, job, "cancelled", "cancelled", "cancelled before it started")
+    elif job.state == "running":
+        job.cancel, job.state = True, "cancelling"
+        record(session, job, "state", {"state": "cancelling"})
 
 
 def delete_job(session: Session, *jobs: JobRow) -> None:

@@ -15,7 +15,14 @@ from hsloc.sweep.table import COLUMNS
 from hsloc_service.audit import note
 from hsloc_service.db.tables import ACTIVE, JobRow, SweepRow
 from hsloc_service.errors import conflict, not_found
-from hsloc_service.jobs.repository import base_job, delete_job, made_before, remember_key, request_digest
+from hsloc_service.jobs.repository import (
+    base_job,
+    cancel_job,
+    delete_job,
+    made_before,
+    remember_key,
+    request_digest,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -95,13 +102,14 @@ class Sweeps:
 
     def cancel(self, who: Principal, sweep_id: str, cancelled: Callable[[str], None]) -> SweepState:
         """Ask for the end of all jobs that have not ended; `cancelled` is called with the id of each."""
-        with self.jobs.database.read() as session:
+        with self.jobs.database.write() as session:
             _sweep(session, who, sweep_id)
-            query = select(JobRow.id).where(JobRow.sweep == sweep_id, JobRow.state.in_(ACTIVE))
-            active = session.scalars(query).all()
-        for job_id in active:
-            self.jobs.cancel(who, job_id)
-            cancelled(job_id)
+            query = select(JobRow).where(JobRow.sweep == sweep_id, JobRow.state.in_(ACTIVE)).order_by(JobRow.seq)
+            active = session.scalars(query.with_for_update()).all()
+            for job in active:
+                cancel_job(session, job)
+        for job in active:
+            cancelled(job.id)
         return self.get(who, sweep_id)
 
     def delete(self, who: Principal, sweep_id: str) -> None:

@@ -160,7 +160,7 @@ def compare(
     from hsloc.report.html import ComparedRun, over_seeds  # with numpy, which the server does not load at its start
 
     runs = []
-    for row in (ctx.jobs.get(who, ident) for ident in dict.fromkeys(job)):
+    for row in ctx.jobs.get_all(who, job):
         found = row.summary or {}
         summary = {"verdict": found.get("metrics", {}).get("verdict", row.state), "figures": found.get("figures", [])}
         runs.append(ComparedRun(row.title or row.log_name, {"run": found.get("run"), "summary": summary}))

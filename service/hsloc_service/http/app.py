@@ -110,7 +110,7 @@ def open_context(settings: Settings) -> Context:
         storage=storage,
         files=files,
         jobs=jobs,
-        shares=Shares(database, jobs),
+        shares=Shares(database),
         sweeps=Sweeps(jobs),
         receiver=UploadReceiver(files, settings),
         dispatcher=parts.dispatcher,

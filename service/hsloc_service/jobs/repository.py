@@ -110,7 +110,7 @@ class Jobs:
         with self.database.write() as session:
             self.database.lock_tenant(session, who.tenant)
             if (known := made_before(session, who, key, digest)) is not None:
-                return Submitted(_job(session, who, known), created=False)
+                return Submitted(job_of(session, who, known), created=False)
             self.need_room(session, who)
             job = self.insert(session, who, request)
             remember_key(session, who, key, digest, job.id)
@@ -120,7 +120,7 @@ class Jobs:
         """The job again, with what the caller made of its request."""
         with self.database.write() as session:
             self.database.lock_tenant(session, who.tenant)
-            old = _job(session, who, job_id)
+            old = job_of(session, who, job_id)
             self.need_room(session, who)
             job = self.insert(session, who, request, rerun_of=old.id)
             job.title, job.labels = old.title, old.labels
@@ -129,7 +129,7 @@ class Jobs:
     def get(self, who: Principal, job_id: str) -> JobRow:
         """One job."""
         with self.database.read() as session:
-            return _job(session, who, job_id)
+            return job_of(session, who, job_id)
 
     def get_all(self, who: Principal, job_ids: Sequence[str]) -> Sequence[JobRow]:
         """Several jobs, each once, in this order. Raises ServiceError 404 if one is not there."""
@@ -160,7 +160,7 @@ class Jobs:
     def assets(self, who: Principal, job_id: str) -> tuple[JobRow, Sequence[AssetRow]]:
         """A job and the manifest of its results."""
         with self.database.read() as session:
-            job = _job(session, who, job_id)
+            job = job_of(session, who, job_id)
             rows = session.scalars(select(AssetRow).where(AssetRow.job_id == job_id).order_by(AssetRow.name)).all()
             return job, rows
 
@@ -170,26 +170,26 @@ class Jobs:
             select(EventRow).where(EventRow.job_id == job_id, EventRow.id > after).order_by(EventRow.id).limit(limit)
         )
         with self.database.read() as session:
-            job = _job(session, who, job_id)
+            job = job_of(session, who, job_id)
             return job, session.scalars(query).all()
 
     def deliveries(self, who: Principal, job_id: str) -> Sequence[DeliveryRow]:
         """The webhooks of a job."""
         with self.database.read() as session:
-            _job(session, who, job_id)
+            job_of(session, who, job_id)
             return session.scalars(select(DeliveryRow).where(DeliveryRow.job_id == job_id)).all()
 
     def cancel(self, who: Principal, job_id: str) -> JobRow:
         """Ask for the end of a job. A waiting job is cancelled at once; a running one when its processes are dead."""
         with self.database.write() as session:
-            job = _job(session, who, job_id, lock=True)
+            job = job_of(session, who, job_id, lock=True)
             cancel_job(session, job)
             return job
 
     def describe(self, who: Principal, job_id: str, changes: Mapping[str, Any]) -> JobRow:
         """Set title, labels or notes of a job; what `changes` does not name stays."""
         with self.database.write() as session:
-            job = _job(session, who, job_id, lock=True)
+            job = job_of(session, who, job_id, lock=True)
             for name, value in changes.items():
                 setattr(job, name, joined_labels(value or ()) if name == "labels" else value or None)
             return job
@@ -207,7 +207,7 @@ class Jobs:
         """
         with self.database.write() as session:
             self.database.lock_tenant(session, who.tenant)
-            job = _job(session, who, job_id, lock=True)
+            job = job_of(session, who, job_id, lock=True)
             if job.state in ACTIVE:
                 raise conflict("active", f"the job is {job.state}; cancel it first")
             if base_job(session, job_id):
@@ -243,7 +243,7 @@ class Jobs:
             if request.get(name) is not None:
                 _complete_file(session, who, request[name], name)
         if request.get("resume") is not None:
-            _need_map(session, _job(session, who, request["resume"]))
+            _need_map(session, job_of(session, who, request["resume"]))
         self.database.lock(session, SEQ)
         job = JobRow(
             seq=_next_seq(session),
@@ -357,7 +357,7 @@ def _need_map(session: Session, job: JobRow) -> None:
         )
 
 
-def _job(session: Session, who: Principal, job_id: str, lock: bool = False) -> JobRow:
+def job_of(session: Session, who: Principal, job_id: str, lock: bool = False) -> JobRow:
     """A job of the principal; with `lock` no other transaction changes it before this one ends."""
     query = select(JobRow).where(JobRow.id == job_id, JobRow.tenant == who.tenant)
     job = session.scalar(query.with_for_update() if lock else query)

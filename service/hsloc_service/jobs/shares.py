@@ -13,6 +13,7 @@ from sqlalchemy import delete, select
 from hsloc_service.auth import sha256_of
 from hsloc_service.db.tables import ShareRow
 from hsloc_service.errors import busy, not_found
+from hsloc_service.jobs.repository import job_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
     from hsloc_service.auth import Principal
     from hsloc_service.db.database import Database
-    from hsloc_service.jobs.repository import Jobs
 
 MAX_SHARES = 50
 """Links of a job that are valid at the same time."""
@@ -32,13 +32,12 @@ class Shares:
     """The links of all tenants; the methods with a principal see those of its jobs only."""
 
     database: Database
-    jobs: Jobs
 
     def issue(self, who: Principal, job_id: str, valid_s: float) -> tuple[ShareRow, str]:
         """A new link and its secret of 256 random bits, which is shown this once. Raises ServiceError 404 and 429."""
-        self.jobs.get(who, job_id)
         secret, now = f"hss_{secrets.token_urlsafe(32)}", time.time()
         with self.database.write() as session:
+            job_of(session, who, job_id, lock=True)
             session.execute(delete(ShareRow).where(ShareRow.job_id == job_id, ShareRow.expires <= now))
             if len(session.scalars(_of(who, job_id)).all()) >= MAX_SHARES:
                 raise busy(f"the job has {MAX_SHARES} links, which is the limit; revoke one", 60.0)
@@ -55,8 +54,8 @@ class Shares:
 
     def rows(self, who: Principal, job_id: str) -> Sequence[ShareRow]:
         """The links of a job that are valid, oldest first."""
-        self.jobs.get(who, job_id)
         with self.database.read() as session:
+            job_of(session, who, job_id)
             return session.scalars(_of(who, job_id).where(ShareRow.expires > time.time())).all()
 
     def revoke(self, who: Principal, job_id: str, ident: str) -> None:

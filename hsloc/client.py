@@ -127,33 +127,28 @@ class Client:
         without harm (Idempotency-Key).
         """
         logs = [log] if isinstance(log, str) else list(log)
-        body = json.dumps({**({"log": logs[0]} if len(logs) == 1 else {"logs": logs}), **request}).encode()
-        headers = {"Content-Type": "application/json", "Idempotency-Key": str(uuid.uuid4())}
-        found: dict[str, Any] = self.request("POST", "/v1/jobs", body, headers).json()
-        return found
+        return self._post_once("/v1/jobs", {**({"log": logs[0]} if len(logs) == 1 else {"logs": logs}), **request})
 
     def submit_sweep(self, logs: Sequence[str], **request: Any) -> dict[str, Any]:
         """Queue a job for each uploaded log, configuration and seed: `seeds`, `configs`, `run`, `name` as in the API.
 
         Sent again without harm (Idempotency-Key).
         """
-        body = json.dumps({"logs": list(logs), **request}).encode()
+        return self._post_once("/v1/sweeps", {"logs": list(logs), **request})
+
+    def _post_once(self, path: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        """The answer to values under an Idempotency-Key of their own."""
         headers = {"Content-Type": "application/json", "Idempotency-Key": str(uuid.uuid4())}
-        found: dict[str, Any] = self.request("POST", "/v1/sweeps", body, headers).json()
+        found: dict[str, Any] = self.request("POST", path, json.dumps(values).encode(), headers).json()
         return found
 
     def wait_sweep(
         self, sweep_id: str, progress: Callable[[dict[str, Any]], None] | None = None, every_s: float = 1.0
     ) -> list[dict[str, Any]]:
         """The table of a sweep when all its jobs have ended; `progress` gets the sweep now and then."""
-        while True:
-            sweep = self.request("GET", f"/v1/sweeps/{sweep_id}").json()
-            if progress is not None:
-                progress(sweep)
-            if sweep["ended"]:
-                rows: list[dict[str, Any]] = self.request("GET", f"/v1/sweeps/{sweep_id}/table").json()["rows"]
-                return rows
-            time.sleep(every_s)
+        self._wait(f"/v1/sweeps/{sweep_id}", lambda sweep: bool(sweep["ended"]), progress, every_s)
+        rows: list[dict[str, Any]] = self.request("GET", f"/v1/sweeps/{sweep_id}/table").json()["rows"]
+        return rows
 
     def job(self, job_id: str) -> dict[str, Any]:
         """The state of a job."""
@@ -174,12 +169,21 @@ class Client:
         self, job_id: str, progress: Callable[[dict[str, Any]], None] | None = None, every_s: float = 0.5
     ) -> dict[str, Any]:
         """The job when it has ended; `progress` gets it now and then. A server that is away for a while is no end."""
+        return self._wait(f"/v1/jobs/{job_id}", lambda job: job["state"] in ENDED, progress, every_s)
+
+    def _wait(
+        self,
+        path: str,
+        has_ended: Callable[[dict[str, Any]], bool],
+        progress: Callable[[dict[str, Any]], None] | None,
+        every_s: float,
+    ) -> dict[str, Any]:
         while True:
-            job = self.job(job_id)
+            found: dict[str, Any] = self.request("GET", path).json()
             if progress is not None:
-                progress(job)
-            if job["state"] in ENDED:
-                return job
+                progress(found)
+            if has_ended(found):
+                return found
             time.sleep(every_s)
 
     def download(self, job_id: str, folder: str | PathLike[str]) -> list[Path]:

@@ -62,9 +62,7 @@ class SweepRequest(Strict):
     seeds: Annotated[list[Seed], Field(min_length=1, max_length=MAX_EACH, json_schema_extra=UNIQUE)] = Field(
         default=[0], description="seeds"
     )
-    configs: (
-        Annotated[dict[Name, SweepOptions], Field(min_length=1, max_length=MAX_EACH, json_schema_extra=CLOSED)] | None
-    ) = Field(
+    configs: Configs | None = Field(
         default=None,
         description="by a label of the table what some runs have besides `run`: `config`, `preset`, `matcher`",
         examples=[{"few": {"config": {"hide": {"budget": 100}}}, "icp": {"matcher": "icp"}}],

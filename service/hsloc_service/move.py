@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from typing import TYPE_CHECKING, NamedTuple
 
 from sqlalchemy import delete, func, insert, select
@@ -42,21 +43,17 @@ def move(settings: Settings, url: str) -> MoveReport:
     path = settings.data / SQLITE
     if not path.is_file():
         raise SettingsError(f"{settings.data}: no data folder of hsloc; name it with --data")
-    storage = Storage(settings.data, settings.min_free_bytes)  # raises where a server runs
-    try:
-        source, target = Database(path), Database(url)
-        try:
-            return _copy(source, target)
-        finally:
-            source.close()
-            target.close()
-    finally:
-        storage.close()
+    with (
+        closing(Storage(settings.data, settings.min_free_bytes)),  # raises where a server runs
+        closing(Database(path)) as source,
+        closing(Database(url)) as target,
+    ):
+        return _copy(source, target)
 
 
 def _copy(source: Database, target: Database) -> MoveReport:
     tables = Base.metadata.sorted_tables
-    rows = 0
+    counts: dict[str, int] = {}
     with source.read() as old, target.write() as new:
         target.lock(new, "migration")
         for table in tables:
@@ -64,10 +61,9 @@ def _copy(source: Database, target: Database) -> MoveReport:
                 raise SettingsError(f"{target.name}: its table {table.name} has rows; give an empty database")
         new.execute(delete(CounterRow))  # the marks of its own migration, which the old one has, too
         for table in tables:
-            rows += _copy_table(old, new, table)
+            counts[table.name] = _copy_table(old, new, table)
             _continue_numbers(new, table)
-        counts = [new.scalar(select(func.count()).select_from(row)) or 0 for row in (JobRow, FileRow)]
-    return MoveReport(counts[0], counts[1], rows)
+    return MoveReport(counts[JobRow.__tablename__], counts[FileRow.__tablename__], sum(counts.values()))
 
 
 def _continue_numbers(session: Session, table: Table) -> None:

@@ -45,7 +45,7 @@ async def upload(request: Request, ctx: Ctx, who: Writer, name: Name = "log", re
     """Upload a log, or a file of a map, as the raw body."""
     wanted = parse_digest(repr_digest)
     row = await to_thread.run_sync(ctx.files.create, who, name, _length(request))
-    return file_view(await _take(request, ctx, who, row, wanted))
+    return file_view(await _take(request.stream(), ctx, who, row, wanted))
 
 
 @router.post("/sample-log", status_code=201, responses=problems(413, 507))
@@ -57,8 +57,7 @@ async def sample(ctx: Ctx, who: Writer) -> FileView:
     async def body() -> AsyncIterator[bytes]:
         yield await to_thread.run_sync(path.read_bytes)
 
-    with ctx.receiver.writer(row.id):
-        return file_view(await ctx.receiver.append(who, row.id, 0, body()))
+    return file_view(await _take(body(), ctx, who, row, None))
 
 
 @router.put("/files/{file_id}", status_code=201, openapi_extra=_BODY, responses=problems(404, 409, 413, 423, 460, 507))
@@ -88,7 +87,7 @@ async def put(
         with ctx.receiver.writer(file_id):
             await to_thread.run_sync(ctx.files.restart, who, file_id, _length(request))
         row = await to_thread.run_sync(ctx.files.get, who, file_id)
-    return file_view(await _take(request, ctx, who, row, wanted))
+    return file_view(await _take(request.stream(), ctx, who, row, wanted))
 
 
 @router.get("/files", responses=problems(404))
@@ -134,12 +133,14 @@ def parse_digest(text: str | None) -> bytes | None:
     return digest
 
 
-async def _take(request: Request, ctx: Context, who: Principal, row: FileRow, wanted: bytes | None) -> FileRow:
+async def _take(
+    body: AsyncIterator[bytes], ctx: Context, who: Principal, row: FileRow, wanted: bytes | None
+) -> FileRow:
     """The whole body; an upload by one request is whole or gone."""
     with ctx.receiver.writer(row.id):
         try:
             checksum = None if wanted is None else ("sha256", wanted)
-            row = await ctx.receiver.append(who, row.id, 0, request.stream(), checksum)
+            row = await ctx.receiver.append(who, row.id, 0, body, checksum)
             if row.state != "complete":
                 if row.size is not None:
                     raise ServiceError(400, "short", f"{row.received} of {row.size} bytes came")

@@ -189,7 +189,7 @@ def sample_log(storage: Storage) -> Path:
         if not path.exists():
             storage.need_space(4 << 20)
             made = storage.work / f"sample-{uuid.uuid4().hex}.mcap"
-            command = [sys.executable, "-m", "hsloc.cli.main", "record", str(made), "--world", "office", "-q"]
+            command = [sys.executable, "-P", "-m", "hsloc.cli.main", "record", str(made), "--world", "office", "-q"]
             try:
                 subprocess.run([*command, "--duration", str(SECONDS)], check=True, timeout=TIMEOUT_S)
             except (OSError, subprocess.SubprocessError) as error:

@@ -57,7 +57,7 @@ class RemoteLog:
     @property
     def name(self) -> str:
         """Last part of the URL."""
-        return self.url.rstrip("/").rsplit("/", 1)[-1]
+        return _last_part(self.url)
 
     def fetch(self) -> Path:
         """A copy on the local disk, which is kept until this process fetches another log. Raises LogError."""
@@ -143,7 +143,7 @@ class UrlFolder:
     @property
     def name(self) -> str:
         """Last part of the URL."""
-        return self.url.rstrip("/").rsplit("/", 1)[-1]
+        return _last_part(self.url)
 
     def mkdir(self, *, parents: bool, exist_ok: bool) -> None:
         """Make it; a bucket of an object store must be there. Raises OutputError."""
@@ -158,8 +158,7 @@ class UrlFolder:
     def glob(self, pattern: str) -> list[UrlFolder]:
         """What is in the folder and has such a name."""
         with _as_error(HslocError, self.url, "read"):
-            fs, path = _file_system(self.url)
-            names = [str(each).rsplit("/", 1)[-1] for each in fs.ls(path, detail=False)] if fs.exists(path) else []
+            names = _names(*_file_system(self.url))
         return [self / name for name in sorted(fnmatch.filter(names, pattern))]
 
     def read_text(self, encoding: str = "utf-8") -> str:
@@ -193,7 +192,7 @@ class UrlFolder:
         """
         with _as_error(OutputError, self.url, "written"):
             fs, path = _file_system(self.url)
-            before = {str(each).rsplit("/", 1)[-1] for each in fs.ls(path, detail=False)} if fs.exists(path) else set()
+            before = _names(fs, path)
             if before and "metrics.json" not in before:
                 raise OutputError(f"{self.url}: is in use for something else; choose another folder")
             if mark in before:
@@ -205,6 +204,15 @@ class UrlFolder:
         )
         for name in names:
             (self / name).write_bytes((local / name).read_bytes())
+
+
+def _last_part(path: str) -> str:
+    return path.rstrip("/").rsplit("/", 1)[-1]
+
+
+def _names(fs: Any, path: str) -> set[str]:
+    """What is in a folder; nothing where there is none."""
+    return {_last_part(str(each)) for each in fs.ls(path, detail=False)} if fs.exists(path) else set()
 
 
 def _file_system(url: str) -> tuple[Any, str]:

@@ -106,23 +106,26 @@ def remote_logs(url: str) -> list[RemoteLog]:
     """The logs that a URL, or a pattern such as `s3://bucket/*.mcap`, names, by their names. Raises LogError."""
     with _as_error(LogError, url, "read"):
         fs, path = _file_system(url)
-        found = sorted(fs.glob(path)) if any(sign in path for sign in "*?[") else [path]
-        logs = [RemoteLog(fs.unstrip_protocol(each), tuple(_files(fs, str(each)))) for each in found]
+        found = fs.glob(path, detail=True) if any(sign in path for sign in "*?[") else {path: {}}
+        logs = [
+            RemoteLog(fs.unstrip_protocol(each), tuple(_files(fs, str(each), found[each]))) for each in sorted(found)
+        ]
     if not logs or not all(log.files for log in logs):
         raise LogError(f"{url}: no log is there")
     return logs
 
 
-def _files(fs: Any, path: str) -> Iterator[RemoteFile]:
-    if not fs.isdir(path):
-        yield _file(fs, path, "")
+def _files(fs: Any, path: str, listed: dict[str, Any]) -> Iterator[RemoteFile]:
+    """`listed` is what a listing says of the path: an object store is not asked for each file again."""
+    if listed.get("type") == "file" or not fs.isdir(path):
+        yield _file(fs, path, "", listed)
         return
-    for each in sorted(fs.find(path)):
-        yield _file(fs, str(each), str(each).removeprefix(path).lstrip("/"))
+    for each, info in sorted(fs.find(path, detail=True).items()):
+        yield _file(fs, str(each), str(each).removeprefix(path).lstrip("/"), info)
 
 
-def _file(fs: Any, path: str, below: str) -> RemoteFile:
-    info = fs.info(path)
+def _file(fs: Any, path: str, below: str, listed: dict[str, Any]) -> RemoteFile:
+    info = listed if listed.get("type") == "file" else fs.info(path)  # a link is listed as what it is, not as its file
     # Where nothing tells one content from another, none is taken for known.
     version = next((str(info[name]) for name in _VERSIONS if info.get(name) is not None), uuid.uuid4().hex)
     return RemoteFile(fs.unstrip_protocol(path), below, int(info["size"]), version)

@@ -22,11 +22,12 @@ from hsloc.errors import HslocError, LogError, OutputError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-_FLAT = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "memory")
-"""Object stores: they have no folders, and what is written appears by one call."""
+OBJECT_STORES = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl")
+"""They have no folders, and what is written appears by one call."""
+_FLAT = (*OBJECT_STORES, "memory")
 _VERSIONS = ("ETag", "etag", "md5Hash", "LastModified", "last_modified", "mtime")
 """What tells the content of a file from that of another time; each file system has its own."""
-_PACKAGES = {
+PACKAGES = {
     "s3": "s3fs",
     "s3a": "s3fs",
     "gs": "gcsfs",
@@ -35,6 +36,7 @@ _PACKAGES = {
     "abfss": "adlfs",
     "az": "adlfs",
 }
+"""Packages of the file systems that fsspec does not have itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +229,7 @@ def _file_system(url: str) -> tuple[Any, str]:
         # Listings must be those of the store, not of our memory.
         fs, path = fsspec.url_to_fs(url, use_listings_cache=False)
     except ImportError as error:
-        package = "fsspec" if error.name == "fsspec" else _PACKAGES.get(scheme, str(error.name or error))
+        package = "fsspec" if error.name == "fsspec" else PACKAGES.get(scheme, str(error.name or error))
         raise HslocError(f"{url}: the package {package} is missing; pip install fsspec {package}") from error
     except ValueError as error:
         raise HslocError(f"{url}: {error}") from error

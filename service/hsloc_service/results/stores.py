@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 
 from sqlalchemy import select
 
+from hsloc.sweep.remote import OBJECT_STORES, PACKAGES
 from hsloc_service.db.tables import JobRow, RemovalRow
 from hsloc_service.errors import StoreError
 from hsloc_service.results.store import FolderStore, checked_asset, checked_result
@@ -30,10 +31,6 @@ if TYPE_CHECKING:
     from hsloc_service.results.store import Asset, AssetReader, ResultStore
     from hsloc_service.settings import Settings
     from hsloc_service.storage import Storage
-
-
-FLAT = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl")
-"""Here no folder is made before its files: there is none, and s3fs would make a bucket of a name that was mistyped."""
 
 
 class ObjectStore:
@@ -58,12 +55,13 @@ class ObjectStore:
             # Listings must be those of the store, not of our memory: leftovers are found by them.
             self._fs, root = fsspec.url_to_fs(url, use_listings_cache=False, skip_instance_cache=True)
         except ImportError as error:
-            package = {"s3": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs"}.get(parts.scheme)
+            package = PACKAGES.get(parts.scheme)
             hint = f": pip install {package}" if package else f": {error}"
             raise SettingsError(f"{setting} is {url!r}; its file system is not installed{hint}") from error
         except Exception as error:
             raise SettingsError(f"{setting} is {url!r}, which cannot be used: {error}") from error
-        self._flat = parts.scheme in FLAT
+        self._flat = parts.scheme in OBJECT_STORES
+        """No folder is made before its files: s3fs would make a bucket of a name that was mistyped."""
         self._url = url if url.endswith("://") else url.rstrip("/")
         self._root = f"{str(root).rstrip('/')}/{folder}"
         self._there = False

@@ -106,7 +106,7 @@ def _options() -> dict[str, Any]:
 
 
 def _note_interrupts() -> None:
-    """Ctrl-C ends a worker's run at its next scan: an exception out of the blue would leave halves behind."""
+    """Ctrl-C ends a worker's run at its next scan: an exception at any point would leave halves behind."""
     signal.signal(signal.SIGINT, lambda *_: STOP.set())
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

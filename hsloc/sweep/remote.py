@@ -26,7 +26,7 @@ OBJECT_STORES = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl")
 """They have no folders, and what is written appears by one call."""
 _FLAT = (*OBJECT_STORES, "memory")
 _VERSIONS = ("ETag", "etag", "md5Hash", "LastModified", "last_modified", "mtime")
-"""What tells the content of a file from that of another time; each file system has its own."""
+"""What changes with the content of a file; each file system has its own."""
 PACKAGES = {
     "s3": "s3fs",
     "s3a": "s3fs",
@@ -128,7 +128,7 @@ def _files(fs: Any, path: str, listed: dict[str, Any]) -> Iterator[RemoteFile]:
 
 def _file(fs: Any, path: str, below: str, listed: dict[str, Any]) -> RemoteFile:
     info = listed if listed.get("type") == "file" else fs.info(path)  # a link is listed as what it is, not as its file
-    # Where nothing tells one content from another, none is taken for known.
+    # Where nothing changes with the content, none is taken for known.
     version = next((str(info[name]) for name in _VERSIONS if info.get(name) is not None), uuid.uuid4().hex)
     return RemoteFile(fs.unstrip_protocol(path), below, int(info["size"]), version)
 

@@ -106,7 +106,7 @@ class Settings:
     """Number of attempts after which a job whose process or server was killed ends as crashed."""
     retry: tuple[str, ...] = ()
     """Number of attempts at a job that ends for a reason, such as `signal=3,store=5`: it goes back into the queue until
-    it has had so many. What is not named is not tried again."""
+    it has had that number. What is not named is not tried again."""
     retry_wait_s: float = 10.0
     """Wait before the second attempt by `retry` [s]; doubled for each further one, up to an hour."""
     lease_s: float = 30.0

@@ -36,7 +36,7 @@ MAX_VIEW_BYTES, MAX_PICTURE_BYTES = 1 << 20, 8 << 20
 
 
 class _Monitor:
-    """Of a process that holds no job: there is no lease, and nobody cancels it."""
+    """Of a process that holds no job: there is no lease, and it is not cancelled."""
 
     def begin(self) -> None: ...
 

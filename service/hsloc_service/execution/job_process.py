@@ -67,7 +67,7 @@ def _printable(line: bytes) -> str:
 
 
 class JobMonitor(Protocol):
-    """Who is told how far a process is and what it writes, and says when it has to stop: see `Heartbeat`."""
+    """Receives the progress and the output of a process, and decides when it has to stop: see `Heartbeat`."""
 
     def begin(self) -> None:
         """The process was started."""

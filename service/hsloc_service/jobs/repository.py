@@ -216,7 +216,7 @@ class Jobs:
             note(session, who.tenant, who.token, "job.delete", job.id)
 
     def need_room(self, session: Session, who: Principal, count: int = 1) -> None:
-        """Raises ServiceError 429 where so many more jobs would be too many that wait, 507 for a full disk or quota."""
+        """Raises ServiceError 429 if `count` more jobs would be too many, 507 for a full disk or quota."""
         self.storage.need_space()
         need_quota(session, who, self.settings.tenant_bytes)
         waiting = session.scalar(

@@ -26,7 +26,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 import postgresql
-from rig import Server, Worker, jobs_processes
+from rig import Server, Worker, jobs_processes, kill_all
 from sqlalchemy import select
 
 from hsloc.client import Client, ClientError
@@ -61,12 +61,6 @@ class Fleet:
 
     def folders(self) -> list[Path]:
         return [each.data for each in (*self.servers, *self.workers)]
-
-    def kill(self) -> None:
-        """End what still runs, however this script ends."""
-        for each in (*self.servers, *self.workers):
-            if each.process is not None and each.process.poll() is None:
-                each.process.kill()
 
     def mistreat(self, rng: random.Random) -> str:
         """Do one thing to one of them; what it was."""
@@ -200,7 +194,7 @@ def main() -> int:
     with ExitStack() as stack:
         database = stack.enter_context(postgresql.running())
         fleet = Fleet(folder, database, arguments.workers, arguments.lease_s)
-        stack.callback(fleet.kill)
+        stack.callback(kill_all, *fleet.servers, *fleet.workers)
         begin = time.monotonic()
         clients = []
         for k, server in enumerate(fleet.servers):

@@ -84,6 +84,13 @@ class Worker:
         return self.process.wait(60.0)
 
 
+def kill_all(*each: Server | Worker) -> None:
+    """End what still runs, however a script ends."""
+    for one in each:
+        if one.process is not None and one.process.poll() is None:
+            one.process.kill()
+
+
 def jobs_processes(data: Path) -> list[int]:
     """Processes of jobs that are alive."""
     from hsloc_service.execution.processes import marked

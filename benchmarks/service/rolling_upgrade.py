@@ -14,7 +14,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 import postgresql
-from rig import Server, Worker
+from rig import Server, Worker, kill_all
 
 from hsloc.client import Client
 
@@ -73,9 +73,7 @@ def main() -> int:
                 each.end()
             found["new alone"] = ends(after, submit(after, folder, 3))
         finally:
-            for each in (*servers, *workers):
-                if each.process is not None and each.process.poll() is None:
-                    each.process.kill()
+            kill_all(*servers, *workers)
     for name, states in found.items():
         print(f"{name}: {states}")
     cancelled = found.pop("cancelled at the old server")

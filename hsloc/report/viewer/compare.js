@@ -11,6 +11,16 @@
     return `${percent > 0 ? "+" : "−"}${Math.abs(percent) < 10 ? Math.abs(percent).toFixed(1) : Math.abs(percent).toFixed(0)} %`;
   }
 
+  // A table in a box that scrolls: the box, the row of its head, and its body.
+  function grid(title) {
+    const box = make("div", "", "scroll"), table = make("table", "", "rv-table"), head = table.createTHead().insertRow(), body = table.createTBody();
+    box.tabIndex = 0; box.setAttribute("role", "region"); box.setAttribute("aria-label", title);
+    head.append(make("td"));
+    box.append(table);
+    return [box, head, body];
+  }
+  const heading = (scope, ...content) => { const made = make("th"); made.scope = scope; made.append(...content); return made; };
+
   class ResultComparison {
     // `runs` are {name, href, data, image}: the value of hsloc/report/view.py, and the picture of its map.
     // `seeds` are {names, rows}, or null: see over_seeds in hsloc/report/html.py.
@@ -36,20 +46,16 @@
     }
 
     table(runs) {
-      const box = make("div", "", "scroll"), table = make("table", "", "rv-table"), head = table.createTHead().insertRow(), body = table.createTBody();
-      box.tabIndex = 0; box.setAttribute("role", "region"); box.setAttribute("aria-label", "figures of all runs");
-      head.append(make("td"));
+      const [box, head, body] = grid("figures of all runs");
       runs.forEach((run, k) => {
-        const cell = make("th"), key = make("i", "", "rv-key"), name = make(run.href ? "a" : "span", run.name);
+        const key = make("i", "", "rv-key"), name = make(run.href ? "a" : "span", run.name);
         if (run.href) name.href = run.href;
         key.style.borderColor = `var(--rv-${INKS[k % INKS.length]})`;
-        cell.scope = "col";
-        cell.append(key, " ", name);
-        head.append(cell);
+        head.append(heading("col", key, " ", name));
       });
       const line = (name, texts, explanation = "", changes = []) => {
-        const row = body.insertRow(), label = make("th", name);
-        label.scope = "row"; label.title = explanation;
+        const row = body.insertRow(), label = heading("row", name);
+        label.title = explanation;
         row.append(label);
         texts.forEach((text, k) => { const cell = make("td", text); if (changes[k]) cell.append(" ", make("small", changes[k], "rv-change")); row.append(cell); });
       };
@@ -60,20 +66,13 @@
         line(name, figures.map((each) => each.get(name)?.values.join(" / ") ?? "–"), any.explanation,
           figures.map((each, k) => k && first ? change(first.numbers?.[0], each.get(name)?.numbers?.[0]) : ""));
       }
-      box.append(table);
       return box;
     }
 
     overSeeds({ names, rows }) {
-      const box = make("div", "", "scroll"), table = make("table", "", "rv-table"), head = table.createTHead().insertRow(), body = table.createTBody();
-      box.tabIndex = 0; box.setAttribute("role", "region"); box.setAttribute("aria-label", "figures over seeds");
-      head.append(make("td"), ...names.map((name) => { const cell = make("th", name); cell.scope = "col"; return cell; }));
-      for (const [name, ...cells] of rows) {
-        const row = body.insertRow(), label = make("th", name);
-        label.scope = "row";
-        row.append(label, ...cells.map((text) => make("td", text)));
-      }
-      box.append(table);
+      const [box, head, body] = grid("figures over seeds");
+      head.append(...names.map((name) => heading("col", name)));
+      for (const [name, ...cells] of rows) body.insertRow().append(heading("row", name), ...cells.map((text) => make("td", text)));
       return [make("h2", "Over seeds"), make("p", "Mean ± standard deviation of runs that differ in their seed alone, and the 95 % interval of the mean (bootstrap).", "rv-help"), box];
     }
 

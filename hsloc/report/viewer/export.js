@@ -28,13 +28,11 @@
 
   // The points of a scan by colour, as dots: paths of no length with round ends.
   function dots(view, k, found) {
-    const { x, y, theta, count } = view.data.scans, cos = Math.cos(theta[k]), sin = Math.sin(theta[k]), [px, py] = view.local(x[k], y[k]);
-    for (let i = view.first[k]; i < view.first[k] + count[k]; i += 1) {
-      const bx = view.xy[2 * i], by = view.xy[2 * i + 1], ink = view.pointInk(i);
+    view.eachPoint(k, (x, y, i) => {
+      const ink = view.pointInk(i);
       if (!found.has(ink)) found.set(ink, []);
-      found.get(ink).push(`M${fixed(px + cos * bx - sin * by)} ${fixed(py + sin * bx + cos * by)}h0`);
-    }
-    return found;
+      found.get(ink).push(`M${fixed(x - view.ox)} ${fixed(y - view.oy)}h0`);
+    });
   }
 
   function drawing(view) {

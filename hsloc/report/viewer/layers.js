@@ -44,19 +44,15 @@
     // Mean distance to the map of the scans' points in each cell; made once.
     heat() {
       if (this.cells) return this.cells;
-      const { x, y, theta, count } = this.data.scans, [x0, y0, x1, y1] = this.data.extent, side = Math.max(x1 - x0, y1 - y0) / HEAT_CELLS;
+      const [x0, y0, x1, y1] = this.data.extent, side = Math.max(x1 - x0, y1 - y0) / HEAT_CELLS;
       const width = Math.ceil((x1 - x0) / side), sums = new Map();
-      for (const k of x.keys()) {
-        const cos = Math.cos(theta[k]), sin = Math.sin(theta[k]);
-        for (let i = this.first[k]; i < this.first[k] + count[k]; i += 1) {
-          const bx = this.xy[2 * i], by = this.xy[2 * i + 1];
-          const column = Math.floor((x[k] + cos * bx - sin * by - x0) / side), row = Math.floor((y[k] + sin * bx + cos * by - y0) / side);
-          if (column < 0 || row < 0 || column >= width) continue;
-          const cell = sums.get(row * width + column) ?? [0, 0];
-          cell[0] += this.near[i] / 100; cell[1] += 1;
-          sums.set(row * width + column, cell);
-        }
-      }
+      for (const k of this.data.scans.x.keys()) this.eachPoint(k, (x, y, i) => {
+        const column = Math.floor((x - x0) / side), row = Math.floor((y - y0) / side);
+        if (column < 0 || row < 0 || column >= width) return;
+        const cell = sums.get(row * width + column) ?? [0, 0];
+        cell[0] += this.near[i] / 100; cell[1] += 1;
+        sums.set(row * width + column, cell);
+      });
       this.cells = { side, cells: [...sums].map(([at, [sum, n]]) => [...this.local(x0 + (at % width) * side, y0 + Math.floor(at / width) * side), sum / n]) };
       return this.cells;
     },

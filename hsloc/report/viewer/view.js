@@ -246,13 +246,17 @@
       return paths;
     }
     pointInk(i) { return this.ink(this.near[i] <= NEAR_CM ? "green" : this.near[i] <= FAR_CM ? "orange" : "vermillion"); }
-    drawScan(c, k, size) {
-      const { x, y, theta, count } = this.data.scans, cos = Math.cos(theta[k]), sin = Math.sin(theta[k]), [px, py] = this.local(x[k], y[k]);
+    // Calls work(x, y, i) for each point i of a scan, in the frame of the map.
+    eachPoint(k, work) {
+      const { x, y, theta, count } = this.data.scans, cos = Math.cos(theta[k]), sin = Math.sin(theta[k]);
       for (let i = this.first[k]; i < this.first[k] + count[k]; i += 1) {
         const bx = this.xy[2 * i], by = this.xy[2 * i + 1];
-        c.fillStyle = this.pointInk(i);
-        c.fillRect(px + cos * bx - sin * by - size / 2, py + sin * bx + cos * by - size / 2, size, size);
+        work(x[k] + cos * bx - sin * by, y[k] + sin * bx + cos * by, i);
       }
+    }
+    drawScan(c, k, size) {
+      const left = this.ox + size / 2, low = this.oy + size / 2;
+      this.eachPoint(k, (x, y, i) => { c.fillStyle = this.pointInk(i); c.fillRect(x - left, y - low, size, size); });
     }
     drawOver() {
       const c = this.$over.getContext("2d"), path = this.data.trajectory, scans = this.data.scans, px = this.ratio / this.scale;

@@ -44,13 +44,18 @@ export async function get(path) {
   return value;
 }
 
-export async function post(path, body, headers = {}) {
+async function send(method, path, body, headers = {}) {
   const answer = await request(path, {
-    method: "POST", body: body === undefined ? undefined : JSON.stringify(body),
+    method, body: body === undefined ? undefined : JSON.stringify(body),
     headers: { "Content-Type": "application/json", ...headers },
   });
   return answer.json();
 }
+export const post = (path, body) => send("POST", path, body);
+export const patch = (path, body) => send("PATCH", path, body);
+// For what must not be made twice, should the request be sent twice.
+export const postOnce = (path, body) =>
+  send("POST", path, body, { "Idempotency-Key": crypto.randomUUID ? crypto.randomUUID() : String(Math.random()) });
 
 const ENDED = ["succeeded", "failed", "crashed", "cancelled"];
 

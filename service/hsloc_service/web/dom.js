@@ -12,6 +12,27 @@ export function element(tag, text = "", className = "") {
   return made;
 }
 
+export function cell(...content) {
+  const made = element("td");
+  made.append(...content);
+  return made;
+}
+
+// Of a row ("row") or a column ("col").
+export function heading(scope, text) {
+  const made = element("th", text);
+  made.scope = scope;
+  return made;
+}
+
+// A list below its title, of [text, class]; nothing where there is no line.
+export function list(title, lines) {
+  if (!lines.length) return [];
+  const all = element("ul");
+  all.append(...lines.map(([text, kind]) => element("li", text, kind)));
+  return [element("h3", title), all];
+}
+
 export function button(text, work, className = "") {
   const made = element("button", text, className);
   made.type = "button";

@@ -1,17 +1,13 @@
 // The uploads: what is there, use it again, delete it.
 
 import { get, request } from "./api.js";
-import { $, button, bytes, element, guarded, when } from "./dom.js";
+import { $, button, bytes, cell, element, guarded, when } from "./dom.js";
 
 let shown = [];
 let next = null;
 
 function row(file, useAgain) {
-  const line = element("tr"), cell = (...content) => { const made = element("td"); made.append(...content); line.append(made); };
-  cell(element("span", file.name, "name"));
-  cell(file.state === "complete" ? bytes(file.size) : `${bytes(file.received)} of ${file.size === null ? "?" : bytes(file.size)}`);
-  cell(when(file.created));
-  cell(element("code", file.sha256?.slice(0, 12) ?? ""));
+  const line = element("tr"), size = file.state === "complete" ? bytes(file.size) : `${bytes(file.received)} of ${file.size === null ? "?" : bytes(file.size)}`;
   const buttons = element("div", "", "row");
   if (file.state === "complete") buttons.append(button("New job", () => useAgain(file.id)));
   buttons.append(button("Delete", async () => {
@@ -19,7 +15,7 @@ function row(file, useAgain) {
     await request(`/v1/files/${file.id}`, { method: "DELETE" });
     await show(useAgain);
   }));
-  cell(buttons);
+  line.append(cell(element("span", file.name, "name")), cell(size), cell(when(file.created)), cell(element("code", file.sha256?.slice(0, 12) ?? "")), cell(buttons));
   return line;
 }
 

@@ -1,6 +1,6 @@
 // The form of a new job: files that are dropped, chosen or uploaded already, and the options that the server offers.
 
-import { get, post } from "./api.js";
+import { get, post, postOnce } from "./api.js";
 import { $, bytes, element, guarded, notice, when } from "./dom.js";
 import * as inspection from "./inspect.js";
 import { chosen as chosenOptions } from "./options.js";
@@ -110,7 +110,7 @@ async function submit() {
       return { sweep: (await sweeps.submit({ name, logs: found.map((request) => request.log), seeds, run, ...(configs ? { configs } : {}) })).id };
     }
     for (const request of await requests()) {
-      jobs.push(await post("/v1/jobs", request, { "Idempotency-Key": crypto.randomUUID ? crypto.randomUUID() : String(Math.random()) }));
+      jobs.push(await postOnce("/v1/jobs", request));
     }
   } catch (error) {
     forget(error);

@@ -1,16 +1,9 @@
 // What is in the chosen log, before it is run: topics to pick from, findings, and the map, on which an arrow sets the start.
 
-import { $, duration, element } from "./dom.js";
+import { $, duration, element, list } from "./dom.js";
 
 const TYPES = { "read.scan_topic": /Scan|PointCloud|Echo/i, "read.odom_topic": /Odometry|JointState|TFMessage|FrameTransform|Twist/i, "read.truth_topic": /Pose|Odometry|TFMessage|Transform/i };
 let map = null, topics = [];
-
-const list = (title, lines) => {
-  if (!lines.length) return [];
-  const all = element("ul");
-  all.append(...lines.map(([text, kind]) => element("li", text, kind)));
-  return [element("h3", title), all];
-};
 
 // Offers the topics of the log that was looked at in the form, which may be made only after that.
 export function offerTopics() {
@@ -53,7 +46,7 @@ export async function show(found) {
   }
   listed.append(element("summary", `${found.topics.length} topics`), table);
   box.replaceChildren(element("p", summary), ...(verdict ? [element("p", verdict, "quiet")] : []),
-    ...list("Check", findings), ...list("Warnings", found.warnings.map((text) => [text, ""])), listed);
+    ...list("Check", findings), ...list("Warnings", found.warnings.map((text) => [text])), listed);
   box.hidden = false;
   topics = found.topics;
   offerTopics();

@@ -1,7 +1,7 @@
 // The table of jobs: search, filter, order, pages, and what can be done with those that are ticked.
 
 import { get, post, request } from "./api.js";
-import { $, badge, duration, element, guarded, when } from "./dom.js";
+import { $, badge, cell, duration, element, guarded, when } from "./dom.js";
 import { chips, describe, known, words } from "./labels.js";
 
 const PAGE = 50;
@@ -15,17 +15,14 @@ function row(job) {
   const key = JSON.stringify(job, (name, value) => name === "age_s" || name === "heartbeat_age_s" ? undefined : value);
   const known = rows.get(job.id);
   if (known?.key === key) return known.line;
-  const line = element("tr"), cell = (...content) => { const made = element("td"); made.append(...content); line.append(made); return made; };
-  const box = element("input");
+  const line = element("tr"), box = element("input");
   box.type = "checkbox";
   box.checked = ticked.has(job.id);
   box.setAttribute("aria-label", `tick ${job.log}`);
   box.addEventListener("change", () => { if (box.checked) ticked.add(job.id); else ticked.delete(job.id); tick(); });
-  cell(box);
   const link = element("a", job.title ?? job.log, "name");
   link.href = `#job=${job.id}`;
   link.dataset.job = job.id;
-  cell(link, ...(job.title ? [element("small", job.log, "quiet name")] : []), ...chips(job.labels));
   const result = cell(badge(job)), summary = job.summary ?? {};
   if (job.progress) {
     const bar = element("progress");
@@ -33,11 +30,11 @@ function row(job) {
     bar.setAttribute("aria-label", `${job.progress.phase} of ${job.log}`);
     result.append(bar);
   }
-  cell(summary.key_figures?.map((figure) => `${figure.name} ${figure.values.join(" / ")}`).join(" · ") || job.message || "");
-  cell(summary.mode ?? "");
-  cell(summary.duration_s ? duration(summary.duration_s) : "");
-  cell(job.started && job.ended ? duration((new Date(job.ended) - new Date(job.started)) / 1000) : "");
-  cell(when(job.created) + (job.rerun_of ? ", run again" : ""));
+  line.append(cell(box), cell(link, ...(job.title ? [element("small", job.log, "quiet name")] : []), ...chips(job.labels)), result,
+    cell(summary.key_figures?.map((figure) => `${figure.name} ${figure.values.join(" / ")}`).join(" · ") || job.message || ""),
+    cell(summary.mode ?? ""), cell(summary.duration_s ? duration(summary.duration_s) : ""),
+    cell(job.started && job.ended ? duration((new Date(job.ended) - new Date(job.started)) / 1000) : ""),
+    cell(when(job.created) + (job.rerun_of ? ", run again" : "")));
   if (known && known.line.contains(document.activeElement)) queueMicrotask(() => link.focus());
   rows.set(job.id, { key, line });
   return line;

@@ -1,6 +1,6 @@
 // What a person calls a job and notes about it: title, labels, notes.
 
-import { get, request } from "./api.js";
+import { get, patch } from "./api.js";
 import { $, element, guarded, notice } from "./dom.js";
 
 let shown = null; // id of the job in the form
@@ -14,9 +14,7 @@ export function chips(labels) {
   });
 }
 
-export const describe = async (id, changes) => (await request(`/v1/jobs/${id}`, {
-  method: "PATCH", body: JSON.stringify(changes), headers: { "Content-Type": "application/json" },
-})).json();
+export const describe = (id, changes) => patch(`/v1/jobs/${id}`, changes);
 
 // The words between commas.
 export const words = (text) => [...new Set(text.split(",").map((word) => word.trim()).filter(Boolean))];

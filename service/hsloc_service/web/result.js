@@ -1,7 +1,7 @@
 // One job: its state while it runs, then its result as report.html shows it.
 
 import { events, get, hasToken, post, request } from "./api.js";
-import { $, ACTIVE, badge, button, bytes, element, guarded } from "./dom.js";
+import { $, ACTIVE, badge, button, bytes, cell, element, guarded, heading, list } from "./dom.js";
 import * as labels from "./labels.js";
 import * as share from "./share.js";
 
@@ -203,18 +203,12 @@ function summary(job, whole) {
   }));
   const reasons = short.verdict_reasons ?? [], known = new Set(reasons.map((reason) => reason.text));
   const warnings = whole?.warnings ?? [...(short.warnings ?? []).filter((warning) => !known.has(warning.text)).map(warningText), ...(short.notes ?? [])];
-  const list = (title, lines) => {
-    if (!lines.length) return [];
-    const all = element("ul");
-    all.append(...lines.map((text) => element("li", text)));
-    return [element("h3", title), all];
-  };
-  $("notes").replaceChildren(...list("Look at this", whole?.reasons ?? reasons.map((reason) => reason.line)), ...list("Warnings", warnings));
+  const lines = (texts) => texts.map((text) => [text]);
+  $("notes").replaceChildren(...list("Look at this", lines(whole?.reasons ?? reasons.map((reason) => reason.line))), ...list("Warnings", lines(warnings)));
   const rows = [];
   const row = (name, values, explanation = "") => {
-    const line = element("tr"), head = element("th", name);
-    head.scope = "row";
-    line.append(head, element("td", values.join(", ")), element("td", explanation, "quiet"));
+    const line = element("tr");
+    line.append(heading("row", name), cell(values.join(", ")), element("td", explanation, "quiet"));
     rows.push(line);
   };
   if (found.verdict) row("verdict", [short.verdict_text ?? found.verdict]);

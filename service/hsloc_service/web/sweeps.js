@@ -1,7 +1,7 @@
 // Sweeps: logs x configurations x seeds. Their list, and one as a matrix that fills while its jobs run.
 
-import { get, post, request } from "./api.js";
-import { $, button, element, guarded, when } from "./dom.js";
+import { get, post, postOnce, request } from "./api.js";
+import { $, button, cell, element, guarded, heading, when } from "./dom.js";
 
 const EVERY_MS = 3000;
 let timer = null;
@@ -26,16 +26,14 @@ export function configs(text) {
   return Object.fromEntries(Object.entries(found).map(([label, config]) => [label, { config }]));
 }
 
-export const submit = (body) => post("/v1/sweeps", body, { "Idempotency-Key": crypto.randomUUID ? crypto.randomUUID() : String(Math.random()) });
+export const submit = (body) => postOnce("/v1/sweeps", body);
 
 export async function list() {
   const { sweeps } = await get("/v1/sweeps?limit=200");
   $("sweep-table").tBodies[0].replaceChildren(...sweeps.map((sweep) => {
-    const row = element("tr"), link = element("a", sweep.name || "sweep"), cell = (...content) => { const made = element("td"); made.append(...content); row.append(made); };
+    const row = element("tr"), link = element("a", sweep.name || "sweep");
     link.href = `#sweep=${sweep.id}`;
-    cell(link);
-    cell(`${sweep.jobs} jobs: ${Object.entries(sweep.states).map(([state, n]) => `${n} ${state}`).join(", ")}`);
-    cell(when(sweep.created));
+    row.append(cell(link), cell(`${sweep.jobs} jobs: ${Object.entries(sweep.states).map(([state, n]) => `${n} ${state}`).join(", ")}`), cell(when(sweep.created)));
     return row;
   }));
   $("sweep-table").hidden = sweeps.length === 0;
@@ -56,22 +54,18 @@ export async function show(id) {
   if (!found || location.hash !== `#sweep=${id}`) return;
   $("sweep-title").textContent = found.name || "Sweep";
   const table = $("matrix"), head = element("tr"), lines = [];
-  head.append(element("td"), ...found.configs.map((config) => { const cell = element("th", config); cell.scope = "col"; return cell; }));
+  head.append(element("td"), ...found.configs.map((config) => heading("col", config)));
   const line = (name, cells) => {
-    const row = element("tr"), label = element("th", name);
-    label.scope = "row";
-    row.append(label, ...cells);
+    const row = element("tr");
+    row.append(heading("row", name), ...cells);
     lines.push(row);
   };
-  found.logs.forEach((log, k) => line(log, found.cells[k].map((cell) => {
-    const made = element("td"), links = element("div");
-    links.append(...cell.runs.flatMap((each) => [run(each), " "]));
-    made.append(links, ...cell.texts.map((text) => element("div", text)));
-    return made;
+  found.logs.forEach((log, k) => line(log, found.cells[k].map(({ runs, texts }) => {
+    const links = element("div");
+    links.append(...runs.flatMap((each) => [run(each), " "]));
+    return cell(links, ...texts.map((text) => element("div", text)));
   })));
-  if (found.logs.length > 1) {
-    line("all logs", found.overall.map((texts) => { const made = element("td"); made.append(...texts.map((text) => element("div", text))); return made; }));
-  }
+  if (found.logs.length > 1) line("all logs", found.overall.map((texts) => cell(...texts.map((text) => element("div", text)))));
   table.tHead.replaceChildren(head);
   table.tBodies[0].replaceChildren(...lines);
   const buttons = found.ended ? [button("Delete", async () => {

@@ -15,6 +15,7 @@ import numpy as np
 from hsloc.kernels.normal_equations import Equations, PairTerms, add_edges, add_pairs, evaluate_pairs
 from hsloc.model.pose2 import wrap_angles
 from hsloc.parameters import Count, CountOrNone, NonNegative, Parameters, Positive
+from hsloc.slam.keyscans import views
 from hsloc.slam.pose_graph import apply_increment, solve_anchored
 from hsloc.slam.sparse_solver import BlockSystem
 
@@ -146,8 +147,6 @@ def moved_scans(step: F64) -> float:
     return float(np.percentile(np.abs(step * (1.0, 1.0, 5.0)).max(axis=1), 99.0))
 
 
-_HEADINGS = 8
-"""Sectors of heading that count as different views. Internal: `max_partners` is what is to be set."""
 _AT_ONCE = 512
 """Scans whose neighbours are listed together. Internal: memory alone, the results are the same."""
 
@@ -163,9 +162,7 @@ def neighbour_pairs(poses: F64, radius: float, most: int, temporal: int, crowd: 
     from scipy.spatial import cKDTree
 
     n = len(poses)
-    sector = np.floor(poses[:, 2] / (2.0 * np.pi) * _HEADINGS).astype(np.int64) % _HEADINGS
-    cell = np.floor(poses[:, :2] / (0.5 * radius)).astype(np.int64)
-    sort = (cell[:, 0] * 1000003 + cell[:, 1]) * _HEADINGS + sector
+    sort = views(poses, 0.5 * radius)
     known = _thinned(sort, crowd)
     tree = cKDTree(poses[known, :2])
     keys = [np.arange(n - gap) * n + np.arange(gap, n) for gap in range(1, temporal + 1)]

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _SURFEL_RADIUS = 0.2
 """Distance (m) of the hits to which a line is fitted. Internal: the size of the smallest walls, door frames."""
+_HEADINGS = 8
+"""Sectors of heading that count as different views. Internal: the `max_partners` of a keyscan is what is to be set."""
 
 _BACK = (1, 2, 4, 8, 16)
 """Which of the last keyscans are compared: a long base line against drift, few scans against cost."""
@@ -179,6 +181,13 @@ class KeyScans:
 def starts_of(lengths: list[int]) -> I64:
     """Where each of n parts begins if they are stored one after the other, and the end of the last, shape (n + 1,)."""
     return np.concatenate(([0], np.cumsum(lengths))).astype(np.int64)
+
+
+def views(poses: F64, side: float) -> I64:
+    """A number (n,) for the square of `side` metres and the sector of heading of each pose (n, 3)."""
+    sector = np.floor(poses[:, 2] / (2.0 * np.pi) * _HEADINGS).astype(np.int64) % _HEADINGS
+    cell = np.floor(poses[:, :2] / side).astype(np.int64)
+    return np.asarray((cell[:, 0] * 1000003 + cell[:, 1]) * _HEADINGS + sector)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

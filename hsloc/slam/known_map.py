@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.model.pose2 import Pose2, rotated
-from hsloc.slam.keyscans import MovingScan, register_onto
+from hsloc.slam.keyscans import MovingScan, register_onto, views
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 _PLACE_M = 0.5
 """Side [m] of the squares of which one keyscan for each heading is compared: as far apart as those before a scan."""
-_HEADINGS = 8
-"""Sectors of heading that count as different views, as in the joint registration."""
 _METRES_OF_A_HALF_TURN = 4.0
 """Distance [m] between two keyscans of one place that face opposite ways, where the nearest are chosen."""
 _REACH_M = 1.2
@@ -67,7 +65,8 @@ class KnownMap:
 
         self._scans = scans
         self._poses = poses
-        self._rows = _one_of_each_view(poses)
+        _, first = np.unique(views(poses, _PLACE_M), return_index=True)
+        self._rows = np.sort(first)
         self._tree = cKDTree(_embedded(poses[self._rows]))
         self._cells = _cells_with_hits(scans, poses, max_range)
         self._moving: dict[int, MovingScan] = {}
@@ -158,14 +157,6 @@ class KnownMapTracker:
         """The same of a new keyscan, if it is the first since the map was left."""
         row, self._left_from = self._left_from, None
         return None if row is None else self.map.anchor(row, pose, covariance)
-
-
-def _one_of_each_view(poses: F64) -> I64:
-    """Rows of the first keyscan of each square and heading, ascending."""
-    cell = np.floor(poses[:, :2] / _PLACE_M).astype(np.int64)
-    sector = np.floor(poses[:, 2] / (2.0 * np.pi) * _HEADINGS).astype(np.int64) % _HEADINGS
-    _, first = np.unique((cell[:, 0] * _ROW + cell[:, 1]) * _HEADINGS + sector, return_index=True)
-    return np.sort(first).astype(np.int64)
 
 
 def _embedded(poses: F64) -> F64:

@@ -96,13 +96,9 @@ def plan(
     """
     runs: list[SweepRun] = []
     seeds = list(seeds)
-    places = [(paths,) if isinstance(paths, Path | RemoteLog) else paths for paths in logs]
-    for paths, label in zip(logs, log_labels([each[0].name for each in places]), strict=True):
-        remote = paths if isinstance(paths, RemoteLog) else None
-        if isinstance(paths, RemoteLog):
-            parts: tuple[Path, ...] = (Path(paths.name),)
-        else:
-            parts = (paths,) if isinstance(paths, Path) else tuple(paths)
+    places = [_parts(log) for log in logs]
+    for log, parts, label in zip(logs, places, log_labels([each[0].name for each in places]), strict=True):
+        remote = log if isinstance(log, RemoteLog) else None
         for name, item in configs.items():
             preset, config = item if isinstance(item, tuple) else ("default", item)
             for seed in seeds:
@@ -112,6 +108,13 @@ def plan(
                 request = RunRequest.from_values(parts, values)
                 runs.append(SweepRun(f"{label}-{name}-seed{seed}".replace("/", "_"), label, name, request, remote))
     return runs
+
+
+def _parts(log: Path | RemoteLog | Sequence[Path]) -> tuple[Path, ...]:
+    """The paths of a log; of one at a URL its name."""
+    if isinstance(log, RemoteLog):
+        return (Path(log.name),)
+    return (log,) if isinstance(log, Path) else tuple(log)
 
 
 def sweep(

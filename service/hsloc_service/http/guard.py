@@ -95,14 +95,9 @@ class Guard:
                 await self._app(inner, self._counted(scope, receive), send_on)
             except BrokenAnswer as error:
                 # Returning before the end makes uvicorn close the connection.
-                log(
-                    "answer.broken",
-                    logging.WARNING,
-                    route=getattr(inner.get("route"), "path", "other"),
-                    error=str(error),
-                )
+                log("answer.broken", logging.WARNING, route=_route(inner), error=str(error))
         finally:
-            route = getattr(inner.get("route"), "path", "other")
+            route = _route(inner)
             seconds = time.perf_counter() - begin
             # A method is any word that a client makes up: each would be a series of its own, kept for ever.
             method = scope["method"] if scope["method"] in METHODS else "other"
@@ -200,6 +195,11 @@ class Guard:
             return message
 
         return counted
+
+
+def _route(scope: Scope) -> str:
+    """The path of a request as its route has it, without what a client put in."""
+    return getattr(scope.get("route"), "path", "other")
 
 
 def _without_head(scope: Scope, send: Send) -> tuple[Scope, Send]:

@@ -108,21 +108,15 @@ def test_events_come_while_the_job_runs(proxied: tuple[Live, str]) -> None:
     assert moments[-1] - moments[0] > 2.0  # else the proxy kept them until the end
 
 
-def test_the_page_works(proxied: tuple[Live, str], tmp_path: Path) -> None:
-    sync_api = pytest.importorskip("playwright.sync_api", reason="THE PAGE IS NOT TESTED: playwright is not installed")
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("THE PAGE IS NOT TESTED: no chromium (apt-get install chromium)")
+def test_the_page_works(proxied: tuple[Live, str], tmp_path: Path, browser: Any) -> None:
     log = tmp_path / "run.mcap"
     log.write_bytes(b"slow 3 " + bytes(3_000_000))
-    with sync_api.sync_playwright() as playwright:
-        browser: Any = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
-        page = browser.new_page()
-        page.set_default_timeout(30_000)
-        page.goto(proxied[1])
-        page.set_input_files("#log", str(log))
-        page.click("#go")
-        page.wait_for_selector("#job-state .running")
-        page.wait_for_function("() => document.querySelector('#job-state').textContent.includes('replay')")
-        page.wait_for_selector("#job-state .succeeded")
-        browser.close()
+    page = browser.new_page()
+    page.set_default_timeout(30_000)
+    page.goto(proxied[1])
+    page.set_input_files("#log", str(log))
+    page.click("#go")
+    page.wait_for_selector("#job-state .running")
+    page.wait_for_function("() => document.querySelector('#job-state').textContent.includes('replay')")
+    page.wait_for_selector("#job-state .succeeded")
+    page.close()

@@ -124,11 +124,11 @@ def add_service(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def service_client(url: str) -> Client:
-    """A client of a service, with the token of $HSLOC_TOKEN."""
+def service_client(arguments: argparse.Namespace) -> Client:
+    """A client of the service of `--url`, with the token of $HSLOC_TOKEN."""
     from hsloc.client import Client
 
-    return Client(url, os.environ.get("HSLOC_TOKEN"))
+    return Client(arguments.url, os.environ.get("HSLOC_TOKEN"))
 
 
 def add_no_progress(parser: argparse._ActionsContainer) -> None:

@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Upload, submit, wait, fetch."""
     from hsloc.cli.main import EXIT_BELOW_LIMIT, EXIT_DATA_LOST, EXIT_FAILED, EXIT_OK
 
-    client = service_client(arguments.url)
+    client = service_client(arguments)
     with ProgressLine(arguments.quiet or arguments.no_progress) as line:
 
         def uploaded(done: int, total: int) -> None:

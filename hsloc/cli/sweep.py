@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hsloc.cli.arguments import add_no_progress, add_options, service_client, values
+from hsloc.cli.arguments import add_no_progress, add_options, values
 from hsloc.cli.progress import ProgressLine
 from hsloc.options import BY_NAME, MATCHER_ALIASES
 
@@ -157,11 +158,12 @@ def _sweep(arguments: argparse.Namespace, runs: list[SweepRun]) -> list[Outcome]
 def _sweep_by_service(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """Upload the logs, have a service do the runs, and wait for the table."""
     from hsloc.cli.submit import request_of
+    from hsloc.client import Client
     from hsloc.config import differences, nested, preset
     from hsloc.errors import HslocError
     from hsloc.sweep.runs import DONE, FAILED
 
-    client = service_client(arguments.service)
+    client = Client(arguments.service, os.environ.get("HSLOC_TOKEN"))
     varied_options = {
         label: {
             "preset": base,

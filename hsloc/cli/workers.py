@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.cli.main import EXIT_FAILED, EXIT_OK
     from hsloc.text_table import table
 
-    found: list[dict[str, Any]] = service_client(arguments.url).workers()
+    found: list[dict[str, Any]] = service_client(arguments).workers()
     if arguments.json:
         print(json.dumps(found, indent=2))
     elif not found:

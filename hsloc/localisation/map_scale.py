@@ -63,7 +63,7 @@ _PRIOR_WALLS = 10.0
 _LEAST_SIGMA = 0.002
 """Standard deviation of a wall's place, at least (m): no building is drawn better."""
 _SIGMAS, _LEAST = 3.0, 0.005
-"""A scale is significant if it is off 1 by so many standard deviations, and by this much: 5 cm in 10 m."""
+"""A scale is significant if it differs from 1 by this number of standard deviations, and by this much: 5 cm in 10 m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +211,7 @@ class MapScaleEstimator:
         """The scale and its standard deviation; None before `_FEWEST_BLOCKS` blocks of path were seen.
 
         Two errors: the scatter of the blocks (jackknife), and that of how walls are drawn, which is the same wherever
-        a wall is seen: a cell's uniform distribution by the spread of the ranges that tells scale from offset.
+        a wall is seen: a cell's uniform distribution by the spread of the ranges that distinguishes scale from offset.
         """
         n = len(self._information)
         if n < _FEWEST_BLOCKS:

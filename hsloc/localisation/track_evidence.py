@@ -87,7 +87,7 @@ _FEWEST_JOINED = 4
 """Scans that a place is compared by, at least."""
 _RAREST = 4
 """Intervals that pass between two comparisons where the last ones said the same, at most: over 32 m a look-alike has a
-probability of 3 %, and a jump into one is told by the scans, after which comparisons are frequent again."""
+probability of 3 %, and a jump into one is noticed in the scans, after which comparisons are frequent again."""
 _FIRST_COMPARISON_M = 3.0
 """A new track is compared with the whole map after this path length (m), or after the usual one if that is shorter."""
 

@@ -59,9 +59,9 @@ def write_log(path: Path, seed: int, seconds: float, world: str) -> dict[str, fl
     }  # fmt: skip
 
 
-def compare(path: Path, truth: dict[str, float], given: Path | None = None) -> dict[str, tuple[float, float]]:
+def compare(path: Path, truth: dict[str, float]) -> dict[str, tuple[float, float]]:
     """Error and half of the 95 % interval of each value."""
-    found = calibrate(RunRequest(logs=(path,), map_path=given))
+    found = calibrate(RunRequest(logs=(path,)))
     estimate = found.estimate
     values = dict(zip(NAMES, estimate.values.tolist(), strict=True))
     sigmas = dict(zip(NAMES, estimate.sigmas.tolist(), strict=True))

@@ -21,9 +21,7 @@ from hsloc.kernels.point_to_line import ScanArrays, Term, pair_terms
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    F32 = NDArray[np.float32]
     F64 = NDArray[np.float64]
-    I32 = NDArray[np.int32]
     I64 = NDArray[np.int64]
 
 _STILL_M = 1e-4

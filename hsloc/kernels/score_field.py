@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     Integers = NDArray[np.uint16] | NDArray[np.int32]
     I64 = NDArray[np.int64]
     F32 = NDArray[np.float32]
-    F64 = NDArray[np.float64]
 
 _STEPS = 64
 """Entries of the decay table per squared cell."""

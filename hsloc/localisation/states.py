@@ -34,8 +34,6 @@ _POOR_FIT = 0.92
 """Explained fitness by the usual one below which a doubted pose is taken for off the map."""
 _SETTLED = 5
 """Matches after which the covariance no longer knows how a track began."""
-_BRIDGED_M = 2.0
-"""Over this path length of refused scans the pose is interpolated if the next match agrees with the prediction (m)."""
 
 USABLE_SHARE = 0.5
 """Least share of localised poses of a result that is usable as a whole."""

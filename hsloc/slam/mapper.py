@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.random import Generator
-    from numpy.typing import NDArray
 
     from hsloc.model.events import Scan
     from hsloc.slam.front_end import LocalMatch
@@ -37,8 +36,6 @@ if TYPE_CHECKING:
     from hsloc.slam.known_map import Anchor
     from hsloc.slam.parameters import GraphMapperParameters, Resume
     from hsloc.slam.result import MappingResult
-
-    F64 = NDArray[np.float64]
 
 
 class Mapper:

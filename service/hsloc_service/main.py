@@ -18,12 +18,11 @@ import uvicorn
 
 from hsloc_service import audit
 from hsloc_service.auth import SCOPES, Tokens
-from hsloc_service.backup import back_up
+from hsloc_service.backup import back_up, move
 from hsloc_service.db.database import database_place, open_database
 from hsloc_service.http.app import create_app
 from hsloc_service.http.middleware import protocol_class
 from hsloc_service.logs import configure
-from hsloc_service.move import move
 from hsloc_service.settings import Settings, SettingsError
 from hsloc_service.storage import Storage
 

@@ -26,7 +26,7 @@ from hsloc.matching.local_refinement import refine
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Evidence, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
-from hsloc.model.pose2 import IDENTITY, Pose2, rotated
+from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.parameters import Angle, Count, NonNegative, OneOf, Parameters, Positive, Ratio
 
 if TYPE_CHECKING:
@@ -223,8 +223,8 @@ class Localiser:
         if not self._match_gate.is_fresh and not self._motion_gate.is_open(motion):
             return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
         propagated = predict_covariance(self._covariance, self._T_map_match, motion, np.zeros((3, 3)))
-        noise = rotated(self._motion_model.covariance(motion), self._T_map_match.theta)
-        covariance = propagated + max(self._innovations.noise_scale, 1.0) * noise
+        noise = self._motion_model.covariance(motion)
+        covariance = propagated + self._innovations.moved(self._T_map_match, motion, noise)
         points = paired.points_base()
         for each in (self._monitor, self._map_scale):
             if each is not None:
@@ -243,7 +243,7 @@ class Localiser:
         if p.fuse:
             if information is not None:
                 information = self._match_gate.trust(match.fitness) * information
-                self._innovations.add(difference(match.pose, predicted), information, propagated, noise)
+                self._innovations.add(difference(match.pose, predicted), information, propagated)
             pose, covariance = fuse_match(predicted, covariance, match, information)
         else:
             pose, covariance = match.pose, match.covariance
@@ -350,6 +350,7 @@ class Localiser:
         if result.is_sure:
             self._searching = False
             self._match_gate.restart(result.fitness)
+            self._innovations.restart()
             if self._monitor is not None:
                 self._monitor.begin()
             status = Status.RELOCALISED

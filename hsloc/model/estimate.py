@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from hsloc.model.certificate import Certificate
@@ -94,8 +95,8 @@ class Estimate:
     """What the scan says about the track, of an estimator that weighs it."""
     certificate: Certificate | None = None
     """What was proven about the match, where it was asked for."""
-    noise_scale: float = 1.0
-    """Variance of the odometry by the assumed one, as the scans so far show it."""
+    noise_scale: NDArray[np.float64] = field(default_factory=lambda: np.ones(3))
+    """Variances (3,) of the odometry ahead, sideways and in heading by the assumed ones, as the scans so far show."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from live_service import settings, submit, wait
-from sqlalchemy import update
+from sqlalchemy import text, update
 
 from hsloc_service.auth import ANYBODY, Principal
 from hsloc_service.db.database import open_database
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from fastapi.testclient import TestClient
     from postgresql import Server
+    from sqlalchemy.orm import Session
 
 OTHER = Principal("other", ANYBODY.scopes)
 
@@ -327,6 +328,38 @@ def test_claims_at_the_same_time_do_not_pass_the_share(parts: Parts) -> None:
     with ThreadPoolExecutor(8) as executor:
         claims = list(executor.map(lambda k: leases.claim(f"w{k}"), range(8)))
     assert sum(claim is not None for claim in claims) == 3
+
+
+def test_a_claim_that_waits_for_a_tenants_share_holds_no_other(tmp_path: Path, postgresql: Server) -> None:
+    """Else two claims that take the tenants in different orders wait for each other."""
+    parts = Parts(tmp_path, postgresql.new_database())
+    taken = parts.submit()
+    other = parts.submit(OTHER)
+    parts.submit()
+    leases, database = replace(parts.leases(), max_running=1), parts.database
+
+    def wait_for_a_waiting_claim(session: Session) -> None:
+        for _ in range(1000):
+            if session.execute(text("SELECT count(*) FROM pg_locks WHERE NOT granted")).scalar_one():
+                return
+            time.sleep(0.005)
+        pytest.fail("no claim waits")
+
+    with ThreadPoolExecutor(1) as executor, database.write() as second:
+        database.lock(second, f"running {OTHER.tenant}")
+        with database.write() as first:
+            database.lock(first, f"running {ANYBODY.tenant}")
+            claim = executor.submit(leases.claim, "w")
+            wait_for_a_waiting_claim(first)
+            first.execute(update(JobRow).where(JobRow.id == taken).values(state="running"))
+        wait_for_a_waiting_claim(second)  # for the other tenant now, as the first has its share
+        database.lock(second, f"running {ANYBODY.tenant}")
+        second.commit()
+        found = claim.result()
+    assert found is not None
+    assert found.job_id == other
+    database.close()
+    parts.storage.close()
 
 
 def test_a_reason_is_retried_as_the_policy_says(parts: Parts) -> None:

@@ -202,14 +202,20 @@ class Leases:
             or_(JobRow.tag.is_(None), JobRow.tag.in_(self.tags)),
             or_(JobRow.not_before.is_(None), JobRow.not_before <= now),
         )
+        query = select(JobRow).where(*waiting).order_by(JobRow.priority.desc(), JobRow.seq).limit(1)
         for running, _, _, tenant in _turns(session, waiting):
             if running >= self.max_running:
                 break  # those that come have as many, or more
-            if self.max_running < UNLIMITED and not self._may_run(session, tenant):
-                continue
-            query = select(JobRow).where(*waiting, JobRow.tenant == tenant)
-            query = query.order_by(JobRow.priority.desc(), JobRow.seq).limit(1)
-            job = session.scalar(query.with_for_update(skip_locked=True))
+            of_tenant = query.where(JobRow.tenant == tenant).with_for_update(skip_locked=True)
+            if self.max_running >= UNLIMITED:
+                job = session.scalar(of_tenant)
+            else:
+                # Rolled back, the savepoint gives up the tenant's lock: a claim that kept it while it waited for that
+                # of the next tenant, and one that took them in another order, would wait for each other.
+                savepoint = session.begin_nested()
+                job = session.scalar(of_tenant) if self._may_run(session, tenant) else None
+                if job is None:
+                    savepoint.rollback()
             if job is not None:
                 return job
         return None

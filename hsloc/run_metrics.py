@@ -94,7 +94,7 @@ class LogMetrics:
     odometry_messages: int
     """Number of odometry messages that were used."""
     path_length_m: float
-    """Length of the estimated trajectory [m]."""
+    """Length of the estimated trajectory, of the odometry where the pose is a guess [m]."""
     first_stamp_ns: int | None
     """Stamp of the first pose [ns since the epoch of the log's clock]; null without a pose."""
     odometry: str | None

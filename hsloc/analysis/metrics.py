@@ -70,12 +70,23 @@ def log_metrics(result: Result) -> LogMetrics:
     return LogMetrics(
         duration_s=duration(result),
         odometry_messages=len(result.odometry),
-        path_length_m=result.trajectory.length(),
+        path_length_m=_path_length(result),
         first_stamp_ns=int(stamps.min()) if len(stamps) else None,
         odometry=None if result.lidar_only else summary.odom_topic,
         reference=None if result.reference is None else reference,
         lasers=tuple(LaserMetrics.of(laser) for laser in lasers),
     )
+
+
+def _path_length(result: Result) -> float:
+    """Of the trajectory; of the odometry where a pose is a guess, which jumps from place to place."""
+    if len(result.odometry) != len(result.trajectory) or result.mapping is not None:
+        return result.trajectory.length()
+    steps, by_odometry = (
+        np.hypot(*np.diff(path.poses[:, :2], axis=0).T) for path in (result.trajectory, result.odometry)
+    )
+    known = result.localised if result.tracked is None else result.tracked
+    return float(np.where(known[1:] & known[:-1], steps, by_odometry).sum())
 
 
 def scan_counts(result: Result) -> ScanCounts:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,8 +46,7 @@ def quality_warnings(result: Result) -> list[RunWarning]:
     if result.mode != "localise":
         return []
     of_scale = _scale_warnings(result)
-    status = Counter(result.diagnostics.status)
-    without, scans = status["searching"] + status["rejected"], len(result.diagnostics)
+    without, scans = int(_without_place(result).sum()), len(result.diagnostics)
     if without <= _MAX_WITHOUT_PLACE * scans:
         return of_scale
     share = _share(result)
@@ -124,8 +122,11 @@ def verdict_reasons(result: Result, warnings: Sequence[RunWarning]) -> tuple[Ver
             reasons.append(VerdictReason(verdict, warning.code, warning.text, warning.remedy))
     if result.mapping is not None:
         reasons += _of_the_map(result.mapping, result)
-    if result.states is not None and (_share(result) > 0.0 or not reasons):
-        reasons += localisation_reasons(result.states, result.trajectory)
+    if result.states is not None:
+        of_poses = localisation_reasons(result.states, result.trajectory, result.ambiguities)
+        # Where every pose is a guess the scans without a place say so already, but not that several places fit.
+        whole = _share(result) > 0.0 or not reasons
+        reasons += [reason for reason in of_poses if whole or reason.code == "poses_ambiguous"]
     return tuple(reasons)
 
 
@@ -153,8 +154,16 @@ def _share(result: Result) -> float:
 
 def _unplaced(result: Result) -> tuple[tuple[float, float], ...]:
     """Spans in which no scan found a place."""
-    without = np.isin(result.diagnostics.status, ("searching", "rejected"))
-    return _times(result.diagnostics.stamps_ns, spans_of(without), result)
+    return _times(result.diagnostics.stamps_ns, spans_of(_without_place(result)), result)
+
+
+def _without_place(result: Result) -> NDArray[np.bool_]:
+    """Which scans found no place; those that found several are ambiguous."""
+    stamps = result.diagnostics.stamps_ns
+    without: NDArray[np.bool_] = np.isin(result.diagnostics.status, ("searching", "rejected"))
+    for each in result.ambiguities:
+        without &= (stamps < each.begin_ns) | (stamps > each.end_ns)
+    return without
 
 
 def _times(

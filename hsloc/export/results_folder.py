@@ -31,12 +31,13 @@ from hsloc.slam.map_state import STATE_FILE, write_state
 from hsloc.trajectory_io.tum import format_stamp
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from os import PathLike
 
     from numpy.typing import NDArray
 
     from hsloc.localisation.states import StateRows
+    from hsloc.model.estimate import Ambiguity
     from hsloc.replay.map_merge import MapMerge
     from hsloc.replay.run import Result
     from hsloc.report.view import ReportView
@@ -47,6 +48,8 @@ STATES_HEADER = ("t", "state", "probability", "sigma_x", "sigma_y", "sigma_theta
 _OF_RESULTS = (("metrics.json", "config.yaml"), ("results.json", "report.md"))
 """Files that a folder of results holds, of a run or of the reproduced experiments, and no other folder."""
 
+HYPOTHESES_HEADER = "begin,end,t,x,y,theta,probability"
+"""A stretch in which several places of the map fit, and one of these, T_map_base at the stamp t."""
 COVARIANCES_HEADER = "t,xx,xy,xtheta,yy,ytheta,thetatheta"
 
 
@@ -110,6 +113,8 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
     write_tum(folder / "trajectory.tum", result.trajectory)
     if result.states is not None:
         write_states(folder / "states.csv", result.trajectory.stamps_ns, result.states)
+    if result.ambiguities:
+        write_hypotheses(folder / "hypotheses.csv", result.ambiguities)
     if len(result.odometry):
         write_tum(folder / "odometry.tum", result.odometry)
     if result.reference is not None:
@@ -150,6 +155,7 @@ def report_parts(result: Result, analysis: Analysis) -> ReportParts:
         overlay=analysis.overlay,
         mapping=result.mapping,
         provenance=provenance(result),
+        ambiguities=result.ambiguities,
         convergence=analysis.convergence,
     )
 
@@ -171,6 +177,16 @@ def write_states(path: Path, stamps_ns: NDArray[np.int64], rows: StateRows) -> N
         for stamp_ns, state, probability, (x, y, theta), fitness, reason in columns:
             figures = (f"{probability:.4f}", f"{x:.4f}", f"{y:.4f}", f"{theta:.5f}", f"{fitness:.3f}")
             writer.writerow((format_stamp(stamp_ns), state.value, *figures, reason))
+
+
+def write_hypotheses(path: Path, ambiguities: Sequence[Ambiguity]) -> None:
+    """Write one line for each place between which the run does not decide: seconds, metres and radians."""
+    lines = [HYPOTHESES_HEADER]
+    for each in ambiguities:
+        stamps = ",".join(map(format_stamp, (each.begin_ns, each.end_ns, each.stamp_ns)))
+        for pose, probability in each.places:
+            lines.append(f"{stamps},{pose.x:.3f},{pose.y:.3f},{pose.theta:.4f},{probability:.4f}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def write_covariances(path: Path, stamps_ns: NDArray[np.int64], covariances: NDArray[np.float64]) -> None:

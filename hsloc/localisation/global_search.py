@@ -3,17 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import exp
 from typing import TYPE_CHECKING, Protocol
 
-from hsloc.model.estimate import State
+from hsloc.localisation.track_evidence import rival_evidence
+from hsloc.model.estimate import LikelyPlace, State
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     import numpy as np
     from numpy.typing import NDArray
 
     from hsloc.model.estimate import Evidence
     from hsloc.model.events import PairedScan
     from hsloc.model.pose2 import Pose2
+
+MOST_PLACES = 8
+"""Places that are kept where several fit; a picture with more of them shows none."""
+
+
+def most_likely(found: Iterable[tuple[Pose2, float]]) -> tuple[LikelyPlace, ...]:
+    """The most probable of places with the mean fitness of the same scans there, if one of all these is the right one.
+
+    The odds of two places are what the ratio of their fitness says (see `rival_evidence`).
+    """
+    places = sorted(found, key=lambda each: -each[1])
+    best = max((fitness for _, fitness in places), default=0.0)
+    weights = [exp(-max(rival_evidence(fitness / max(best, 1e-9)), 0.0)) for _, fitness in places]
+    pairs = zip(places[:MOST_PLACES], weights, strict=False)
+    return tuple(LikelyPlace(pose, weight / sum(weights)) for (pose, _), weight in pairs)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +57,8 @@ class RelocaliserResult:
     """While it is not sure: whether several places fit, none does, or too few scans were seen."""
     evidence: Evidence | None = None
     """Once it is sure: what its scans say for the place."""
+    places: tuple[LikelyPlace, ...] = ()
+    """While several places fit: the most probable ones, T_map_base at the last scan that was used."""
 
 
 class GlobalSearch(Protocol):

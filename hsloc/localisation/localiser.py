@@ -366,6 +366,7 @@ class Localiser:
             self._revision(result),
             None if result.is_sure else result.state,
             None if self._monitor is None else result.evidence or Evidence(0.0),
+            places=result.places,
         )
 
     def _revision(self, result: RelocaliserResult) -> tuple[tuple[int, Pose2], ...]:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.localisation.gates import MotionGate
-from hsloc.localisation.global_search import RelocaliserResult
+from hsloc.localisation.global_search import RelocaliserResult, most_likely
 from hsloc.localisation.hypotheses import (
     RECORDED,
     CandidateLimits,
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from hsloc.localisation.whole_map_search import WholeMapSearch
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
+    from hsloc.model.estimate import LikelyPlace
     from hsloc.model.events import PairedScan
     from hsloc.model.occupancy_grid import OccupancyGrid
 
@@ -142,6 +143,7 @@ class Relocaliser:
         self._explained: float | None = None
         self._weigh_at = 0
         self._state = State.LOST
+        self._places: tuple[LikelyPlace, ...] = ()
         self._usual = USUAL_EXPLAINED
         self._field = likelihood
         self._matcher = matcher
@@ -162,7 +164,7 @@ class Relocaliser:
         self._hypotheses = []
         self._T_odom_last = self._explained = None
         self._weigh_at = 0
-        self._state = State.LOST
+        self._state, self._places = State.LOST, ()
         self._seen.clear()
 
     def places(self) -> list[Pose2]:
@@ -298,6 +300,8 @@ class Relocaliser:
         evidence: Evidence | None = None
         if fresh:
             self._state = self._judge(best, pose)
+            several = self._hypotheses if self._state is State.AMBIGUOUS else ()
+            self._places = most_likely((each.pose, each.mean) for each in several)
         others = self._hypotheses[1:]
         proven = bool(others) and all(fits_better(best.history, other.history, p.confidence) for other in others)
         sure = fresh and ahead and (proven or ratio <= p.max_rival_ratio)
@@ -320,6 +324,7 @@ class Relocaliser:
             whole,
             self._state,
             evidence if sure else None,
+            self._places,
         )
 
     def _is_poor(self) -> bool:

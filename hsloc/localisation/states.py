@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.localisation.track_evidence import TrackRow, smooth, usual_explained
-from hsloc.model.estimate import Evidence, State, Status
+from hsloc.model.estimate import Ambiguity, Evidence, LikelyPlace, State, Status
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
 
 if TYPE_CHECKING:
@@ -35,6 +36,8 @@ _POOR_FIT = 0.92
 _SETTLED = 5
 """Matches after which the covariance no longer knows how a track began."""
 
+_NAMED = 3
+"""Places that are named where several fit."""
 USABLE_SHARE = 0.5
 """Least share of localised poses of a result that is usable as a whole."""
 TOLERATED_SHARE = 0.01
@@ -151,6 +154,43 @@ class StateLog:
         fitness = np.array([np.nan if e.fitness is None else e.fitness for e in self._estimates])
         return StateRows(tuple(states), probability, sigma, fitness, tuple(reasons))
 
+    def ambiguities(self) -> tuple[Ambiguity, ...]:
+        """The stretches of the scans that are ambiguous, with the places between which they do not decide."""
+        rows, owners = self._tracks()
+        probabilities, states = smooth(rows), self.at_scans().state
+        found = []
+        for first, last in spans_of(np.array([state is State.AMBIGUOUS for state in states], dtype=np.bool_)):
+            # A search and the track that follows it know of different places.
+            is_guess = [owner < 0 for owner in owners[first : last + 1]]
+            edges = [first, *(first + k for k in range(1, len(is_guess)) if is_guess[k] != is_guess[k - 1]), last + 1]
+            for begin, end in pairwise(edges):
+                at, places = self._places(end - 1, begin, owners, probabilities)
+                if len(places) > 1:
+                    first_ns, last_ns, at_ns = (self._estimates[k].stamp_ns for k in (begin, end - 1, at))
+                    found.append(Ambiguity(first_ns, last_ns, at_ns, places))
+        return tuple(found)
+
+    def _places(
+        self, last: int, first: int, owners: Sequence[int], probabilities: F64
+    ) -> tuple[int, tuple[LikelyPlace, ...]]:
+        """The last scan up to `last` that knows of several places, and these.
+
+        Of a search it is one from `first` on; of a track the comparison with the whole map may lie before.
+        """
+        if owners[last] < 0:
+            at = next((k for k in range(last, first - 1, -1) if self._estimates[k].places), last)
+            return at, self._estimates[at].places
+        right, alike, _ = probabilities[owners[last]]
+        for k in range(last, -1, -1):
+            estimate = self._estimates[k]
+            other = None if estimate.evidence is None else estimate.evidence.other
+            if other is not None and owners[k] >= 0:
+                both = (LikelyPlace(estimate.T_map_base, float(right)), LikelyPlace(other, float(alike)))
+                return k, tuple(sorted(both, key=lambda place: -place.probability))
+            if estimate.status is Status.RELOCALISED:
+                break
+        return last, ()
+
     def _tracks(self) -> tuple[list[TrackRow], list[int]]:
         """The rows of all tracks, and of each scan its row; -1 for a guess that no later search revised."""
         rows: list[TrackRow] = []
@@ -211,6 +251,15 @@ def _judge(probabilities: F64, sigma: F64, usual: float, before: Sequence[TrackR
     return State.LOCALISED, ""
 
 
+def _named_places(ambiguities: Sequence[Ambiguity]) -> str:
+    """The most probable places of the longest stretch."""
+    if not ambiguities:
+        return ""
+    longest = max(ambiguities, key=lambda each: each.end_ns - each.begin_ns)
+    places = [f"x {pose.x:.1f} m, y {pose.y:.1f} m ({100.0 * p:.0f} %)" for pose, p in longest.places[:_NAMED]]
+    return f", as {' or '.join(places)} {'' if len(longest.places) <= _NAMED else 'or others '}(hypotheses.csv)"
+
+
 def _named_rival(rows: Sequence[TrackRow]) -> str:
     """The other place of the last comparison, where it was found."""
     for row in reversed(rows):
@@ -232,9 +281,12 @@ def _last_explained(rows: Sequence[TrackRow]) -> Evidence | None:
     return None
 
 
-def localisation_reasons(rows: StateRows, trajectory: Trajectory) -> tuple[VerdictReason, ...]:
+def localisation_reasons(
+    rows: StateRows, trajectory: Trajectory, ambiguities: Sequence[Ambiguity] = ()
+) -> tuple[VerdictReason, ...]:
     """A reason for each state that more poses are in than is tolerated, with where and when; none for a good result.
 
+    Of the longest of `ambiguities` it names the most probable places.
     The result is to be checked, or has failed where less than half of the poses are localised.
     """
     n = len(rows)
@@ -243,21 +295,23 @@ def localisation_reasons(rows: StateRows, trajectory: Trajectory) -> tuple[Verdi
     share = {state: count / n for state, count in Counter(rows.state).items()}
     verdict = Verdict.CHECK if share.get(State.LOCALISED, 0.0) >= USABLE_SHARE else Verdict.FAILED
     reasons = []
-    for state in (State.OFF_MAP, State.LOST, State.AMBIGUOUS, State.PREDICTED):
+    kinds = (State.OFF_MAP, State.LOST, State.AMBIGUOUS, State.PREDICTED)
+    for state in sorted(kinds, key=lambda each: -share.get(each, 0.0)):
         part = share.get(state, 0.0)
         if part <= (TOLERATED_PREDICTED if state is State.PREDICTED else TOLERATED_SHARE):
             continue
         spans = spans_of(np.array([each is state for each in rows.state]))
         firsts = [first for first, _ in spans]
+        names = _named_places(ambiguities) if state is State.AMBIGUOUS else ""
         start = int(trajectory.stamps_ns.min())
         seconds = ((trajectory.stamps_ns - start) / 1e9).tolist()
         reasons.append(
             VerdictReason(
                 verdict,
                 f"poses_{state.value}",
-                f"{100.0 * part:.1f} % of the poses are {_WORDS[state]}",
+                f"{100.0 * part:.1f} % of the poses are {_WORDS[state]}{names}",
                 _REMEDIES[state],
-                places=tuple((float(x), float(y)) for x, y in trajectory.poses[firsts, :2]),
+                places=() if names else tuple((float(x), float(y)) for x, y in trajectory.poses[firsts, :2]),
                 times=tuple((seconds[first], seconds[last]) for first, last in spans),
             )
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -71,6 +71,26 @@ class Evidence:
     other: Pose2 | None = None
 
 
+class LikelyPlace(NamedTuple):
+    """A place where the robot may be, T_map_base, and the probability that it is the right one."""
+
+    pose: Pose2
+    probability: float
+
+
+@dataclass(frozen=True, slots=True)
+class Ambiguity:
+    """A stretch of a run, from stamp to stamp, in which several places of the map fit about as well.
+
+    `places` are the most probable ones, the first the most, at the stamp `stamp_ns`; there may be more.
+    """
+
+    begin_ns: int
+    end_ns: int
+    stamp_ns: int
+    places: tuple[LikelyPlace, ...]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The pose of the base in the map at a stamp, and how it came about.
@@ -97,6 +117,8 @@ class Estimate:
     """What was proven about the match, where it was asked for."""
     noise_scale: NDArray[np.float64] = field(default_factory=lambda: np.ones(3))
     """Variances (3,) of the odometry ahead, sideways and in heading by the assumed ones, as the scans so far show."""
+    places: tuple[LikelyPlace, ...] = ()
+    """While several places fit: the most probable ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

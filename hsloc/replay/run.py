@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from hsloc.log import Log
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
-    from hsloc.model.estimate import ScanDiagnostics
+    from hsloc.model.estimate import Ambiguity, ScanDiagnostics
     from hsloc.model.events import Event
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.model.pose2 import Pose2
@@ -74,7 +74,7 @@ class Result:
     `true_grid` is the one that the log carries, if any. `likelihood` is the field that was matched on, of a given map.
     `states` are the states of the poses of a localiser that weighs evidence; `localised` are those in this state,
     `tracked` the poses that were not searched for, whether their scans fit or not.
-    `map_scale` is the size of a given map by what the lidar measures.
+    `map_scale` is the size of a given map by what the lidar measures, `ambiguities` where several places of it fit.
     With `lidar_only` no odometry of the log was used: a localiser's `odometry` is then that of the scans. `deskewed`
     says whether the beams were moved to where the robot was when each was measured.
     """
@@ -98,6 +98,7 @@ class Result:
     states: StateRows | None = None
     tracked: NDArray[np.bool_] | None = None
     map_scale: MapScale | None = None
+    ambiguities: tuple[Ambiguity, ...] = ()
     lidar_only: bool = False
     deskewed: bool = False
 
@@ -258,6 +259,7 @@ def _run_with(
         states=states,
         tracked=tracked,
         map_scale=scale,
+        ambiguities=history.ambiguities(states),
         lidar_only=lidar_only,
         deskewed=deskew,
     )

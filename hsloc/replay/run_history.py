@@ -16,7 +16,7 @@ from hsloc.localisation.kalman_filter import (
     smooth_matches,
 )
 from hsloc.localisation.states import StateLog, with_position_errors
-from hsloc.model.estimate import ScanDiagnostics, Status
+from hsloc.model.estimate import ScanDiagnostics, State, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
 from hsloc.model.pose2 import Pose2, compose_poses
 from hsloc.model.trajectory import Trajectory
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from hsloc.localisation.motion_models import MotionModel
     from hsloc.localisation.states import StateRows
     from hsloc.model.certificate import Certificate
-    from hsloc.model.estimate import Estimate
+    from hsloc.model.estimate import Ambiguity, Estimate
 
     F64 = NDArray[np.float64]
 
@@ -188,6 +188,10 @@ class RunHistory:
             return rows
         errors = scale.position_errors(self.trajectory()[0].poses)
         return with_position_errors(rows, errors, f"the scale of the map is {scale.value:.3f}")
+
+    def ambiguities(self, states: StateRows | None) -> tuple[Ambiguity, ...]:
+        """Between which places the run does not decide, and when; `states` are those of its poses."""
+        return () if states is None or State.AMBIGUOUS not in states.state else self._states.ambiguities()
 
     def diagnostics(self) -> ScanDiagnostics:
         """One row for each scan; covariances are those of the smoothed poses where these are smoothed."""

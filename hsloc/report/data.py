@@ -14,13 +14,14 @@ from hsloc.model import IDENTITY, Status
 from hsloc.trajectory_io.tum import NS_PER_S
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from hsloc.analysis.scan_statistics import ScanOverlay
     from hsloc.evaluation import Comparison
     from hsloc.model import OccupancyGrid, ScanDiagnostics, Trajectory
+    from hsloc.model.estimate import Ambiguity
     from hsloc.run_metrics import RunMetrics
     from hsloc.slam.result import MappingResult
 
@@ -78,6 +79,8 @@ class ReportParts:
     """Points (n, 2) that are drawn as a map [m]."""
     provenance: Provenance = field(default_factory=Provenance)
     """How to repeat the run."""
+    ambiguities: tuple[Ambiguity, ...] = ()
+    """Stretches in which several places of the map fit."""
     convergence: Mapping[str, tuple[Floats, Floats]] = field(default_factory=dict)
     """By heading, the best fitness over the number of evaluations: two arrays (n,) each."""
 
@@ -166,8 +169,18 @@ class ReportData:
     """Both ends (k, 2, 2) of the loops that were closed [m]."""
     is_built: bool
     """Whether the map was built by the run."""
+    ambiguities: tuple[Ambiguity, ...] = ()
+    """Stretches in which several places of the map fit, the longest `MOST_AMBIGUITIES`, in order of time."""
+
+    @property
+    def places(self) -> Floats:
+        """Positions (k, 2) of these places [m]."""
+        xy = [(place.pose.x, place.pose.y) for each in self.ambiguities for place in each.places]
+        return np.array(xy, dtype=np.float64).reshape(-1, 2)
 
 
+MOST_AMBIGUITIES = 6
+"""Stretches whose places are drawn: a map with more arrows shows none."""
 _JUMP_M, _JUMP_SPEED = 0.5, 10.0
 """A step that is longer than this [m] and would have needed this speed [m/s] is no motion of a ground robot."""
 _PAUSE_S, _PAUSE_STEPS = 2.0, 10.0
@@ -223,7 +236,13 @@ def prepare(parts: ReportParts) -> ReportData:
         far=None if parts.overlay is None else _far(parts.overlay, start_ns),
         loops=None if parts.mapping is None else _closed(parts.mapping),
         is_built=parts.metrics is not None and parts.metrics.run.mode == "slam",
+        ambiguities=_longest(parts.ambiguities),
     )
+
+
+def _longest(ambiguities: Sequence[Ambiguity]) -> tuple[Ambiguity, ...]:
+    longest = sorted(ambiguities, key=lambda each: each.begin_ns - each.end_ns)[:MOST_AMBIGUITIES]
+    return tuple(sorted(longest, key=lambda each: each.begin_ns))
 
 
 def _closed(mapping: MappingResult) -> Floats:

@@ -44,6 +44,7 @@ _OF_THE_FIRST = (
     "graph",
     "ellipses",
     "marks",
+    "ambiguities",
     "events",
     "status",
     "odometry",

@@ -99,11 +99,13 @@ def picture_of(grid: OccupancyGrid, most_pixels: float) -> Picture | None:
 
 
 def shown_extent(data: ReportData, grid: OccupancyGrid | None, points: Floats | None) -> Extent:
-    """All of the trajectory and the reference, and the known map around them. Odometry may leave the picture.
+    """All of the trajectory, the reference and the places that may be right, and the known map around them.
 
-    Of a map that is far larger than the path only what lies within `SURROUNDINGS` of the path is shown.
+    Odometry may leave the picture. Of a map that is far larger than the path only what lies within `SURROUNDINGS` of
+    the path is shown.
     """
-    paths = _finite(np.concatenate((data.path, np.zeros((0, 2)) if data.reference is None else data.reference)))
+    reference = np.zeros((0, 2)) if data.reference is None else data.reference
+    paths = _finite(np.concatenate((data.path, reference, data.places)))
     ground = _finite(
         np.concatenate(
             (np.zeros((0, 2)) if points is None else points, np.zeros((0, 2)) if grid is None else _known_corners(grid))

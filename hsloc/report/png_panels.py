@@ -6,6 +6,7 @@ from math import floor, log10
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.markers import MarkerStyle
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, StrMethodFormatter
 from matplotlib.transforms import Affine2D
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     from hsloc.report.table import Row
 
+_PLACE = np.array(((13.0, 0.0), (-9.0, 8.0), (-5.0, 0.0), (-9.0, -8.0), (13.0, 0.0))) / 13.0
+"""An arrow, as vertices of a marker."""
 HALO = [withStroke(linewidth=3.0, foreground="white")]
 
 
@@ -43,6 +46,7 @@ def draw_map(
         axes.plot(points[:, 0], points[:, 1], ".", color=style.WALL, markersize=2.2, label="map points", zorder=2)
     _draw_paths(axes, data, line_width(data, extent), max(extent.width, extent.height) / pixels)
     _draw_marks(axes, data)
+    _draw_places(axes, data)
     _draw_ends(axes, data, extent)
     _draw_scale_bar(axes, extent)
     axes.set_xlim(extent.x0, extent.x1)
@@ -122,6 +126,26 @@ def _draw_marks(axes: Axes, data: ReportData) -> None:
                 markeredgewidth=1.4 if marker == "x" else 0.7,
                 markeredgecolor=colour if marker == "x" else style.INK,
             )  # fmt: skip
+
+
+def _draw_places(axes: Axes, data: ReportData) -> None:
+    """Places between which the run does not decide: an arrow along the heading, and the probability."""
+    for each in data.ambiguities:
+        seconds = "" if len(data.ambiguities) == 1 else f" at {(each.stamp_ns - data.start_ns) / 1e9:.0f} s"
+        for place in each.places:
+            xy = (place.pose.x, place.pose.y)
+            arrow = MarkerStyle(_PLACE, transform=Affine2D().rotate(place.pose.theta))
+            share = "< 1 %" if place.probability < 0.01 else f"{100.0 * place.probability:.0f} %"
+            axes.plot(*xy, marker=arrow, color=style.ORANGE, markersize=15, markeredgecolor=style.INK, zorder=11)
+            axes.annotate(
+                f"{share}{seconds}", xy, xytext=(0, -22), textcoords="offset points", fontsize=style.TEXT, ha="center",
+                fontweight="bold", color=style.INK, path_effects=HALO, zorder=11,
+            )  # fmt: skip
+    if data.ambiguities:
+        axes.plot(
+            [], [], linestyle="none", marker=MarkerStyle(_PLACE), color=style.ORANGE, markersize=12,
+            markeredgecolor=style.INK, label="place that may be right",
+        )  # fmt: skip
 
 
 def _draw_ends(axes: Axes, data: ReportData, extent: Extent) -> None:

@@ -107,7 +107,9 @@ def _headline(metrics: RunMetrics) -> str:
         return f"{made} from {mapping.keyscans} scans, {loops}."
     share = metrics.localised.share_of_poses
     if share == 0.0:
-        return f"Not localised on {_map_name(metrics)}: every pose is a guess."
+        several = any(reason.code == "poses_ambiguous" for reason in metrics.verdict_reasons)
+        why = "several places of it fit, and every pose is a guess" if several else "every pose is a guess"
+        return f"Not localised on {_map_name(metrics)}: {why}."
     known = "every pose is known" if share == 1.0 else f"{format_share(share)} of the poses are known"
     return f"Localised on {_map_name(metrics)}: {known}{_lost_and_found(metrics)}."
 

@@ -87,6 +87,7 @@ def view_of(parts: ReportParts, data: ReportData | None = None) -> ReportView:
         "loops": loops,
         "graph": None if parts.mapping is None else graph_view(parts.mapping.graph),
         "ellipses": _ellipses(parts, data.start_ns),
+        "ambiguities": _ambiguities(data),
         "events": _events(parts, data, loops),
         "status": [] if scans is None else _status_rows(scans),
         "charts": [_chart(chart) for chart in (*run_charts(data), *convergence_charts(parts.convergence))],
@@ -254,6 +255,18 @@ def _ellipses(parts: ReportParts, start_ns: int) -> dict[str, Any] | None:
     return columns | _columns(xx=c[:, 0, 0], xy=c[:, 0, 1], yy=c[:, 1, 1], decimals=7)
 
 
+def _ambiguities(data: ReportData) -> list[dict[str, Any]]:
+    """When several places of the map fit, and the most probable of them, T_map_base, as known at the time `t`."""
+    found = []
+    for each in data.ambiguities:
+        begin, end, t = since(np.array([each.begin_ns, each.end_ns, each.stamp_ns]), data.start_ns).tolist()
+        poses = np.array([place.pose.to_array() for place in each.places])
+        columns = _columns(x=poses[:, 0], y=poses[:, 1], theta=poses[:, 2])
+        probability = [_round(place.probability) for place in each.places]
+        found.append({"begin": _round(begin), "end": _round(end), "at": _round(t), **columns, "p": probability})
+    return found
+
+
 def _events(parts: ReportParts, data: ReportData, loops: dict[str, Any] | None) -> list[dict[str, Any]]:
     """What to jump to, in order of time: reasons of the verdict, losses and what ended them, loops, refused scans."""
     found: list[tuple[float, str, str]] = []
@@ -265,6 +278,10 @@ def _events(parts: ReportParts, data: ReportData, loops: dict[str, Any] | None) 
         ]
     for begin, end in data.lost:
         found += [(begin, "loss", f"the pose is not known until {end:.1f} s"), (end, "loss", "the pose is known again")]
+    for each in _ambiguities(data):
+        triples = zip(each["p"], each["x"], each["y"], strict=True)
+        places = ", ".join(f"x {x:.1f} m, y {y:.1f} m ({100.0 * p:.0f} %)" for p, x, y in triples)
+        found.append((each["begin"], "ambiguous", f"several places fit until {each['end']:.1f} s: {places}"))
     if loops is not None:
         found += [(t, "loop", "a loop is closed") for t, ok in zip(loops["t"], loops["accepted"], strict=True) if ok]
     if data.scans is not None:

@@ -10,6 +10,7 @@ import pytest
 from rooms import L_SHAPE, beside, grid, seen
 
 from hsloc.errors import ConfigError
+from hsloc.localisation.global_search import most_likely
 from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
 from hsloc.matching import Hide, LikelihoodField
@@ -82,6 +83,20 @@ def test_of_two_rooms_that_look_alike_neither_is_claimed() -> None:
     assert pose is not None
     x = pose.x
     assert min(abs(x - truth[-1].x), abs(x - 20.0 - truth[-1].x)) < 0.1
+    assert verdicts[0].places == ()  # too few scans to say so
+    places = verdicts[-1].places
+    assert sorted(round(place.pose.x - truth[-1].x) for place in places[:2]) == [0, 20]
+    assert places[0].probability == pytest.approx(places[1].probability) == pytest.approx(0.5, abs=0.1)
+
+
+def test_the_odds_of_places_follow_from_their_fitness() -> None:
+    poses = [Pose2(float(k), 0.0, 0.0) for k in range(12)]
+    alike = most_likely((pose, 0.8) for pose in poses)
+    assert [place.probability for place in alike] == pytest.approx([1.0 / 12.0] * 8)
+    worse, best = most_likely([(poses[0], 0.6), (poses[1], 0.9)])[::-1]
+    assert (worse.pose, best.pose) == (poses[0], poses[1])
+    assert best.probability / worse.probability == pytest.approx(np.exp(4.0))
+    assert most_likely([]) == ()
 
 
 def test_a_scan_without_motion_adds_no_evidence() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from hsloc.export.results_folder import STATES_HEADER, write_states
 from hsloc.localisation.states import StateLog, StateRows, localisation_reasons, with_position_errors
 from hsloc.model import Estimate, Evidence, Pose2, State, Status, Trajectory
+from hsloc.model.estimate import LikelyPlace
 from hsloc.model.verdict import Verdict, verdict_of
 
 if TYPE_CHECKING:
@@ -60,6 +62,27 @@ def test_a_guess_of_the_search_has_the_state_that_the_search_gave_it() -> None:
     assert states.state[-1] is State.AMBIGUOUS
     assert states.probability[-1] == 0.0
     assert np.isnan(states.sigma[-1]).all()
+
+
+def test_an_ambiguous_stretch_names_its_places() -> None:
+    two = (LikelyPlace(Pose2(1.0, 2.0, 0.0), 0.6), LikelyPlace(Pose2(21.0, 2.0, 0.0), 0.4))
+    log, other = StateLog(), Pose2(50.0, 0.0, 0.0)
+    for k in range(16):
+        if k < 4:
+            found = estimate(k, status=Status.SEARCHING, state=State.AMBIGUOUS, places=two[: 2 * (k < 3)])
+        else:
+            found = estimate(k, status=Status.RELOCALISED if k == 4 else Status.MATCHED)
+            # Far without a comparison that leaves all other places behind.
+            of_rival = {"rival": 1.0, "other": other} if k in (6, 9) else {}
+            found = replace(found, evidence=Evidence(30.0, GOOD, **of_rival))  # type: ignore[arg-type]
+        log.add(found, k)
+    search, track = log.ambiguities()
+    assert (search.begin_ns, search.end_ns, search.stamp_ns, search.places) == (0, 3, 2, two)
+    assert (track.end_ns, track.stamp_ns) == (15, 9)
+    assert [place.pose.x for place in track.places] == [0.25 * 9, 50.0]
+    assert 0.5 < track.places[0].probability < 0.9
+    (reason,) = localisation_reasons(log.at_odometry(16), path(16), (search, track))
+    assert f"as x {track.places[0].pose.x:.1f} m, y 0.0 m (" in reason.text
 
 
 def test_scans_before_a_relocalisation_belong_to_the_track_that_was_found() -> None:

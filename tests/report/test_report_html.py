@@ -19,10 +19,12 @@ from report_parts import NOTHING, parts, view_in
 from hsloc.analysis.scan_statistics import ScanOverlay
 from hsloc.errors import OutputError
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
+from hsloc.model.estimate import Ambiguity, LikelyPlace
 from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.report.charts import run_charts
-from hsloc.report.data import Provenance, ReportParts
+from hsloc.report.data import MOST_AMBIGUITIES, Provenance, ReportParts
 from hsloc.report.html import write_report_html
+from hsloc.report.png import report_figure
 from hsloc.report.view import MOST_EDGES, MOST_MARKS, MOST_POSES, graph_view, runs, view_of
 from hsloc.slam.pose_graph import Edges, PoseGraph
 from hsloc.warnings import RunWarning
@@ -228,6 +230,23 @@ def test_scans_lie_where_they_were_taken(run: dict[str, Any]) -> None:
     assert scans["status"][0]
     (far,) = [chart for chart in view["charts"] if chart["name"] == "far_cm"]
     assert (far["t"], far["v"]) == ([2.0, 10.0], [2.0, None])  # the line breaks where the pose was lost
+
+
+def test_places_between_which_a_run_does_not_decide_are_drawn(run: dict[str, Any], tmp_path: Path) -> None:
+    stamps = run["trajectory"].stamps_ns
+    places = (LikelyPlace(Pose2(1.0, 2.0, 0.5), 0.75), LikelyPlace(Pose2(99.0, 2.0, 0.5), 0.25))
+    stretches = [Ambiguity(int(stamps[k]), int(stamps[3 * k]), int(stamps[2 * k]), places) for k in range(10)]
+    shown = ReportParts(title="", **run, ambiguities=tuple(stretches))
+    view, _ = view_of(shown)
+    found = view["ambiguities"]
+    assert len(found) == MOST_AMBIGUITIES
+    assert (found[-1]["begin"], found[-1]["end"], found[-1]["at"]) == (0.45, 1.35, 0.9)  # the longest, at 20 Hz
+    assert (found[0]["x"], found[0]["theta"], found[0]["p"]) == ([1.0, 99.0], [0.5, 0.5], [0.75, 0.25])
+    assert view["extent"][2] > 99.0  # all of them are in the picture
+    (event, *_) = [each for each in view["events"] if each["kind"] == "ambiguous"]
+    assert event["text"].endswith("x 1.0 m, y 2.0 m (75 %), x 99.0 m, y 2.0 m (25 %)")
+    labels = report_figure(shown).axes[-1].get_legend_handles_labels()[1]
+    assert "place that may be right" in labels
 
 
 def test_without_a_pose_times_begin_with_the_first_scan(run: dict[str, Any]) -> None:

@@ -66,6 +66,10 @@
       if (!on(mark.status)) continue;
       for (const k of mark.t.keys()) text(globalThis.ResultLayers.MARKS[mark.status], ...view.pixels(...view.local(mark.x[k], mark.y[k])), view.ink(mark.status === "rejected" ? "vermillion" : "orange"), 12);
     }
+    for (const { outline, text: words, at } of view.placeMarks()) {
+      page.append(node("polygon", { points: outline.map((xy) => xy.map(fixed).join(",")).join(" "), fill: view.ink("orange"), stroke: view.ink("ink"), "stroke-width": 1.4 * ratio }));
+      text(words, ...at, view.ink("ink"), 13);
+    }
     const path = data.trajectory, n = path.x.length;
     for (const [k, words, ink] of n && on("trajectory") ? [[n - 1, "end", "vermillion"], [0, "start", "green"]] : []) {
       const [x, y] = view.pixels(...view.local(path.x[k], path.y[k])), r = 6 * ratio;

@@ -5,6 +5,7 @@
   // Viridis at eight places (S. van der Walt and N. Smith, 2015): even in lightness, readable for the colour-blind.
   const SCALE = ["#440154", "#46327e", "#365c8d", "#277f8e", "#1fa187", "#4ac16d", "#a0da39", "#fde725"];
   const MARKS = { rejected: "✕", no_returns: "▼", relocalised: "★" };
+  const PLACE = [[13, 0], [-9, 8], [-5, 0], [-9, -8]]; // an arrow, in pixels
   const HEAT_M = 0.3, HEAT_CELLS = 240; // where the scale ends; cells along the longer side of the extent
   const make = (tag, attributes = {}, ...children) => {
     const made = document.createElement(tag);
@@ -110,6 +111,28 @@
       }
       return found;
     },
+    // The places between which the run does not decide, in pixels: an arrow along the heading, and the probability.
+    placeMarks() {
+      const found = [], stretches = this.shown.has("places") ? this.data.ambiguities : [], r = this.ratio;
+      for (const each of stretches) for (const k of each.p.keys()) {
+        const [px, py] = this.pixels(...this.local(each.x[k], each.y[k])), cos = Math.cos(each.theta[k]), sin = -Math.sin(each.theta[k]);
+        const outline = PLACE.map(([x, y]) => [px + r * (cos * x - sin * y), py + r * (sin * x + cos * y)]);
+        const share = each.p[k] < 0.01 ? "< 1 %" : `${(100 * each.p[k]).toFixed(0)} %`;
+        found.push({ outline, text: stretches.length > 1 ? `${share} at ${each.at.toFixed(0)} s` : share, at: [px, py + 20 * r] });
+      }
+      return found;
+    },
+    drawPlaces(c) {
+      c.textAlign = "center"; c.textBaseline = "middle"; c.font = `600 ${13 * this.ratio}px system-ui, sans-serif`; c.lineJoin = "round";
+      for (const { outline, text, at } of this.placeMarks()) {
+        c.beginPath();
+        outline.forEach(([x, y], k) => { if (k) c.lineTo(x, y); else c.moveTo(x, y); });
+        c.closePath();
+        c.fillStyle = this.ink("orange"); c.strokeStyle = this.ink("ink"); c.lineWidth = 1.4 * this.ratio; c.fill(); c.stroke();
+        c.strokeStyle = this.ink("halo"); c.lineWidth = 3.5 * this.ratio; c.strokeText(text, ...at);
+        c.fillStyle = this.ink("ink"); c.fillText(text, ...at);
+      }
+    },
     drawMarks(c) {
       c.setTransform(1, 0, 0, 1, 0, 0);
       c.textAlign = "center"; c.textBaseline = "middle";
@@ -127,6 +150,7 @@
         c.strokeText(name, px + 1.5 * r, py - 1.5 * r); c.fillStyle = this.ink("ink"); c.fillText(name, px + 1.5 * r, py - 1.5 * r);
       };
       if (n && this.shown.has("trajectory")) { end(n - 1, "end", "vermillion"); end(0, "start", "green"); }
+      this.drawPlaces(c);
     },
     drawScale() {
       const rough = 110 * this.ratio / this.scale, power = 10 ** Math.floor(Math.log10(rough));

@@ -5,7 +5,7 @@
 (() => {
   const { MARKS, Path, make } = globalThis.ResultLayers;
   const NEAR_CM = 5, FAR_CM = 15;
-  const KINDS = [["", "any event"], ["warning", "warning"], ["loss", "loss"], ["loop", "loop"], ["rejected", "refused scan"]];
+  const KINDS = [["", "any event"], ["warning", "warning"], ["loss", "loss"], ["ambiguous", "several places fit"], ["loop", "loop"], ["rejected", "refused scan"]];
 
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   const length = globalThis.lengthText;
@@ -107,6 +107,7 @@
         ["scan", "scan at the cursor", d.scans, true], ["scans", "all scans", d.scans, false],
         ["loops", `loops (${d.loops ? d.loops.accepted.length - refused : 0})`, d.loops && d.loops.accepted.length > refused, true],
         ["refused", `refused loops (${refused})`, refused, false], ["graph", `pose graph (${d.graph?.total} edges)`, d.graph, false], ["ellipses", "2σ ellipses", d.ellipses, false],
+        ["places", `places that may be right (${d.ambiguities?.reduce((n, each) => n + each.p.length, 0)})`, d.ambiguities?.length, true],
         ["heat", "distance of scans to the map", d.scans && d.map, false],
         ...d.marks.map((mark) => [mark.status, `scan ${mark.label} (${mark.t.length})`, true, true]),
       ];

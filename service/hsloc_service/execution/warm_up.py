@@ -24,12 +24,11 @@ class WarmUp:
 
     def __init__(self, shared: Path) -> None:
         self._caches = caches_of(shared)
-        self._stamp = self._caches["NUMBA_CACHE_DIR"] / f".hsloc-{__version__}-{platform.python_version()}"
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
         """Begin."""
-        if self._stamp.exists():
+        if stamp(self._caches["NUMBA_CACHE_DIR"]).exists():
             return
         command = ["nice", "-n", "15", sys.executable, "-P", "-m", "hsloc_service.execution.warm_up"]
         chosen = {**os.environ, **{name: str(path) for name, path in self._caches.items()}}
@@ -39,7 +38,7 @@ class WarmUp:
                 folder.mkdir(parents=True, exist_ok=True, mode=0o700)
             quiet = subprocess.DEVNULL
             self._process = subprocess.Popen(
-                [*command, str(self._stamp)],
+                command,
                 env=chosen,
                 stdin=quiet,
                 stdout=quiet,
@@ -56,8 +55,13 @@ class WarmUp:
             self._process.wait()
 
 
+def stamp(kernels: Path) -> Path:
+    """The file that says that a cache of kernels is full for this version of hsloc and of Python."""
+    return kernels / f".hsloc-{__version__}-{platform.python_version()}"
+
+
 def main() -> int:
-    """Record a short log, localise it on its map, and map it; then leave a stamp."""
+    """Record a short log, localise it on its map, and map it; then leave a stamp in $NUMBA_CACHE_DIR, if it is set."""
     from hsloc.cli.main import main as program
 
     with tempfile.TemporaryDirectory() as folder:
@@ -65,8 +69,8 @@ def main() -> int:
         recorded = program(["record", str(path), "--world", "office", "--duration", "15", "--quiet"])
         codes = [program(["replay", str(path), "--quiet", "--out", str(Path(folder) / "localise"), "--unknown-start"])]
         codes += [program(["replay", str(path), "--quiet", "--out", str(Path(folder) / "map"), "--mode", "slam"])]
-    if max(recorded, *codes) == 0 and len(sys.argv) > 1:
-        Path(sys.argv[1]).touch()
+    if max(recorded, *codes) == 0 and (kernels := os.environ.get("NUMBA_CACHE_DIR")):
+        stamp(Path(kernels)).touch()
     return max(recorded, *codes)
 
 

@@ -53,6 +53,8 @@ class WarningCode(StrEnum):
     """An initial pose is given in a frame that no transform connects with the map; it is not used."""
     REFERENCE_READ_AS = "reference_read_as"
     """A file of poses was read in a unit, an order or a frame that it does not state."""
+    REFERENCE_DISPLACED = "reference_displaced"
+    """The result has the shape of the reference, but lies elsewhere: the frames differ, or the place was wrong."""
     REFERENCE_STAMPS_REPEAT = "reference_stamps_repeat"
     """Most poses of a file share their stamps: they were written with too few digits."""
     LASER_TILTED = "laser_tilted"

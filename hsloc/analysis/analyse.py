@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from hsloc.analysis.second_pass import PosedEvent
     from hsloc.evaluation import Comparison, RelationsResult
     from hsloc.replay.run import Result
+    from hsloc.warnings import RunWarning
 
     Convergence = dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
 
@@ -100,7 +101,13 @@ def analyse(
                 sample.add(scan, T_map_base)
             overlay.add(scan, T_map_base, distance)
     errors = _Errors(result, request.alignment or ("se2" if result.mode == "slam" else "none"))
-    found = (*quality_warnings(result), *offset_warnings(result), *residuals.warnings(), *check.warnings())
+    found = (
+        *quality_warnings(result),
+        *offset_warnings(result),
+        *residuals.warnings(),
+        *check.warnings(),
+        *errors.warnings(),
+    )
     warnings = (*result.warnings, *found)
     reasons = verdict_reasons(result, warnings)
     metrics = RunMetrics(
@@ -165,9 +172,15 @@ class _Errors:
         if self._reference is not None and result.localised.any() and not result.localised.all():
             known = Trajectory(result.trajectory.stamps_ns[result.localised], result.trajectory.poses[result.localised])
             self.localised, self.localised_reason = self._compare(known)
+        self._known = self.whole if result.localised.all() else self.localised
         self.odometry_alone = None
         if self.whole is not None and self.odometry is not None:
             self.odometry_alone = self._compare(self.odometry)[0]
+
+    def warnings(self) -> list[RunWarning]:
+        """That the known poses are displaced from the reference as a whole; no evidence for the verdict."""
+        found = None if self._known is None else self._known.displaced()
+        return [] if found is None else [found]
 
     def _compare(self, trajectory: Trajectory) -> tuple[Comparison | None, str | None]:
         """The comparison, or why there is none; a reference of one pose is no trajectory to compare with."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate each estimate and print one table, or JSON."""
-    from hsloc.evaluation.metrics import compare, format_json
+    from hsloc.evaluation.metrics import format_json
     from hsloc.evaluation.relations import read_relations
     from hsloc.evaluation.rpe import Delta
     from hsloc.replay.references import read_reference
@@ -98,13 +99,17 @@ def run(arguments: argparse.Namespace) -> int:
     relations = None if arguments.relations is None else read_relations(arguments.relations)
     warnings: list[RunWarning] = []
     reference = None if alone or own else read_reference(files[0], (), warnings)
-    read: dict[str, tuple[Trajectory, Trajectory | None]] = {}
+    comparisons: dict[str, Comparison] = {}
     results: dict[str, Result] = {}
     for path in files[0 if alone or own else 1 :]:
         estimate = read_reference(_inside(path, "trajectory.tum"), (), warnings)
         truth = read_reference(_inside(path, "reference.tum"), (), warnings) if own else reference
-        read[path] = estimate, truth
-        results[path] = _evaluate(path, estimate, truth, relations, delta, arguments)
+        compared, scored = _evaluate(path, estimate, truth, relations, arguments)
+        if compared is not None:
+            comparisons[path] = compared
+            if (displaced := compared.displaced()) is not None:
+                warnings.append(replace(displaced, text=f"{path}: {displaced.text}"))
+        results[path] = None if compared is None else compared.evaluation((delta,)), scored
     for warning in dict.fromkeys(warnings):
         print(f"hsloc: warning: {warning}", file=sys.stderr)
     wanted = [name for name in ("save_results", "plot", "save_plot") if getattr(arguments, name)]
@@ -113,11 +118,6 @@ def run(arguments: argparse.Namespace) -> int:
             option = f"--{wanted[0].replace('_', '-')}"
             print(f"hsloc eval: error: {option} needs a reference to take errors from", file=sys.stderr)
             return 2
-        comparisons = {
-            path: compare(estimate, truth, **_pairing(arguments))
-            for path, (estimate, truth) in read.items()
-            if truth is not None
-        }
         _draw(arguments, comparisons)
         if arguments.save_results is not None:
             _save(arguments, comparisons, None if own else files[0], delta)
@@ -153,23 +153,20 @@ def _evaluate(
     estimate: Trajectory,
     reference: Trajectory | None,
     relations: Relations | None,
-    delta: Delta,
     arguments: argparse.Namespace,
-) -> Result:
-    from hsloc.evaluation.metrics import evaluate
+) -> tuple[Comparison | None, RelationsResult | None]:
+    from hsloc.evaluation.metrics import compare
     from hsloc.evaluation.relations import evaluate_relations
 
     try:
-        evaluation = None
-        if reference is not None:
-            evaluation = evaluate(estimate, reference, **_pairing(arguments), deltas=(delta,))
-        return evaluation, None if relations is None else evaluate_relations(estimate, relations)
+        compared = None if reference is None else compare(estimate, reference, **_pairing(arguments))
+        return compared, None if relations is None else evaluate_relations(estimate, relations)
     except EvaluationError as error:
         raise EvaluationError(f"{path}: {error}") from error
 
 
 def _pairing(arguments: argparse.Namespace) -> dict[str, Any]:
-    """How poses are paired with the reference and moved onto it: arguments of `evaluate` and `compare`."""
+    """How poses are paired with the reference and moved onto it: arguments of `compare`."""
     return {
         "alignment": arguments.alignment,
         "max_difference_s": arguments.t_max_diff,

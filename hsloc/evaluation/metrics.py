@@ -20,6 +20,7 @@ from hsloc.evaluation.statistics import PoseErrors, PoseStatistics
 from hsloc.model import wrap_angles
 from hsloc.model.pose2 import compose_poses
 from hsloc.trajectory_io.tum import NS_PER_S
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,6 +35,10 @@ if TYPE_CHECKING:
 DELTAS = (Delta(1.0, "frames"), Delta(1.0, "m"), Delta(1.0, "s"))
 _MIN_PAIRED = 0.5
 """Fraction of the sparser trajectory's poses that must have a partner within 10 ms."""
+_DISPLACED = 0.25
+"""RMSE of the positions (m) from which on poses count as wrong, as in the states of poses."""
+_SAME_SHAPE = 0.1
+"""Share of that error that may be left once the estimate is moved as a whole: the rest is one constant motion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +110,30 @@ class Comparison:
     errors: PoseErrors
 
     def __repr__(self) -> str:
-        rmse = float(np.sqrt(np.mean(np.square(self.errors.trans_part))))
-        return f"<Comparison: {len(self.aligned)} pairs, alignment {self.alignment}, APE rmse {rmse:.4f} m>"
+        return f"<Comparison: {len(self.aligned)} pairs, alignment {self.alignment}, APE rmse {self._rmse():.4f} m>"
+
+    def _rmse(self) -> float:
+        return float(np.sqrt(np.mean(np.square(self.errors.trans_part))))
+
+    def displaced(self) -> RunWarning | None:
+        """That nearly all of the error is one constant motion; None where it is small, or of another kind."""
+        whole = self._rmse()
+        if self.alignment != "none" or whole < _DISPLACED:
+            return None
+        try:
+            moved = align(self.pairs.reference, self.pairs.estimate, "se2")
+        except EvaluationError:
+            return None
+        left = ape(self.pairs.reference, compose_poses(moved.to_array(), self.pairs.estimate)).statistics()
+        if left.trans_part.rmse > _SAME_SHAPE * whole:
+            return None
+        return RunWarning(
+            WarningCode.REFERENCE_DISPLACED,
+            f"{whole:.3g} m from the reference, but {left.trans_part.rmse:.2g} m once moved as a whole by "
+            f"x {moved.x:.2f} m, y {moved.y:.2f} m, {math.degrees(moved.theta):.1f} deg: their frames differ, "
+            "or the robot was localised at another place",
+            "if the frames differ, compare with --alignment se2",
+        )
 
     def evaluation(self, deltas: tuple[Delta, ...] = DELTAS) -> Evaluation:
         """The statistics of the errors, with RPE over pieces of each of `deltas`."""

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from hsloc.errors import EvaluationError
 from hsloc.evaluation.association import associate
-from hsloc.evaluation.metrics import evaluate, format_json, write_json
+from hsloc.evaluation.metrics import compare, evaluate, format_json, write_json
 from hsloc.evaluation.rpe import Delta, pieces
 from hsloc.evaluation.statistics import Statistics
 from hsloc.model import Pose2, Trajectory
@@ -148,6 +148,25 @@ def test_a_constant_shift_by_hand() -> None:
     assert result.ape.angle_deg.max == pytest.approx(90.0)
     assert result.axis_rmse == pytest.approx((0.3, 0.4, np.pi / 2))
     assert (result.length_reference, result.length_estimate) == pytest.approx((10.0, 10.0))
+
+
+def test_an_error_that_is_one_motion_of_the_whole_is_told_with_that_motion(rng: np.random.Generator) -> None:
+    path = line()
+    noise = rng.normal(0.0, 0.01, path.poses.shape)
+    moved = compose_poses(np.array((3.0, -1.0, np.pi / 2)), path.poses) + noise
+    told = compare(Trajectory(path.stamps_ns, moved), path).displaced()
+    assert told is not None
+    assert told.code == "reference_displaced"
+    # The motion is that of the estimate onto the reference: back by the inverse.
+    assert "x 1.0" in told.text
+    assert "y 3.0" in told.text
+    assert "-90" in told.text
+    bent = path.poses + np.column_stack(
+        (np.zeros((len(path), 1)), np.linspace(-1.0, 1.0, len(path)) ** 2 * 4, noise[:, 2])
+    )
+    for other in (path.poses + np.array((0.2, 0.0, 0.0)), bent):
+        assert compare(Trajectory(path.stamps_ns, other), path).displaced() is None
+    assert compare(Trajectory(path.stamps_ns, moved), path, alignment="se2").displaced() is None
 
 
 def test_theta_is_wrapped_before_it_is_squared() -> None:

@@ -28,6 +28,8 @@ _STILL_M = 1e-4
 _STILL_RAD = 1e-5
 """A step smaller than both ends the registration."""
 
+_CELLS = 1 << 31
+"""Squares of a grid from one column to the next. Internal: more than any map has."""
 _PRIOR = 0.1
 """Information (1/m^2; 1/rad^2) of each pose by itself. Internal: keeps the equations solvable if nothing is seen."""
 
@@ -45,6 +47,21 @@ class RegistrationParameters(NamedTuple):
     """Scale of the Cauchy weight on the chi of the prior; infinite: the prior is trusted."""
     rounds: int
     """Gauss-Newton steps at most."""
+
+
+class Grid(NamedTuple):
+    """Squares of `side` metres, and the numbers of those in which scans lie (n,), ascending."""
+
+    side: float
+    cells: I64
+
+    @staticmethod
+    def of(positions: F64, side: float) -> tuple[Grid, I64]:
+        """The grid of positions (n, 2), and their order in it (n,), stable within a square."""
+        corner = np.floor(positions / side).astype(np.int64)
+        number = corner[:, 0] * _CELLS + corner[:, 1]
+        order = np.argsort(number, kind="stable")
+        return Grid(side, number[order]), order
 
 
 class Scene(NamedTuple):
@@ -165,6 +182,56 @@ def register(pose: F64, scene: Scene, prior: Prior, p: RegistrationParameters, i
         if still and k >= 2:
             break
     return sqrt(chi2)
+
+
+@njit(cache=True, nogil=True)
+def nearest_partners(poses: F64, sorts: I64, known: I64, grid: Grid, most: int, partners: I64) -> None:
+    """Write the scans that each scan is compared with to `partners` (n, most), the nearest first, -1 where none is.
+
+    Of the `known` scans within `grid.side` metres the nearest of each sort counts, `sorts` (n,), and of these the
+    nearest; half a metre counts as a radian. `known` are in the order of their cells, and ascending within each.
+    """
+    n = len(poses)
+    radius2 = grid.side * grid.side
+    best = np.empty(n)
+    scan = np.empty(n, dtype=np.int64)
+    kind = np.empty(n, dtype=np.int64)
+    for k in range(n):
+        found = 0
+        column = int(np.floor(poses[k, 0] / grid.side))
+        row = int(np.floor(poses[k, 1] / grid.side))
+        for across in range(column - 1, column + 2):
+            first = np.searchsorted(grid.cells, across * _CELLS + row - 1)
+            last = np.searchsorted(grid.cells, across * _CELLS + row + 2)
+            for p in range(first, last):
+                other = known[p]
+                dx = poses[other, 0] - poses[k, 0]
+                dy = poses[other, 1] - poses[k, 1]
+                if other == k or dx * dx + dy * dy > radius2:
+                    continue
+                turn = poses[other, 2] - poses[k, 2]
+                turn -= 2.0 * pi * np.round(turn / (2.0 * pi))
+                distance = sqrt(dx * dx + dy * dy) + 0.5 * abs(turn)
+                at = 0
+                while at < found and kind[at] != sorts[other]:
+                    at += 1
+                if at == found:
+                    found += 1
+                    kind[at] = sorts[other]
+                elif distance > best[at] or (distance == best[at] and other > scan[at]):
+                    continue
+                best[at] = distance
+                scan[at] = other
+        for taken in range(most):
+            nearest = -1
+            for at in range(found):
+                if scan[at] >= 0 and (
+                    nearest < 0 or best[at] < best[nearest] or (best[at] == best[nearest] and scan[at] < scan[nearest])
+                ):
+                    nearest = at
+            partners[k, taken] = scan[nearest] if nearest >= 0 else -1
+            if nearest >= 0:
+                scan[nearest] = -1
 
 
 @njit(cache=True, nogil=True)

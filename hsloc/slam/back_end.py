@@ -100,7 +100,7 @@ def finish_session(
         steps = without_slips(gathered.steps, stretches.slipped(len(gathered.steps)))
         gathered = replace(gathered, steps=steps)
         edges = Edges.concatenate([steps, loop_edges])
-        refined, more = _refine(refined.poses, gathered.scans, edges, _near_the_end(parameters), _silent)
+        refined, more = _refine(refined.poses, gathered.scans, edges, _near_the_end(parameters), _silent, refined)
         passes += more
     covariances = marginal_covariances(refined, edges)
     grid = build_grid(refined.poses, gathered.scans, parameters.occupancy)
@@ -223,17 +223,22 @@ def _close_loops(
 
 
 def _refine(
-    poses: F64, scans: KeyScans, edges: Edges, parameters: GraphMapperParameters, progress: Callable[[float], None]
+    poses: F64,
+    scans: KeyScans,
+    edges: Edges,
+    parameters: GraphMapperParameters,
+    progress: Callable[[float], None],
+    previous: Registration | None = None,
 ) -> tuple[Registration, int]:
     """Passes over the whole log, each with partners chosen again, until nothing moves."""
     most, p = parameters.passes, parameters.joint_registration
     later = _near_the_end(parameters).joint_registration
-    refined = refine(poses, scans, edges, p, lambda part: progress(part / most))
+    refined = refine(poses, scans, edges, p, lambda part: progress(part / most), previous)
     passes = 1
     while passes < most and refined.moved >= _UNSETTLED_M:
         begin = refined.poses
         done = passes
-        refined = refine(begin, scans, edges, later, lambda part: progress((done + part) / most))  # noqa: B023
+        refined = refine(begin, scans, edges, later, lambda part: progress((done + part) / most), refined)  # noqa: B023
         passes += 1
         change = refined.poses - begin
         change[:, 2] = wrap_angles(change[:, 2])

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.normal_equations import Equations, PairTerms, add_edges, add_pairs, evaluate_pairs
-from hsloc.model.pose2 import wrap_angles
+from hsloc.kernels.normal_equations import Equations, Evaluated, PairTerms, add_edges, add_pairs, evaluate_pairs
+from hsloc.kernels.registration import Grid, nearest_partners
 from hsloc.parameters import Count, CountOrNone, NonNegative, Parameters, Positive
 from hsloc.slam.keyscans import views
 from hsloc.slam.pose_graph import apply_increment, solve_anchored
@@ -79,6 +79,8 @@ class Registration:
     rounds: int
     moved: float
     """What 99 of 100 poses moved less than in the last round (m; rad: a fifth)."""
+    evaluated: Evaluated
+    """Where the terms were evaluated last."""
 
     @property
     def counts(self) -> F64:
@@ -104,20 +106,26 @@ def refine(
     edges: Edges,
     parameters: JointRegistrationParameters,
     progress: Callable[[float], None] | None = None,
+    previous: Registration | None = None,
 ) -> Registration:
-    """Move `poses` (n, 3) until all pairs of scans and all edges agree best; the first pose stays."""
+    """Move `poses` (n, 3) until all pairs of scans and all edges agree best; the first pose stays.
+
+    What a `previous` pass over the same scans has found of pairs that have hardly moved since is used again.
+    """
     p = parameters
     pairs = neighbour_pairs(poses, p.radius, p.max_partners, p.temporal, p.max_scans_per_view)
     system = BlockSystem(
         len(poses), np.concatenate((pairs[:, 0], edges.pairs[:, 0])), np.concatenate((pairs[:, 1], edges.pairs[:, 1]))
     )
     arrays = scans.arrays(p.points_per_scan)
-    terms = PairTerms(np.empty((len(pairs), 3, 3)), np.empty((len(pairs), 3)), np.zeros((len(pairs), 5)))
+    terms, evaluated = _known_terms(pairs, len(poses), previous)
     weight = 1.0 / (p.sigma**2 * p.correlated_points)
-    before, gate, moved, rounds = poses, p.gates[0], 0.0, 0
+    before, gate, moved, rounds = poses, previous.gate if previous is not None else 0.0, 0.0, 0
     for rounds in range(1, p.rounds + 1):
-        gate = p.gates[min(rounds, len(p.gates)) - 1]
-        evaluate_pairs(poses, pairs, arrays, gate, p.scale_of_gate * gate, terms)
+        last, gate = gate, p.gates[min(rounds, len(p.gates)) - 1]
+        if gate != last:
+            evaluated.at[:] = np.nan
+        evaluate_pairs(poses, pairs, arrays, gate, p.scale_of_gate * gate, terms, evaluated)
         diagonal, off_diagonal, right = normal_equations(poses, pairs, terms, weight, edges)
         step = solve_anchored(system, diagonal, off_diagonal, right)
         before, poses = poses, apply_increment(poses, step)
@@ -126,7 +134,19 @@ def refine(
             progress(rounds / p.rounds)
         if rounds >= len(p.gates) and moved < p.convergence_tolerance:
             break
-    return Registration(poses, pairs, terms, before, weight, gate, p.scale_of_gate * gate, rounds, moved)
+    return Registration(poses, pairs, terms, before, weight, gate, p.scale_of_gate * gate, rounds, moved, evaluated)
+
+
+def _known_terms(pairs: I64, scans: int, previous: Registration | None) -> tuple[PairTerms, Evaluated]:
+    """Terms of the pairs (m, 2), and where they were evaluated: those that a previous pass has, the others to be."""
+    terms = PairTerms(np.empty((len(pairs), 3, 3)), np.empty((len(pairs), 3)), np.zeros((len(pairs), 5)))
+    evaluated = Evaluated(np.full((len(pairs), 3), np.nan), np.empty((len(pairs), 3)))
+    if previous is not None:
+        old, new = (numbers[:, 0] * scans + numbers[:, 1] for numbers in (previous.pairs, pairs))
+        _, of_new, of_old = np.intersect1d(new, old, assume_unique=True, return_indices=True)
+        for to, source in zip((*terms, *evaluated), (*previous.terms, *previous.evaluated), strict=True):
+            to[of_new] = source[of_old]
+    return terms, evaluated
 
 
 def normal_equations(poses: F64, pairs: I64, terms: PairTerms, weight: float, edges: Edges) -> tuple[F64, F64, F64]:
@@ -147,10 +167,6 @@ def moved_scans(step: F64) -> float:
     return float(np.percentile(np.abs(step * (1.0, 1.0, 5.0)).max(axis=1), 99.0))
 
 
-_AT_ONCE = 512
-"""Scans whose neighbours are listed together. Internal: memory alone, the results are the same."""
-
-
 def neighbour_pairs(poses: F64, radius: float, most: int, temporal: int, crowd: int) -> I64:
     """Pairs of scans that should see the same walls: those just before, and the near ones in space.
 
@@ -159,27 +175,16 @@ def neighbour_pairs(poses: F64, radius: float, most: int, temporal: int, crowd: 
     `crowd` scans only `crowd`, even in time, are taken as partners, so that the equations stay sparse.
     Returns (m, 2), the earlier first, sorted.
     """
-    from scipy.spatial import cKDTree
-
     n = len(poses)
     sort = views(poses, 0.5 * radius)
     known = _thinned(sort, crowd)
-    tree = cKDTree(poses[known, :2])
+    grid, order = Grid.of(poses[known, :2], radius)
+    partners = np.empty((n, most), dtype=np.int64)
+    nearest_partners(poses, sort, known[order], grid, most, partners)
+    scan, partner = np.repeat(np.arange(n), most), partners.reshape(-1)
+    scan, partner = scan[partner >= 0], partner[partner >= 0]
     keys = [np.arange(n - gap) * n + np.arange(gap, n) for gap in range(1, temporal + 1)]
-    for begin in range(0, n, _AT_ONCE):
-        lists = tree.query_ball_point(poses[begin : begin + _AT_ONCE, :2], radius, return_sorted=True)
-        for k, found in enumerate(lists, start=begin):
-            near = known[np.array(found, dtype=np.int64)]
-            near = near[near != k]
-            if len(near) == 0:
-                continue
-            offset = poses[near] - poses[k]
-            distance = np.hypot(offset[:, 0], offset[:, 1]) + 0.5 * np.abs(wrap_angles(offset[:, 2]))
-            order = np.argsort(distance, kind="stable")
-            _, first = np.unique(sort[near[order]], return_index=True)
-            chosen = near[order[np.sort(first)[:most]]]
-            keys.append(np.minimum(chosen, k) * n + np.maximum(chosen, k))
-    unique = np.unique(np.concatenate(keys)) if keys else np.zeros(0, dtype=np.int64)
+    unique = np.unique(np.concatenate((*keys, np.minimum(scan, partner) * n + np.maximum(scan, partner))))
     return np.column_stack((unique // n, unique % n)).astype(np.int64)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.sparse import bsr_array, csc_array, tril
 from scipy.sparse.linalg import splu
 
+from hsloc.kernels.block_cholesky import Factor, factor_columns, factorise, solve_factor
 from hsloc.kernels.normal_equations import diagonal_blocks, selected_inverse
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ class BlockSystem:
     """A symmetric positive definite matrix of 3 x 3 blocks with a fixed pattern: n on the diagonal, m off it.
 
     `rows` and `columns` (m,) are the places of the off-diagonal blocks, in either triangle; blocks that share a place
-    are added up.
+    are added up. The order of elimination is found once, for all matrices of the pattern.
     """
 
     def __init__(self, size: int, rows: I64, columns: I64) -> None:
@@ -38,11 +39,13 @@ class BlockSystem:
         self._indices = self._columns[order][first]
         counts = np.bincount(self._rows[order][first], minlength=size)
         self._indptr = np.concatenate(([0], np.cumsum(counts)))
+        self._elimination: _Elimination | None = None
 
     def solve(self, diagonal: F64, off_diagonal: F64, right: F64) -> F64:
         """The x (n, 3) of `A x = right`."""
-        solution: F64 = self._factor(diagonal, off_diagonal).solve(np.ascontiguousarray(right.reshape(-1)))
-        return solution.reshape(-1, 3)
+        if self._elimination is None:
+            self._elimination = _Elimination(self._indptr, self._indices)
+        return self._elimination.solve(self._summed(diagonal, off_diagonal), right)
 
     def inverse_blocks(self, diagonal: F64, off_diagonal: F64) -> F64:
         """The blocks (n, 3, 3) on the diagonal of the inverse: covariances, where the matrix is an information."""
@@ -57,8 +60,54 @@ class BlockSystem:
         diagonal_blocks(start, rows, lower, on_diagonal, factor.perm_c.astype(np.int64), blocks)
         return blocks
 
-    def _factor(self, diagonal: F64, off_diagonal: F64) -> SuperLU:
+    def _summed(self, diagonal: F64, off_diagonal: F64) -> F64:
+        """The blocks of the matrix, row by row."""
         blocks = np.concatenate((diagonal, off_diagonal, off_diagonal.transpose(0, 2, 1)))
-        data = np.add.reduceat(blocks[self._order], self._group, axis=0)
+        return np.asarray(np.add.reduceat(blocks[self._order], self._group, axis=0), dtype=np.float64)
+
+    def _factor(self, diagonal: F64, off_diagonal: F64) -> SuperLU:
+        data = self._summed(diagonal, off_diagonal)
         matrix = csc_array(bsr_array((data, self._indices, self._indptr), shape=(3 * self._size, 3 * self._size)))
         return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+class _Elimination:
+    """The order in which the blocks of a pattern (CSR: `indptr`, `indices`) are eliminated, and where L has blocks."""
+
+    def __init__(self, indptr: I64, indices: I64) -> None:
+        size = len(indptr) - 1
+        order = _minimum_degree(indptr, indices)
+        place = np.empty(size, dtype=np.int64)
+        place[order] = np.arange(size)
+        rows, columns = place[np.repeat(np.arange(size), np.diff(indptr))], place[indices]
+        upper = np.flatnonzero(rows < columns)
+        upper = upper[np.lexsort((rows[upper], columns[upper]))]
+        self._order, self._upper = order, upper
+        self._diagonal = np.flatnonzero(rows == columns)[order]
+        self._rows = rows[upper]
+        self._start = np.concatenate(([0], np.cumsum(np.bincount(columns[upper], minlength=size)))).astype(np.int64)
+        self._parent, counts = np.empty(size, dtype=np.int64), np.empty(size, dtype=np.int64)
+        factor_columns(self._start, self._rows, self._parent, counts)
+        start = np.concatenate(([0], np.cumsum(counts)))
+        blocks = int(start[-1])
+        self._factor = Factor(start, np.empty(blocks, np.int64), np.empty((blocks, 3, 3)), np.empty((size, 3, 3)))
+
+    def solve(self, blocks: F64, right: F64) -> F64:
+        """The x (n, 3) of the matrix with these blocks, in the order of the pattern."""
+        factorise(self._start, self._rows, blocks[self._upper], blocks[self._diagonal], self._parent, self._factor)
+        x = np.ascontiguousarray(right[self._order], dtype=np.float64)
+        solve_factor(self._factor, x)
+        solution = np.empty_like(x)
+        solution[self._order] = x
+        return solution
+
+
+def _minimum_degree(indptr: I64, indices: I64) -> I64:
+    """An order of elimination (n,) with little fill, of a symmetric pattern whose diagonal is full."""
+    size = len(indptr) - 1
+    # SuperLU orders by the pattern alone; the values only have to be factorised without pivoting.
+    values = np.ones(len(indices))
+    values[np.repeat(np.arange(size), np.diff(indptr)) == indices] = 2.0 * size
+    matrix = csc_array((values, indices, indptr), shape=(size, size))
+    factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return np.argsort(factor.perm_c).astype(np.int64)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from room_scans import room_scan
 
 from hsloc.errors import ConfigError
-from hsloc.model.pose2 import wrap_angles
-from hsloc.slam.joint_registration import JointRegistrationParameters, neighbour_pairs
+from hsloc.model.pose2 import Pose2, wrap_angles
+from hsloc.slam.joint_registration import JointRegistrationParameters, neighbour_pairs, refine
+from hsloc.slam.keyscans import KeyScan, KeyScans
+from hsloc.slam.pose_graph import Edges
 
 RADIUS, MOST, TEMPORAL = 3.0, 8, 3
 
@@ -54,7 +57,7 @@ def test_pairs_are_those_of_the_plain_rule(n: int) -> None:
 
 def test_of_a_crowd_some_stand_for_all_and_everybody_has_partners() -> None:
     crowd = 5
-    poses = drive(1500, 4.0)
+    poses = drive(600, 2.5)
     pairs = neighbour_pairs(poses, RADIUS, MOST, 0, crowd)
     members: dict[tuple[int, int, int], list[int]] = {}
     for k, pose in enumerate(poses):
@@ -70,6 +73,30 @@ def test_of_a_crowd_some_stand_for_all_and_everybody_has_partners() -> None:
     chain = {(k, k + gap) for gap in range(1, TEMPORAL + 1) for k in range(len(poses) - gap)}
     assert as_set(pairs) | chain == naive_pairs(poses, partners)
     assert set(np.unique(pairs).tolist()) == set(range(len(poses)))
+
+
+def test_a_pass_uses_what_the_one_before_found_of_scans_that_did_not_move() -> None:
+    true = [Pose2(1.0 + 0.3 * k, 1.5, 0.1 * k) for k in range(10)]
+    scans = KeyScans.from_scans([KeyScan.of(room_scan(pose, noise=0.01, seed=k)) for k, pose in enumerate(true)])
+    poses = np.array([pose.to_array() for pose in true])
+    start = poses + np.random.default_rng(3).normal(0.0, (0.03, 0.03, 0.01), poses.shape)
+    start[0] = poses[0]
+    parameters = JointRegistrationParameters(rounds=6, temporal=9)
+    first = refine(start, scans, Edges.none(), parameters)
+    np.testing.assert_allclose(first.poses[:, :2], poses[:, :2], atol=0.02)
+    at = first.evaluated.at.copy()
+    later = JointRegistrationParameters(gates=parameters.gates[-1:], temporal=9)
+    again = refine(first.poses, scans, Edges.none(), later, previous=first)
+    afresh = refine(first.poses, scans, Edges.none(), later)
+    np.testing.assert_array_equal(again.evaluated.at, at)
+    np.testing.assert_array_equal(again.counts, first.counts)
+    np.testing.assert_allclose(again.poses, afresh.poses, atol=3e-4)
+    moved = first.poses.copy()
+    moved[4, 0] += 0.02
+    changed = refine(moved, scans, Edges.none(), later, previous=first)
+    touches = (first.pairs == 4).any(axis=1)
+    assert (changed.evaluated.at[touches] != at[touches]).any(axis=1).all()
+    np.testing.assert_allclose(changed.poses, afresh.poses, atol=3e-3)
 
 
 def test_a_crowd_of_nobody_is_refused() -> None:

@@ -1,0 +1,157 @@
+"""Cholesky factorisation of sparse symmetric systems of 3 x 3 blocks.
+
+The pattern of the factor is found once; then each matrix of that pattern costs a few operations a block. The algorithm
+is that of Davis (2005), "Algorithm 849: a concise sparse Cholesky factorization package", on blocks.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numba import njit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    F64 = NDArray[np.float64]
+    I64 = NDArray[np.int64]
+
+
+class Factor(NamedTuple):
+    """`L D L^T` of a symmetric positive definite matrix of n x n blocks (3, 3), L unit lower triangular.
+
+    Column k of L has the blocks lower[start[k] : start[k + 1]] in the rows of the same entries; `inverse` (n, 3, 3) is
+    that of D.
+    """
+
+    start: I64
+    rows: I64
+    lower: F64
+    inverse: F64
+
+
+@njit(cache=True, nogil=True)
+def factor_columns(start: I64, rows: I64, parent: I64, counts: I64) -> None:
+    """Write the elimination tree to `parent` (n,), -1 at its roots, and the `counts` (n,) of blocks of L by column.
+
+    `start` (n + 1,) and `rows` are the pattern of the matrix above the diagonal, column by column.
+    """
+    n = len(parent)
+    visited = np.empty(n, dtype=np.int64)
+    for k in range(n):
+        parent[k] = -1
+        counts[k] = 0
+        visited[k] = k
+        for p in range(start[k], start[k + 1]):
+            i = rows[p]
+            while visited[i] != k:
+                if parent[i] == -1:
+                    parent[i] = k
+                counts[i] += 1
+                visited[i] = k
+                i = parent[i]
+
+
+@njit(cache=True, nogil=True)
+def factorise(start: I64, rows: I64, upper: F64, diagonal: F64, parent: I64, factor: Factor) -> None:
+    """Write rows, lower blocks and inverse of `factor`, whose `start` is known.
+
+    The matrix has blocks `upper` (m, 3, 3) at the pattern `start`, `rows` and `diagonal` (n, 3, 3).
+    """
+    n = len(diagonal)
+    begin = factor.start
+    out_rows = factor.rows
+    lower = factor.lower
+    inverse = factor.inverse
+    filled = np.zeros(n, dtype=np.int64)
+    visited = np.full(n, -1, dtype=np.int64)
+    pattern = np.empty(n, dtype=np.int64)
+    path = np.empty(n, dtype=np.int64)
+    y = np.zeros((n, 3, 3))
+    d = np.empty((3, 3))
+    x = np.empty((3, 3))
+    for k in range(n):
+        # Row k of L is a solution of the rows before; its pattern are the paths to k in the tree.
+        top = n
+        visited[k] = k
+        for p in range(start[k], start[k + 1]):
+            i = rows[p]
+            for a in range(3):
+                for b in range(3):
+                    y[i, a, b] += upper[p, a, b]
+            length = 0
+            while visited[i] != k:
+                path[length] = i
+                length += 1
+                visited[i] = k
+                i = parent[i]
+            while length > 0:
+                length -= 1
+                top -= 1
+                pattern[top] = path[length]
+        for a in range(3):
+            for b in range(3):
+                d[a, b] = diagonal[k, a, b]
+        for q in range(top, n):
+            i = pattern[q]
+            for a in range(3):
+                for b in range(3):
+                    x[a, b] = y[i, a, b]
+                    y[i, a, b] = 0.0
+            last = begin[i] + filled[i]
+            for p in range(begin[i], last):
+                row = out_rows[p]
+                for a in range(3):
+                    for b in range(3):
+                        y[row, a, b] -= lower[p, a, 0] * x[0, b] + lower[p, a, 1] * x[1, b] + lower[p, a, 2] * x[2, b]
+            for a in range(3):
+                for b in range(3):
+                    lower[last, a, b] = (
+                        x[0, a] * inverse[i, 0, b] + x[1, a] * inverse[i, 1, b] + x[2, a] * inverse[i, 2, b]
+                    )
+            for a in range(3):
+                for b in range(3):
+                    d[a, b] -= lower[last, a, 0] * x[0, b] + lower[last, a, 1] * x[1, b] + lower[last, a, 2] * x[2, b]
+            out_rows[last] = k
+            filled[i] += 1
+        xx = d[1, 1] * d[2, 2] - d[1, 2] * d[2, 1]
+        xy = d[0, 2] * d[2, 1] - d[0, 1] * d[2, 2]
+        xz = d[0, 1] * d[1, 2] - d[0, 2] * d[1, 1]
+        yy = d[0, 0] * d[2, 2] - d[0, 2] * d[2, 0]
+        yz = d[0, 2] * d[1, 0] - d[0, 0] * d[1, 2]
+        zz = d[0, 0] * d[1, 1] - d[0, 1] * d[1, 0]
+        scale = 1.0 / (d[0, 0] * xx + d[1, 0] * xy + d[2, 0] * xz)
+        inverse[k, 0, 0] = xx * scale
+        inverse[k, 0, 1] = inverse[k, 1, 0] = xy * scale
+        inverse[k, 0, 2] = inverse[k, 2, 0] = xz * scale
+        inverse[k, 1, 1] = yy * scale
+        inverse[k, 1, 2] = inverse[k, 2, 1] = yz * scale
+        inverse[k, 2, 2] = zz * scale
+
+
+@njit(cache=True, nogil=True)
+def solve_factor(factor: Factor, x: F64) -> None:
+    """Solve with the factor, in place: `x` (n, 3) is the right side before."""
+    start = factor.start
+    rows = factor.rows
+    lower = factor.lower
+    inverse = factor.inverse
+    n = len(x)
+    for k in range(n):
+        x0 = x[k, 0]
+        x1 = x[k, 1]
+        x2 = x[k, 2]
+        for p in range(start[k], start[k + 1]):
+            for a in range(3):
+                x[rows[p], a] -= lower[p, a, 0] * x0 + lower[p, a, 1] * x1 + lower[p, a, 2] * x2
+    for k in range(n - 1, -1, -1):
+        x0 = x[k, 0]
+        x1 = x[k, 1]
+        x2 = x[k, 2]
+        for a in range(3):
+            x[k, a] = inverse[k, a, 0] * x0 + inverse[k, a, 1] * x1 + inverse[k, a, 2] * x2
+        for p in range(start[k], start[k + 1]):
+            row = rows[p]
+            for a in range(3):
+                x[k, a] -= lower[p, 0, a] * x[row, 0] + lower[p, 1, a] * x[row, 1] + lower[p, 2, a] * x[row, 2]

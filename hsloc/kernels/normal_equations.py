@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 
 _SAME_M = 1e-3
 _SAME_RAD = 3e-4
-"""Motion of a pair (m; rad) that leaves its paired points as they are. Internal: a twentieth of the noise of a point, so
-that the linear model is as good as another evaluation."""
+"""Motion of a pair (m; rad) that leaves its paired points as they are. Internal: a part of the noise of a point."""
 
 
 class Blocks(NamedTuple):
@@ -314,3 +313,31 @@ def diagonal_blocks(start: I64, rows: I64, lower: F64, diagonal: F64, order: I64
                 begin = start[column]
                 at = begin + np.searchsorted(rows[begin : start[column + 1]], max(one, other))
                 blocks[k, a, b] = blocks[k, b, a] = lower[at]
+
+
+@njit(cache=True, nogil=True)
+def path_lengths(chain: F64, links: I64, lengths: F64, source: int, found: F64) -> None:
+    """Write the length of the shortest path from node `source` to each of the nodes to `found` (n,).
+
+    Nodes k and k + 1 are chain[k] apart, as far as the chain leads; the `links` (m, 2) are `lengths` (m,) long.
+    """
+    found[:] = np.inf
+    found[source] = 0.0
+    is_open = True
+    while is_open:
+        is_open = False
+        for k in range(len(chain)):
+            if found[k] + chain[k] < found[k + 1]:
+                found[k + 1] = found[k] + chain[k]
+        for k in range(len(chain) - 1, -1, -1):
+            if found[k + 1] + chain[k] < found[k]:
+                found[k] = found[k + 1] + chain[k]
+        for m in range(len(links)):
+            i = links[m, 0]
+            j = links[m, 1]
+            if found[i] + lengths[m] < found[j]:
+                found[j] = found[i] + lengths[m]
+                is_open = True
+            elif found[j] + lengths[m] < found[i]:
+                found[i] = found[j] + lengths[m]
+                is_open = True

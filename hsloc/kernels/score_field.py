@@ -13,7 +13,7 @@ hsloc/kernels/fitness.py.
 
 from __future__ import annotations
 
-from math import exp, sqrt
+from math import cos, exp, hypot, sin, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +28,10 @@ if TYPE_CHECKING:
     Integers = NDArray[np.uint16] | NDArray[np.int32]
     I64 = NDArray[np.int64]
     F32 = NDArray[np.float32]
+    F64 = NDArray[np.float64]
 
+_EMPTY = -(1 << 62)
+"""A column of cells that no point lies in."""
 _STEPS = 64
 """Entries of the decay table per squared cell."""
 
@@ -135,3 +138,38 @@ def splat(scores: F32, packed: F32, points: F32, table: F32, radius: float, know
                     scores[v, u] = max(scores[v, u], score)
         pack(scores, packed, iv - reach - 1, iv + reach + 1, iu - reach - 1, iu + reach + 1)
     return added
+
+
+@njit(cache=True, nogil=True)
+def thinned_cloud(points: F32, start: I64, poses: F64, max_range: float, cell: float, cloud: F64) -> int:
+    """Write the hits of n scans at `poses` (n, 3) to `cloud`, the first in each cell of side `cell`; returns how many.
+
+    Scan k has the `points` start[k] to start[k + 1] (m, 2); those farther than `max_range` from the pose are left out.
+    """
+    slots = 1024
+    while slots < 2 * len(points):
+        slots *= 2
+    table = np.full((slots, 2), _EMPTY, dtype=np.int64)
+    count = 0
+    for k in range(len(poses)):
+        c = cos(poses[k, 2])
+        s = sin(poses[k, 2])
+        for i in range(start[k], start[k + 1]):
+            px = np.float64(points[i, 0])
+            py = np.float64(points[i, 1])
+            if not hypot(px, py) < max_range:
+                continue
+            x = poses[k, 0] + c * px - s * py
+            y = poses[k, 1] + s * px + c * py
+            u = np.int64(np.floor(x / cell))
+            v = np.int64(np.floor(y / cell))
+            slot = (u * 73856093 ^ v * 19349663) & (slots - 1)
+            while table[slot, 0] != _EMPTY and (table[slot, 0] != u or table[slot, 1] != v):
+                slot = (slot + 1) & (slots - 1)
+            if table[slot, 0] == _EMPTY:
+                table[slot, 0] = u
+                table[slot, 1] = v
+                cloud[count, 0] = x
+                cloud[count, 1] = y
+                count += 1
+    return count

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import MapError
+from hsloc.kernels.normal_equations import path_lengths
 from hsloc.model.pose2 import Pose2, relative_poses
 from hsloc.slam.loop_matcher import Loop, LoopMatcher
 from hsloc.slam.pose_graph import Edges, edge_errors, solve_edges
@@ -222,9 +223,6 @@ class LoopCloser:
 
     def _path_lengths(self, place: int) -> F64:
         """Metres from a submap to each earlier one along the path and over closed loops, shape (place,)."""
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import dijkstra
-
         # Where two logs are connected the path may lead over submaps that are still to be visited.
         last = place if self._first == 0 else len(self._places) - 1
         chain = np.maximum(np.diff(self._places.path_length[: last + 1]), 1e-3)
@@ -238,12 +236,10 @@ class LoopCloser:
             else:
                 loops.append(loop)
                 lengths.append(length)
-        rows = [*range(last), *(loop.first for loop in loops)]
-        columns = [*range(1, last + 1), *(loop.second for loop in loops)]
-        edges = (np.concatenate((chain, lengths)), (rows, columns))
-        graph = coo_array(edges, shape=(len(self._places), len(self._places)))
-        distances: F64 = dijkstra(graph.tocsr(), directed=False, indices=np.array([place]))
-        return distances[0, :place]
+        links = np.array([(loop.first, loop.second) for loop in loops], dtype=np.int64).reshape(-1, 2)
+        found = np.empty(len(self._places))
+        path_lengths(chain, links, np.array(lengths), place, found)
+        return found[:place]
 
     def _window(self, path_length: float) -> tuple[float, float]:
         """Half-widths (m, rad) of the window after a path length (m)."""
@@ -263,6 +259,6 @@ def loop_edges(accepted: list[Loop], nodes: NDArray[np.int64], robust: float) ->
     return Edges(
         np.array([(nodes[loop.first], nodes[loop.second]) for loop in accepted], dtype=np.int64),
         np.array([loop.T_first_second.to_array() for loop in accepted]),
-        np.array([np.linalg.inv(loop.covariance) for loop in accepted]),
+        np.asarray(np.linalg.inv(np.array([loop.covariance for loop in accepted])), dtype=np.float64),
         np.full(len(accepted), robust),
     )

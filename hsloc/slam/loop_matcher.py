@@ -139,13 +139,14 @@ class LoopMatcher:
         self._rng = rng
         self._chosen = scans.chosen(_COMPARED_HITS)
         self._fields: dict[int, tuple[LikelihoodField, F32]] = {}
+        self._last_cloud: tuple[int, F64] = (-1, np.zeros((0, 2)))
 
     def search(self, first: int, second: int, centre: Pose2, window: tuple[float, float]) -> Loop:
         """Search the pose of place `second` seen from `first` in `centre` +- `window` (m, rad)."""
         p = self._parameters
         half, half_angle = window
         likelihood, pooled = self._field(first)
-        points = self._places.cloud(second, 1, self._scans, p.scan_range, 2.0 * p.resolution)
+        points = self._cloud(second)
         match = p.hide.match(points, likelihood, Window(centre, half, half, half_angle), self._rng)
         prior = np.diag((1.0 / half**2, 1.0 / half**2, 1.0 / half_angle**2)) * p.sigmas**2
         pose, information, paired, conflict = self._registered(first, second, match.pose, centre, prior)
@@ -215,6 +216,14 @@ class LoopMatcher:
             np.concatenate(picked),
             starts_of([len(part) for part in picked]),
         )
+
+    def _cloud(self, place: int) -> F64:
+        """Hits (n, 2) of a place in its frame; a place is searched for in several others in a row."""
+        if self._last_cloud[0] != place:
+            p = self._parameters
+            cloud = self._places.cloud(place, 1, self._scans, p.scan_range, 2.0 * p.resolution)
+            self._last_cloud = (place, cloud)
+        return self._last_cloud[1]
 
     def _field(self, place: int) -> tuple[LikelihoodField, F32]:
         found = self._fields.pop(place, None)

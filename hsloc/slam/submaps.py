@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.kernels.score_field import thinned_cloud
 from hsloc.localisation.kalman_filter import predict_covariance
 from hsloc.model.pose2 import IDENTITY, Pose2, compose_poses, relative_poses
 from hsloc.slam.local_map import LocalMap
@@ -121,17 +122,11 @@ class Submaps:
             np.broadcast_to(self.poses[self.reference[place]], (len(members), 3)),
             self.poses[members.start : members.stop],
         )
-        parts = []
-        for row, scan in enumerate(members):
-            hits = scans.hits(scan).astype(np.float64)
-            parts.append(Pose2.from_array(relative[row]) @ hits[np.hypot(hits[:, 0], hits[:, 1]) < max_range])
-        points = np.concatenate(parts)
-        if len(points) == 0:
-            return points
-        keys = np.floor(points / cell).astype(np.int64)
-        _, first = np.unique(keys[:, 0] * 4000037 + keys[:, 1], return_index=True)
-        thinned: F64 = points[np.sort(first)]
-        return thinned
+        hits = slice(int(scans.start[members.start]), int(scans.start[members.stop]))
+        start = scans.start[members.start : members.stop + 1] - hits.start
+        points = scans.points[hits]
+        cloud = np.empty((len(points), 2))
+        return cloud[: thinned_cloud(points, start, relative, max_range, cell, cloud)]
 
     def field(
         self, place: int, around: int, scans: KeyScans, max_range: float, resolution: float, sigma: float

@@ -6,7 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from hsloc.kernels.normal_equations import Blocks, Equations, add_edges, add_inverse_term, add_relative_term, relative
+from hsloc.kernels.normal_equations import (
+    Blocks,
+    Equations,
+    add_edges,
+    add_inverse_term,
+    add_relative_term,
+    path_lengths,
+    relative,
+)
 from hsloc.kernels.point_to_line import Term
 from hsloc.model.pose2 import relative_poses
 from hsloc.slam.sparse_solver import BlockSystem
@@ -128,3 +136,18 @@ def test_blocks_on_the_diagonal_are_those_of_the_dense_inverse() -> None:
     got = BlockSystem(n, rows, columns).inverse_blocks(diagonal, off)
     for k in range(n):
         np.testing.assert_allclose(got[k], want[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rtol=1e-9, atol=1e-12)
+
+
+def test_path_lengths_are_those_of_dijkstra_over_chain_and_links(rng: Any) -> None:
+    chain, links, lengths = rng.uniform(1.0, 3.0, 29), rng.integers(0, 33, (12, 2)), rng.uniform(0.1, 8.0, 12)
+    distance = np.full((33, 33), np.inf)
+    ends = [*((k, k + 1) for k in range(29)), *links.tolist()]
+    for (i, j), length in zip(ends, [*chain, *lengths], strict=True):
+        distance[i, j] = distance[j, i] = min(distance[i, j], length)
+    np.fill_diagonal(distance, 0.0)
+    for middle in range(33):
+        distance = np.minimum(distance, distance[:, [middle]] + distance[[middle]])
+    found = np.empty(33)
+    for source in (0, 7, 29, 32):
+        path_lengths(chain, links, lengths, source, found)
+        np.testing.assert_allclose(found, distance[source])

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_edt
 
 from hsloc.kernels.fitness import pack
-from hsloc.kernels.score_field import column_distances, decay_table, splat, squared_distances
+from hsloc.kernels.score_field import column_distances, decay_table, splat, squared_distances, thinned_cloud
+from hsloc.model.pose2 import Pose2
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -112,3 +113,18 @@ def test_points_at_the_border_or_outside_are_left_out(point: tuple[float, float]
     assert count == 0
     assert not scores.any()
     assert not packed.any()
+
+
+def test_a_cloud_has_the_first_point_of_each_cell_that_is_near_enough(rng: Any) -> None:
+    points = rng.normal(0.0, 2.0, (60, 2)).astype(np.float32)
+    start, poses = np.array([0, 25, 25, 60]), rng.normal(size=(3, 3))
+    wanted: dict[tuple[int, int], list[float]] = {}
+    for k in range(3):
+        for x, y in points[start[k] : start[k + 1]].astype(np.float64):
+            if np.hypot(x, y) < 3.0:
+                moved = Pose2.from_array(poses[k]) @ np.array((x, y))
+                wanted.setdefault((int(moved[0] // 0.5), int(moved[1] // 0.5)), moved.tolist())
+    cloud = np.empty((60, 2))
+    count = thinned_cloud(points, start, poses, 3.0, 0.5, cloud)
+    assert 10 < count < 60
+    np.testing.assert_allclose(cloud[:count], list(wanted.values()))

@@ -1,8 +1,11 @@
 """Jobs on two servers and several workers that share a PostgreSQL and a store, while all of them are mistreated.
 
 At random: kill -9 of workers, servers and jobs' processes, a worker that stands still for longer than its lease and
-comes back, a restart of PostgreSQL. Afterwards: every accepted job has ended exactly once, its results are right and
-there once, every upload is whole, every webhook came, and no process is left.
+comes back, a restart of PostgreSQL. With `--network` (as root) each server and worker is a network namespace of its
+own, and the store is S3 (moto's server): then a worker or server is cut off from the network for longer than a lease,
+the store is away for as long, and a clock is set an hour forward, PostgreSQL's among them. Afterwards: every accepted
+job has ended exactly once, its results are right and there once, every upload is whole, every webhook came, and no
+process is left.
 """
 
 from __future__ import annotations
@@ -19,13 +22,14 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 import postgresql
+from network import S3, Clock, Machine, Network
 from rig import Server, Worker, jobs_processes, kill_all
 from sqlalchemy import select
 
@@ -38,13 +42,24 @@ from hsloc_service.results.upload_parts import UploadParts
 ENDS = ("succeeded", "failed", "crashed", "cancelled")
 LEASE_S = 4.0
 """By default; a busy machine needs more, or jobs are requeued because nothing is scheduled."""
+HOUR_S = 3600
 
 
 class Fleet:
-    def __init__(self, folder: Path, database: postgresql.Server, workers: int, lease_s: float) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        database: postgresql.Server,
+        workers: int,
+        lease_s: float,
+        network: Network | None,
+        store: S3 | None,
+        clock: Clock | None,
+    ) -> None:
         self.lease_s = lease_s
         self.folder, self.database, self.url = folder, database, database.new_database()
-        self.store = f"file://{folder}/store"
+        self.store = f"file://{folder}/store" if store is None else "s3://fleet/jobs"
+        self.s3, self.clock = store, clock
         shared = {
             "HSLOC_DATABASE_URL": self.url,
             "HSLOC_STORE_URL": self.store,
@@ -55,9 +70,18 @@ class Fleet:
             "HSLOC_WEBHOOK_PRIVATE": "1",
             "HSLOC_WEBHOOK_ATTEMPTS": "50",
             "HSLOC_WEBHOOK_BACKOFF_S": "0.2",
+            "HSLOC_STORE_TIMEOUT_S": "10",
+            **({} if store is None else store.variables),
         }
-        self.servers = [Server(folder / f"s{k}", HSLOC_SLOTS="0", **shared).start() for k in range(2)]
-        self.workers = [Worker(folder / f"w{k}", HSLOC_SLOTS="2", **shared).start() for k in range(workers)]
+        machines = [None if network is None else network.machine() for _ in range(2 + workers)]
+        variables = [shared if each is None else shared | each.clock.variables for each in machines]
+        self.servers = [
+            Server(folder / f"s{k}", machine=machines[k], HSLOC_SLOTS="0", **variables[k]).start() for k in range(2)
+        ]
+        self.workers = [
+            Worker(folder / f"w{k}", machine=machines[2 + k], HSLOC_SLOTS="2", **variables[2 + k]).start()
+            for k in range(workers)
+        ]
 
     def folders(self) -> list[Path]:
         return [each.data for each in (*self.servers, *self.workers)]
@@ -67,7 +91,10 @@ class Fleet:
         for each in (*self.servers, *self.workers):
             if each.process is not None and each.process.poll() is not None:
                 each.start()  # as the system's manager of services does: it was started while PostgreSQL was away
-        kind = rng.choices(("worker", "job process", "server", "stop", "database"), (40, 30, 20, 7, 3))[0]
+        kinds = {"worker": 40, "job process": 30, "server": 20, "stop": 7, "database": 3}
+        if self.s3 is not None:
+            kinds |= {"cut worker": 12, "cut server": 4, "store": 4, "clock": 3, "clock of the database": 2}
+        kind = rng.choices(list(kinds), list(kinds.values()))[0]
         if kind == "job process":
             pids = [pid for folder in self.folders() for pid in jobs_processes(folder)]
             if not pids:
@@ -78,6 +105,17 @@ class Fleet:
             server = rng.choice(self.servers)
             server.end(signal.SIGKILL)
             server.start()
+        elif kind in ("cut worker", "cut server"):
+            self.cut(rng.choice(self.workers if kind == "cut worker" else self.servers).machine)
+        elif kind == "store":
+            self.cut(None if self.s3 is None else self.s3.machine)
+        elif kind == "clock":
+            machine = rng.choice((*self.servers, *self.workers)).machine
+            assert machine is not None
+            machine.clock.set_forward(HOUR_S)
+        elif kind == "clock of the database":
+            assert self.clock is not None
+            self.clock.set_forward(HOUR_S)
         elif kind == "database":
             self.database.stop("immediate")
             time.sleep(rng.uniform(0.0, 2.0))
@@ -94,12 +132,19 @@ class Fleet:
                 worker.start()
         return kind
 
+    def cut(self, machine: Machine | None) -> None:
+        """A machine without network for longer than a lease."""
+        assert machine is not None
+        machine.cut()
+        time.sleep(1.5 * self.lease_s)
+        machine.join()
+
 
 class Receiver(ThreadingHTTPServer):
     """Counts webhooks by their event's id."""
 
-    def __init__(self) -> None:
-        super().__init__(("127.0.0.1", 0), Handler)
+    def __init__(self, address: str) -> None:
+        super().__init__((address, 0), Handler)
         self.jobs: dict[str, str] = {}
         self.count: Counter[str] = Counter()
 
@@ -118,10 +163,9 @@ class Handler(BaseHTTPRequestHandler):
         pass
 
 
-def submit_all(url: str, count: int, seed: int, hook: str, accepted: dict[str, tuple[int, str]]) -> None:
+def submit_all(client: Client, count: int, seed: int, hook: str, accepted: dict[str, tuple[int, str]]) -> None:
     """Upload and submit, as a client that tries again; one in ten is cancelled soon after."""
     rng = random.Random(seed)
-    client = Client(url, attempts=300, timeout_s=10.0, block=20_000)
     path = Path(tempfile.gettempdir()) / f"fleet-{os.getpid()}-{seed}.mcap"
     for k in range(count):
         path.write_bytes(f"slow {rng.uniform(0.5, 3.0):.3f} {k} ".encode() + rng.randbytes(50_000))
@@ -185,20 +229,32 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=3)
     parser.add_argument("--lease-s", type=float, default=LEASE_S)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--network", action="store_true", help="Network namespaces and S3; needs root and moto.")
     arguments = parser.parse_args()
     folder, rng = Path(tempfile.mkdtemp(prefix="hsloc-fleet-")), random.Random(arguments.seed)
     accepted: dict[str, tuple[int, str]] = {}
-    receiver = Receiver()
-    threading.Thread(target=receiver.serve_forever, daemon=True).start()
-    hook = f"http://127.0.0.1:{receiver.server_port}/"
     with ExitStack() as stack:
-        database = stack.enter_context(postgresql.running())
-        fleet = Fleet(folder, database, arguments.workers, arguments.lease_s)
+        network = store = clock = None
+        if arguments.network:
+            network = stack.enter_context(closing(Network(folder)))
+            store = stack.enter_context(closing(S3(network.machine(), folder / "s3.log")))
+            os.environ |= store.variables  # what is judged is read by this process
+            clock = Clock(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hsloc-clock-"))) / "database")
+            clock.path.parent.chmod(0o755)
+        address = "" if network is None else network.address
+        receiver = Receiver(address or "127.0.0.1")
+        threading.Thread(target=receiver.serve_forever, daemon=True).start()
+        hook = f"http://{address or '127.0.0.1'}:{receiver.server_port}/"
+        variables = {} if clock is None else clock.variables
+        database = stack.enter_context(postgresql.running(address=address, variables=variables))
+        fleet = Fleet(folder, database, arguments.workers, arguments.lease_s, network, store, clock)
         stack.callback(kill_all, *fleet.servers, *fleet.workers)
         begin = time.monotonic()
         clients = []
         for k, server in enumerate(fleet.servers):
-            work = (server.url, arguments.jobs // 2, arguments.seed * 10 + k, hook, accepted)
+            client = Client(server.url, attempts=300, timeout_s=10.0, block=20_000)
+            client.request("GET", "/healthz")  # a server that never answered is given up sooner
+            work = (client, arguments.jobs // 2, arguments.seed * 10 + k, hook, accepted)
             clients.append(threading.Thread(target=submit_all, args=work, daemon=True))
             clients[-1].start()
         done: Counter[str] = Counter()
@@ -207,7 +263,7 @@ def main() -> int:
             done[fleet.mistreat(rng)] += 1
         for thread in clients:
             thread.join()
-        client = Client(fleet.servers[0].url)
+        client = Client(fleet.servers[0].url, attempts=300, timeout_s=10.0)
         states = Counter(client.wait(job)["state"] for job in list(accepted))
         attempts = Counter(client.job(job)["attempt"] for job in accepted)
         seconds = time.monotonic() - begin

@@ -12,17 +12,24 @@ import time
 import urllib.error
 import urllib.request
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from network import Machine
 
 FAKE_WORKER = Path(__file__).parents[2] / "tests" / "service" / "fake_worker.py"
 
 
 class Server:
-    def __init__(self, data: Path, real: bool = False, **variables: str) -> None:
-        self.data = data
-        with socket.socket() as found:
-            found.bind(("127.0.0.1", 0))
-            self.port = int(found.getsockname()[1])
-        self.url = f"http://127.0.0.1:{self.port}"
+    def __init__(self, data: Path, real: bool = False, machine: Machine | None = None, **variables: str) -> None:
+        self.data, self.machine = data, machine
+        self.host = "127.0.0.1" if machine is None else machine.address
+        self.port = 8000
+        if machine is None:
+            with socket.socket() as found:
+                found.bind((self.host, 0))
+                self.port = int(found.getsockname()[1])
+        self.url = f"http://{self.host}:{self.port}"
         self.process: subprocess.Popen[bytes] | None = None
         self.variables = {"HSLOC_MIN_FREE_BYTES": "1M", **variables}
         if not real:
@@ -30,6 +37,8 @@ class Server:
 
     def start(self) -> Server:
         command = [sys.executable, "-m", "hsloc.cli.main", "serve", "--data", str(self.data), "--port", str(self.port)]
+        if self.machine is not None:
+            command = [*self.machine.prefix, *command, "--host", self.host, "--open-to-all"]
         with (self.data.parent / f"{self.data.name}.log").open("ab") as log:
             self.process = subprocess.Popen(command, env=os.environ | self.variables, stdout=log, stderr=log)
         self.wait_ready()
@@ -63,8 +72,8 @@ class Server:
 class Worker:
     """`hsloc work` with the tests' fake worker."""
 
-    def __init__(self, data: Path, **variables: str) -> None:
-        self.data = data
+    def __init__(self, data: Path, machine: Machine | None = None, **variables: str) -> None:
+        self.data, self.machine = data, machine
         self.variables = {
             "HSLOC_MIN_FREE_BYTES": "1M",
             "HSLOC_WORKER_COMMAND": f"{sys.executable},-P,{FAKE_WORKER}",
@@ -74,6 +83,8 @@ class Worker:
 
     def start(self) -> Worker:
         command = [sys.executable, "-m", "hsloc.cli.main", "work", "--data", str(self.data)]
+        if self.machine is not None:
+            command = [*self.machine.prefix, *command]
         with (self.data.parent / f"{self.data.name}.log").open("ab") as log:
             self.process = subprocess.Popen(command, env=os.environ | self.variables, stdout=log, stderr=log)
         return self

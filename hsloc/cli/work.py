@@ -35,6 +35,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="Run jobs with these tags, too, such as big-memory; those without a tag run everywhere.",
     )  # fmt: skip
     parser.add_argument(
+        "--metrics", metavar="[HOST:]PORT",
+        help="Address of metrics for Prometheus, without a token (default: none; HOST by default 127.0.0.1).",
+    )  # fmt: skip
+    parser.add_argument(
         "--drain-s", type=float, default=3600.0, metavar="S",
         help="Time for the running jobs to end after SIGTERM [s]; then they go back into the queue (default: 3600).",
     )  # fmt: skip
@@ -48,6 +52,6 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         tags = None if arguments.tags is None else tuple(filter(None, arguments.tags.split(",")))
         chosen = settings.from_environment(data=arguments.data, slots=arguments.slots, tags=tags)
-        return int(service_module("work").work(chosen, max(arguments.drain_s, 0.0)))
+        return int(service_module("work").work(chosen, max(arguments.drain_s, 0.0), arguments.metrics))
     except settings.SettingsError as error:
         raise ConfigError(str(error)) from error

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING
 
 from sqlalchemy import delete, select
 
+from hsloc_service.db.database import clock
 from hsloc_service.db.tables import AuditRow
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ KEPT_S = 366 * 86400.0
 
 def note(session: Session, tenant: str, actor: str | None, action: str, *targets: str) -> None:
     """Record an action on each target, in the transaction that does it. Without a token the actor is empty."""
-    now = time.time()
+    now = clock(session)
     session.add_all(
         AuditRow(at=now, tenant=tenant, actor=actor or "", action=action, target=target) for target in targets
     )

@@ -1,9 +1,9 @@
 """What is removed with time, and what is put right when the server starts.
 
-With time: unfinished uploads, old jobs, old keys. At the start the data folder is compared with its database. What the
-database knows to be deleted or abandoned is removed. What it does not know is moved to `quarantine/` and logged,
-because the database may be the wrong one: restored from a backup, or lost. When the right one is back, what it names is
-moved out of the quarantine again.
+With time: unfinished uploads, old jobs, old keys, expired links. At the start the data folder is compared with its
+database. What the database knows to be deleted or abandoned is removed. What it does not know is moved to
+`quarantine/` and logged, because the database may be the wrong one: restored from a backup, or lost. When the right one
+is back, what it names is moved out of the quarantine again.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from __future__ import annotations
 import logging
 import math
 import threading
-import time
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from sqlalchemy import delete, exists, select, update
 
 from hsloc_service.audit import RETENTION, forget, note
-from hsloc_service.db.tables import ENDED, FileRow, IdempotencyRow, JobRow, SweepRow, UploadDeletionRow
+from hsloc_service.db.database import clock
+from hsloc_service.db.tables import ENDED, FileRow, IdempotencyRow, JobRow, ShareRow, SweepRow, UploadDeletionRow
 from hsloc_service.errors import StoreError
 from hsloc_service.jobs.repository import base_job, delete_job
 from hsloc_service.jobs.workers import forget_workers
@@ -66,7 +66,9 @@ class Housekeeping:
         while not self._stop.wait(pause):
             pause = self._settings.housekeeping_s
             try:
-                self.tidy(time.time())
+                with self._database.read() as session:
+                    now = clock(session)
+                self.tidy(now)
             except Exception as error:
                 log("housekeeping.error", error=f"{type(error).__name__}: {error}")
 
@@ -84,6 +86,7 @@ class Housekeeping:
             self._delete_old(now - self._settings.retention_s)
         with self._database.write() as session:
             session.execute(delete(IdempotencyRow).where(IdempotencyRow.created < now - KEY_S))
+            session.execute(delete(ShareRow).where(ShareRow.expires <= now))
             forget(session, now)
         uploads, results = self._deletions.clear_uploads(), self._deletions.clear()
         if uploads or results:

@@ -23,6 +23,7 @@ from urllib.parse import urlsplit
 
 from sqlalchemy import select
 
+from hsloc_service.db.database import clock
 from hsloc_service.db.tables import DeliveryRow, SecretRow
 from hsloc_service.logs import log
 from hsloc_service.storage import safe_name
@@ -56,7 +57,7 @@ def queue_webhook(session: Session, job: JobRow, event: str) -> None:
     """
     if job.webhook is None:
         return
-    ident, now = str(uuid.uuid4()), time.time()
+    ident, now = str(uuid.uuid4()), clock(session)
     body = {
         "event": event,
         "event_id": ident,
@@ -139,10 +140,10 @@ class WebhookSender:
         with self._database.write() as session:
             row = session.get(DeliveryRow, due.id, with_for_update=True)
             if row is not None and row.attempts == due.attempts:
-                self._note(row, status, error)
+                self._note(row, status, error, clock(session))
         return True
 
-    def _note(self, row: DeliveryRow, status: int | None, error: str | None) -> None:
+    def _note(self, row: DeliveryRow, status: int | None, error: str | None, now: float) -> None:
         row.attempts += 1
         row.last_status, row.last_error = status, error
         if status is not None and 200 <= status < 300:
@@ -151,7 +152,7 @@ class WebhookSender:
             row.state = "given_up"
         else:
             wait = min(self._settings.webhook_backoff_s * 2.0 ** (row.attempts - 1), LONGEST_WAIT_S)
-            row.next_at = time.time() + wait
+            row.next_at = now + wait
         log("webhook", job=row.job_id, event_id=row.id, state=row.state, status=status, error=error)
 
     def _post(self, row: DeliveryRow, secret: str) -> tuple[int | None, str | None]:

@@ -7,21 +7,28 @@ import threading
 import time
 from typing import TYPE_CHECKING, Any
 
+from prometheus_client import start_http_server
+
 from hsloc.version import __version__
 from hsloc_service.execution.warm_up import WarmUp
+from hsloc_service.http import metrics
 from hsloc_service.jobs.workers import Presence
 from hsloc_service.logs import configure, log
 from hsloc_service.parts import open_parts
 from hsloc_service.settings import WORKER, SettingsError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from hsloc_service.settings import Settings
 
 POLL_S = 0.1
 
 
-def work(settings: Settings, drain_s: float) -> int:
+def work(settings: Settings, drain_s: float, metrics_at: str | None = None) -> int:
     """Run jobs until SIGTERM or SIGINT; the exit code.
+
+    `metrics_at` is an address `[HOST:]PORT` at which Prometheus finds this worker's metrics, without a token.
 
     Then no job is begun any more. Those that run may end for `drain_s` seconds, or until the next signal; what still
     runs then goes back into the queue, and that attempt does not count. Raises SettingsError.
@@ -36,7 +43,12 @@ def work(settings: Settings, drain_s: float) -> int:
         )
     if settings.slots < 1:
         raise SettingsError(f"slots is {settings.slots}; a worker needs 1 or more")
-    parts = open_parts(settings)
+    close_metrics = serve_metrics(metrics_at)
+    try:
+        parts = open_parts(settings, ended=metrics.attempt_ended, store_failed=metrics.STORE_ERRORS.inc)
+    except BaseException:
+        close_metrics()
+        raise
     configure()
     asked = threading.Semaphore(0)
 
@@ -46,6 +58,9 @@ def work(settings: Settings, drain_s: float) -> int:
     for which in (signal.SIGTERM, signal.SIGINT):
         signal.signal(which, ask)
     dispatcher = parts.dispatcher
+    metrics.SLOTS.set_function(lambda: settings.slots)
+    metrics.BUSY.set_function(lambda: dispatcher.capacity().busy)
+    metrics.FREE.set_function(parts.storage.free_bytes)
     presence = Presence(
         parts.database, dispatcher.owner, "worker", settings.slots, settings.heartbeat_s, lambda: dispatcher.is_draining
     )
@@ -72,5 +87,29 @@ def work(settings: Settings, drain_s: float) -> int:
         if warm_up is not None:
             warm_up.stop()
         parts.close()
+        close_metrics()
         log("stop")
     return 0
+
+
+def serve_metrics(address: str | None) -> Callable[[], None]:
+    """Answer HTTP requests at `[HOST:]PORT` with the metrics of this machine; what ends that.
+
+    Raises SettingsError for an address that is none, or cannot be listened at.
+    """
+    if address is None:
+        return lambda: None
+    host, _, port = address.rpartition(":")
+    if not port.isdecimal() or int(port) > 65535:
+        raise SettingsError(f"--metrics is {address!r}; it must be a port, or an address such as 0.0.0.0:9100")
+    try:
+        server, thread = start_http_server(int(port), host.strip("[]") or "127.0.0.1", metrics.MACHINE)
+    except OSError as error:
+        raise SettingsError(f"--metrics {address}: cannot be listened at: {error.strerror}; give another") from error
+
+    def close() -> None:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+    return close

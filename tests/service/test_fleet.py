@@ -9,9 +9,10 @@ import re
 import signal
 import time
 from typing import TYPE_CHECKING, Any
+from urllib.request import urlopen
 
 import pytest
-from live_service import Worker, settings, submit, upload, wait
+from live_service import Worker, free_port, settings, submit, upload, wait
 from paths import ROOT
 from ruamel.yaml import YAML
 
@@ -22,6 +23,7 @@ from hsloc_service.http.app import create_app
 from hsloc_service.jobs.leases import Claim
 from hsloc_service.settings import SettingsError, from_environment
 from hsloc_service.storage import Storage
+from hsloc_service.work import serve_metrics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -126,7 +128,8 @@ def test_an_upload_begun_at_one_server_goes_on_at_the_other_and_a_worker_runs_th
     assert (file["state"], file["sha256"]) == ("complete", hashlib.sha256(content).hexdigest())
     assert not list((fleet.folder / "a" / "uploads").iterdir())
     job = other.post("/v1/jobs", json={"log": file["id"]}).json()["id"]
-    worker = fleet.worker("--slots", "2")
+    port = free_port()
+    worker = fleet.worker("--slots", "2", "--metrics", str(port))
     assert wait(one, job, 60.0)["state"] == "succeeded"
     results = [client.get(f"/v1/jobs/{job}/results/trajectory.tum") for client in servers]
     assert results[0].status_code == 200
@@ -144,6 +147,11 @@ def test_an_upload_begun_at_one_server_goes_on_at_the_other_and_a_worker_runs_th
     assert main(["workers"]) == 0
     line = next(each for each in capsys.readouterr().out.splitlines() if each.startswith("| worker"))
     assert [word.strip() for word in line.split("|")][3:6] == [str(worker.process.pid), "2", "1"]
+    with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10.0) as answer:
+        measured = answer.read().decode()
+    expected = {'hsloc_jobs_ended_total{state="succeeded"} 1.0', "hsloc_slots 2.0", "hsloc_slots_busy 1.0"}
+    assert expected <= set(measured.splitlines())
+    assert "hsloc_fleet_slots" not in measured  # which servers know alone
     worker.process.send_signal(signal.SIGTERM)
     later = submit(other)
     assert worker.process.wait(30.0) == 0
@@ -300,6 +308,9 @@ def test_a_worker_that_shares_nothing_is_refused(
     assert main(["work", "--data", str(tmp_path / "data")]) == 1
     assert reason in capsys.readouterr().err
     assert not (tmp_path / "data").exists()
+    for wrong in ("here", "192.0.2.1:9100"):
+        with pytest.raises(SettingsError, match=f"--metrics.*{wrong}"):
+            serve_metrics(wrong)
 
 
 def test_a_store_that_cannot_be_used_is_named_by_its_setting(tmp_path: Path) -> None:

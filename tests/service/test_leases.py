@@ -181,11 +181,16 @@ def test_a_lease_that_a_clock_ended_is_not_taken_from_the_worker_that_runs_the_j
 
 
 def test_leases_are_measured_by_the_database(parts: Parts, monkeypatch: pytest.MonkeyPatch) -> None:
-    parts.submit()
-    assert parts.leases().claim("a") is not None
+    job = parts.submit(webhook="http://127.0.0.1:9/")
+    claim = parts.leases().claim("a")
+    assert claim is not None
     now = time.time()
     monkeypatch.setattr(time, "time", lambda: now + 3600.0)
     assert parts.leases().recover() == []
+    assert parts.leases().fail(claim, "failed", "none", "") == "failed"
+    if parts.database.shared:  # a server whose clock is right would send the webhook after an hour
+        (delivery,) = parts.jobs.deliveries(ANYBODY, job)
+        assert delivery.next_at < now + 60.0
 
 
 def test_a_server_that_starts_leaves_the_jobs_of_another_data_folder_alone(parts: Parts) -> None:

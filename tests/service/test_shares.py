@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import pytest
 from live_service import submit, upload, wait
 from paths import RECORDINGS
-from sqlalchemy import update
+from sqlalchemy import select, update
 
 from hsloc_service.auth import Tokens
 from hsloc_service.db.tables import ShareRow
+from hsloc_service.housekeeping import Housekeeping
 from hsloc_service.settings import Settings
 
 if TYPE_CHECKING:
@@ -103,3 +104,10 @@ def test_a_link_shows_one_job_until_it_is_revoked_or_expires(make_client: Callab
         session.execute(update(ShareRow).values(expires=time.time() - 1.0))
     assert client.get(f"/v1/shared/{late}").status_code == 404
     assert client.get(f"/v1/jobs/{job}/shares").json() == {"shares": []}
+    noted = client.get("/v1/audit").json()["entries"]
+    assert [each["action"] for each in noted[:3]] == ["share.issue", "share.revoke", "share.issue"]
+    assert noted[1]["target"] == noted[2]["target"] == f"{job}/{made['id']}"
+    context = client.app.state.context  # type: ignore[attr-defined]
+    Housekeeping(database, context.storage, context.settings, context.deletions).tidy(time.time())
+    with database.read() as session:
+        assert session.scalar(select(ShareRow)) is None

@@ -11,12 +11,13 @@ import uuid
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import pytest
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
 
 @cache
@@ -38,17 +39,29 @@ def need_postgresql() -> Path:
 class Server:
     """A running PostgreSQL."""
 
-    def __init__(self, folder: Path, programs: Path, fsync: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        programs: Path,
+        fsync: bool = False,
+        address: str = "",
+        variables: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        """Also at an IP address of this machine, for all of its network; with variables in its environment."""
         self.folder, self._programs, self._fsync = folder, programs, fsync
+        self._address, self._variables = address, dict(variables)
         self._user = None
         if os.getuid() == 0:  # PostgreSQL does not run as root
             self._user = "postgres"
             found = pwd.getpwnam("postgres")
             os.chown(folder, found.pw_uid, found.pw_gid)
         self._run("initdb", "-D", str(folder / "db"), "-U", "hsloc", "--auth=trust", "--no-sync", "-E", "UTF8")
+        if address:
+            with (folder / "db" / "pg_hba.conf").open("a") as rules:
+                rules.write("host all all samenet trust\n")
 
     def start(self) -> None:
-        options = f"-k {self.folder} -c listen_addresses= -c shared_buffers=16MB -c max_connections=200"
+        options = f"-k {self.folder} -c listen_addresses={self._address} -c shared_buffers=16MB -c max_connections=200"
         options += f" -c fsync={'on' if self._fsync else 'off'}"
         self._run("pg_ctl", "-D", str(self.folder / "db"), "-w", "-o", options, "-l", str(self.folder / "log"), "start")
 
@@ -59,7 +72,7 @@ class Server:
         """The URL of an empty database."""
         name = f"test_{uuid.uuid4().hex}"
         self._run("createdb", "-h", str(self.folder), "-U", "hsloc", name)
-        return f"postgresql://hsloc@/{name}?host={self.folder}"
+        return f"postgresql://hsloc@/{name}?host={self._address or self.folder}"
 
     def _run(self, program: str, *arguments: str) -> None:
         subprocess.run(
@@ -68,7 +81,7 @@ class Server:
             group=self._user,
             extra_groups=[] if self._user else None,
             cwd=self.folder,
-            env={"PATH": os.environ["PATH"], "LC_ALL": "C.UTF-8"},
+            env={"PATH": os.environ["PATH"], "LC_ALL": "C.UTF-8", **self._variables},
             check=True,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -78,10 +91,12 @@ class Server:
 
 
 @contextmanager
-def running(fsync: bool = False) -> Iterator[Server]:
+def running(
+    fsync: bool = False, address: str = "", variables: Mapping[str, str] = MappingProxyType({})
+) -> Iterator[Server]:
     """A server that ends with the block. Its socket's path must be short."""
     with tempfile.TemporaryDirectory(prefix="hsloc-pg-", ignore_cleanup_errors=True) as folder:
-        server = Server(Path(folder), need_postgresql(), fsync)
+        server = Server(Path(folder), need_postgresql(), fsync, address, variables)
         server.start()
         try:
             yield server

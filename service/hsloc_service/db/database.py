@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import sqlite3
 import threading
+import time
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -160,6 +161,18 @@ class Database:
     def close(self) -> None:
         """Close all connections."""
         self._engine.dispose()
+
+
+def clock(session: Session) -> float:
+    """Seconds since 1970, for what servers compare that share a database: by its clock, asked once in a transaction.
+
+    The clock of one machine may be wrong by hours: its webhooks would wait so long, or uploads be deleted too early.
+    """
+    if session.get_bind().dialect.name != "postgresql":
+        return time.time()
+    if "clock" not in session.info:
+        session.info["clock"] = float(session.execute(text("SELECT extract(epoch FROM now())")).scalar_one())
+    return float(session.info["clock"])
 
 
 def notify(session: Session, message: str) -> None:

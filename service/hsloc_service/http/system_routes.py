@@ -110,8 +110,10 @@ class AuditEntry(BaseModel):
     id: int
     at: AwareDatetime
     actor: str = Field(description="id of the token; `operator`: the server's command line; `retention`: the server")
-    action: str = Field(description="token.issue, token.revoke, job.delete, sweep.delete, file.delete")
-    target: str = Field(description="id of the token, job, sweep or upload")
+    action: str = Field(
+        description="token.issue, token.revoke, share.issue, share.revoke, job.delete, sweep.delete, file.delete"
+    )
+    target: str = Field(description="id of the token, job, sweep or upload; of a link, JOB/LINK")
 
 
 class AuditList(BaseModel):
@@ -128,7 +130,7 @@ def audit_log(
     before: Annotated[int | None, Query(ge=1, le=2**62, description="`next` of the page before")] = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
 ) -> AuditList:
-    """Tokens and deletions of your tenant, for a year. Needs the scope `admin`."""
+    """Tokens, links and deletions of your tenant, for a year. Needs the scope `admin`."""
     rows = audit.entries(ctx.database, who.tenant, before, limit)
     found = [
         AuditEntry(id=row.id, at=known_moment(row.at), actor=row.actor, action=row.action, target=row.target)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import delete
 
-from hsloc_service.db.database import notify
+from hsloc_service.db.database import clock, notify
 from hsloc_service.db.tables import EventRow
 
 if TYPE_CHECKING:
@@ -23,4 +22,4 @@ def record(session: Session, job: JobRow, kind: str, data: dict[str, Any]) -> No
     if kind == "state" and data["state"] in ("queued", "cancelling"):
         # A hint for slots elsewhere; who misses it finds the row within a second, or at the next heartbeat.
         notify(session, "queued" if data["state"] == "queued" else f"cancelling {job.id}")
-    session.add(EventRow(tenant=job.tenant, job_id=job.id, at=time.time(), kind=kind, data=data))
+    session.add(EventRow(tenant=job.tenant, job_id=job.id, at=clock(session), kind=kind, data=data))

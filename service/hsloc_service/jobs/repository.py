@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
 import uuid
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from sqlalchemy import ColumnElement, delete, func, or_, select
 
 from hsloc_service.audit import note
+from hsloc_service.db.database import clock
 from hsloc_service.db.tables import (
     ACTIVE,
     AssetRow,
@@ -255,7 +255,7 @@ class Jobs:
             rerun_of=rerun_of,
             resume_of=request.get("resume"),
             state="queued",
-            created=time.time(),
+            created=clock(session),
             attempt=0,
             cancel=False,
             webhook=request.get("webhook"),
@@ -287,7 +287,7 @@ def made_before(session: Session, who: Principal, key: str | None, digest: str) 
 def remember_key(session: Session, who: Principal, key: str | None, digest: str, made: str) -> None:
     """Record what a request with an Idempotency-Key made."""
     if key is not None:
-        row = IdempotencyRow(tenant=who.tenant, key=key, sha256=digest, job_id=made, created=time.time())
+        row = IdempotencyRow(tenant=who.tenant, key=key, sha256=digest, job_id=made, created=clock(session))
         session.add(row)
 
 
@@ -317,7 +317,7 @@ def _next_seq(session: Session) -> int:
 def finish_job(session: Session, job: JobRow, state: str, reason: str | None, message: str | None) -> None:
     """Put a job into a final state, and its webhook into the outbox, in one transaction."""
     job.state, job.reason, job.message = state, reason, message
-    job.ended = time.time()
+    job.ended = clock(session)
     job.owner = job.lease_until = None
     record(session, job, "state", {"state": state, "reason": reason, "message": message})
     queue_webhook(session, job, "job.ended")

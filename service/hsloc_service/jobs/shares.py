@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import secrets
-import time
 import uuid
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sqlalchemy import delete, select
 
+from hsloc_service.audit import note
 from hsloc_service.auth import sha256_of
+from hsloc_service.db.database import clock
 from hsloc_service.db.tables import ShareRow
 from hsloc_service.errors import busy, not_found
 from hsloc_service.jobs.repository import job_of
@@ -35,8 +36,9 @@ class Shares:
 
     def issue(self, who: Principal, job_id: str, valid_s: float) -> tuple[ShareRow, str]:
         """A new link and its secret of 256 random bits, which is shown this once. Raises ServiceError 404 and 429."""
-        secret, now = f"hss_{secrets.token_urlsafe(32)}", time.time()
+        secret = f"hss_{secrets.token_urlsafe(32)}"
         with self.database.write() as session:
+            now = clock(session)
             job_of(session, who, job_id, lock=True)
             session.execute(delete(ShareRow).where(ShareRow.job_id == job_id, ShareRow.expires <= now))
             if len(session.scalars(_of(who, job_id)).all()) >= MAX_SHARES:
@@ -50,13 +52,14 @@ class Shares:
                 expires=now + valid_s,
             )
             session.add(row)
+            note(session, who.tenant, who.token, "share.issue", f"{job_id}/{row.id}")
         return row, secret
 
     def rows(self, who: Principal, job_id: str) -> Sequence[ShareRow]:
         """The links of a job that are valid, oldest first."""
         with self.database.read() as session:
             job_of(session, who, job_id)
-            return session.scalars(_of(who, job_id).where(ShareRow.expires > time.time())).all()
+            return session.scalars(_of(who, job_id).where(ShareRow.expires > clock(session))).all()
 
     def revoke(self, who: Principal, job_id: str, ident: str) -> None:
         """End a link. Raises ServiceError 404."""
@@ -65,12 +68,13 @@ class Shares:
             if row is None:
                 raise not_found("link", ident)
             session.delete(row)
+            note(session, who.tenant, who.token, "share.revoke", f"{job_id}/{ident}")
 
     def find(self, secret: str) -> ShareRow | None:
         """The link of a secret; None if it is unknown, revoked or expired."""
         with self.database.read() as session:
             return session.scalar(
-                select(ShareRow).where(ShareRow.sha256 == sha256_of(secret), ShareRow.expires > time.time())
+                select(ShareRow).where(ShareRow.sha256 == sha256_of(secret), ShareRow.expires > clock(session))
             )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import uuid
 from collections import Counter
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from sqlalchemy import func, select
 from hsloc.sweep import log_labels
 from hsloc.sweep.table import COLUMNS
 from hsloc_service.audit import note
+from hsloc_service.db.database import clock
 from hsloc_service.db.tables import ACTIVE, JobRow, SweepRow
 from hsloc_service.errors import conflict, not_found
 from hsloc_service.jobs.repository import (
@@ -72,7 +72,7 @@ class Sweeps:
             if (known := made_before(session, who, key, digest)) is not None:
                 return _state(session, _sweep(session, who, known)), []
             self.jobs.need_room(session, who, len(runs))
-            row = SweepRow(id=str(uuid.uuid4()), tenant=who.tenant, name=name, created=time.time(), runs={})
+            row = SweepRow(id=str(uuid.uuid4()), tenant=who.tenant, name=name, created=clock(session), runs={})
             made = [(run, self.jobs.insert(session, who, run.request, sweep=row.id)) for run in runs]
             row.runs = _named(made)
             session.add(row)

@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
 import uuid
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -15,8 +14,9 @@ from sqlalchemy import case, delete, func, select, tuple_
 
 from hsloc.version import __version__
 from hsloc_service.audit import note
+from hsloc_service.db.database import clock
 from hsloc_service.db.tables import ACTIVE, FileRow, JobRow, UploadPartRow
-from hsloc_service.errors import ServiceError, conflict, no_space, not_found
+from hsloc_service.errors import ServiceError, busy, conflict, no_space, not_found
 from hsloc_service.results.deletion_queue import delete_upload
 from hsloc_service.stored_request import files_of
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 SECONDS = 60
 """Length of the log [s]."""
 TIMEOUT_S = 120.0
+WAIT_S = 10.0
 _making = threading.Lock()
 
 
@@ -55,8 +56,8 @@ class Files:
         """
         if size is not None:
             self.need_size(size)
-        now = time.time()
         with self.database.write() as session:
+            now = clock(session)
             self.database.lock_tenant(session, who.tenant)
             self._need_room(session, who, size or 0)
             taken = None if file_id is None else session.get(FileRow, file_id)
@@ -118,7 +119,7 @@ class Files:
             row = session.get(FileRow, file_id, with_for_update=True)
             if row is not None:
                 row.received = row.received if received is None else received
-                row.expires = time.time() + self.settings.upload_ttl_s
+                row.expires = clock(session) + self.settings.upload_ttl_s
 
     def complete(self, file_id: str, size: int, sha256: str) -> FileRow:
         """The file is whole. Raises ServiceError 404 if it was deleted meanwhile."""
@@ -183,9 +184,16 @@ def _file(session: Session, who: Principal, file_id: str) -> FileRow:
 
 
 def sample_log(storage: Storage) -> Path:
-    """The log, made by `hsloc record` in a process of its own. Raises ServiceError 503 where that fails."""
+    """The log, made by `hsloc record` in a process of its own by whoever asks first.
+
+    Raises ServiceError 503 where that fails, 429 where another still makes it after WAIT_S.
+    """
     path = storage.cache / f"sample-{__version__}.mcap"
-    with _making:
+    if path.exists():
+        return path
+    if not _making.acquire(timeout=WAIT_S):  # who waits holds a thread that other requests need
+        raise busy("the sample is being made", 5.0)
+    try:
         if not path.exists():
             storage.need_space(4 << 20)
             made = storage.work / f"sample-{uuid.uuid4().hex}.mcap"
@@ -196,4 +204,6 @@ def sample_log(storage: Storage) -> Path:
                 made.unlink(missing_ok=True)
                 raise ServiceError(503, "sample", "the sample could not be made; upload a log of your own") from error
             os.replace(made, path)
+    finally:
+        _making.release()
     return path

@@ -102,10 +102,19 @@ def _name_inside(part: Path, folder: Path, shown: Path) -> Path:
 
 def _by_content(inside: Sequence[Path], path: Path, scratch: Scratch, shown: Path) -> list[LogFile]:
     """The bags among the files of a folder without a known ending."""
-    files = [part for part in inside[:_MAX_UNNAMED] if part.is_file() and kind_of(_head(part)) not in ("", "text")]
+    files = [part for part in inside[:_MAX_UNNAMED] if part.is_file() and _is_bag(part)]
     if not files:
-        raise LogFormatError(f"{shown}: is a folder without .mcap, .db3 or .bag files; name a log file")
+        if any(part.name.endswith(".db3-wal") for part in inside):
+            raise LogFormatError(f"{shown}: holds the write-ahead log of a .db3 file without that; copy both")
+        what = "a folder" if shown == path or shown.is_dir() else "an archive"
+        raise LogFormatError(f"{shown}: is {what} without .mcap, .db3 or .bag files; name a log file")
     return [file for part in files for file in expand(part, scratch, _name_inside(part, path, shown))]
+
+
+def _is_bag(path: Path) -> bool:
+    """Whether a file is a bag, by what it holds, packed or not."""
+    head = _head(path)
+    return kind_of(head if not is_packed(head) else unpacked_head(path, head)) not in ("", "text")
 
 
 def _of_file(path: Path, scratch: Scratch, shown: Path, layers: int = 0) -> list[LogFile]:
@@ -113,7 +122,9 @@ def _of_file(path: Path, scratch: Scratch, shown: Path, layers: int = 0) -> list
         raise LogFormatError(f"{shown}: is not a regular file")
     head = _head(path)
     if not head:
-        raise LogFormatError(f"{shown}: is empty")
+        has_log = path.with_name(f"{path.name}-wal").is_file()
+        more = "; its write-ahead log beside it cannot be read without the database" if has_log else ""
+        raise LogFormatError(f"{shown}: is empty{more}")
     if is_packed(head):
         inner = unpacked_head(path, head)
         # Text logs are read through gzip line by line; all else is unpacked.
@@ -125,7 +136,7 @@ def _of_file(path: Path, scratch: Scratch, shown: Path, layers: int = 0) -> list
         return expand(found, scratch, shown) if found.is_dir() else _of_file(found, scratch, shown, layers + 1)
     kind = kind_of(head)
     if not kind:
-        raise LogFormatError(f"{shown}: {NO_LOG}")
+        raise LogFormatError(f"{shown}: {_why_no_log(path, head)}")
     return [LogFile(path, kind, shown)]
 
 
@@ -148,10 +159,36 @@ def kind_of(head: bytes) -> str:
     return "text" if head and b"\0" not in head else ""
 
 
+_FOREIGN = {
+    b"7z\xbc\xaf\x27\x1c": "7z",
+    b"Rar!": "rar",
+    b"\x1f\x9d": "compress (.Z)",
+    b"\x89LZO": "lzop",
+    b"LZIP": "lzip",
+    b"\xff\x06\x00\x00sNaPpY": "snappy",
+}
+"""How files begin that are packed in a way that is not read, and its name."""
+_WAL = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
+"""How the write-ahead log of an SQLite database begins."""
+
+
+def _why_no_log(path: Path, head: bytes) -> str:
+    """What a file is that is no log, and what to do."""
+    packed = next((name for magic, name in _FOREIGN.items() if head.startswith(magic)), None)
+    if packed is not None:
+        return f"is packed by {packed}, which is not read; unpack it first"
+    if head.startswith(_WAL):
+        name = path.name.removesuffix("-wal")
+        return f"is the write-ahead log of a ROS 2 bag: name the database, {name}, which must lie beside it"
+    return NO_LOG
+
+
 GZIP, ZSTD, ZIP = b"\x1f\x8b", b"\x28\xb5\x2f\xfd", b"PK\x03\x04"
 _BZIP2, _XZ, _LZ4 = b"BZh", b"\xfd7zXZ\0", b"\x04\x22\x4d\x18"
 _STREAMS = (GZIP, ZSTD, _BZIP2, _XZ, _LZ4)
 """How files begin that hold one packed file."""
+_SKIPPED = b"\x2a\x4d\x18"
+"""How a frame goes on that decompressors of zstd and lz4 skip; its first byte is 0x50 to 0x5f."""
 _MAX_LAYERS = 3
 """How many times a file may be packed. Internal: some packed files unpack to themselves."""
 _TAR_AT, _TAR = 257, b"ustar"
@@ -166,12 +203,20 @@ _BROKEN = (EOFError, gzip.BadGzipFile, zlib.error, lzma.LZMAError, zipfile.BadZi
 
 def is_packed(head: bytes) -> bool:
     """Whether a file that begins with `head` (the first 512 bytes or more) is packed."""
-    return head.startswith((*_STREAMS, ZIP)) or _is_tar(head)
+    return head.startswith((*_STREAMS, ZIP)) or _is_tar(head) or _begins_with_zstd(head)
+
+
+def _begins_with_zstd(head: bytes) -> bool:
+    """Whether a file is packed by zstd; pzstd begins with a frame that decompressors skip."""
+    at = 0
+    while head[at + 1 : at + 4] == _SKIPPED and head[at] & 0xF0 == 0x50:
+        at += 8 + int.from_bytes(head[at + 4 : at + 8], "little")
+    return head[at : at + 4] == ZSTD
 
 
 def unpacked_head(path: Path, head: bytes) -> bytes:
     """The first bytes of what a packed file holds; empty where that cannot be read, and for archives."""
-    if not head.startswith(_STREAMS):
+    if not (head.startswith(_STREAMS) or _begins_with_zstd(head)):
         return b""
     try:
         with _opened(path, head) as stream:
@@ -228,11 +273,14 @@ def _opened(path: Path, head: bytes) -> Iterator[BinaryIO]:
     if head.startswith(GZIP):
         with gzip.open(path, "rb") as stream:
             yield cast("BinaryIO", stream)
-    elif head.startswith(ZSTD):
+    elif _begins_with_zstd(head):
         import zstandard
 
         try:
-            with path.open("rb") as file, zstandard.ZstdDecompressor(max_window_size=1 << 31).stream_reader(file) as s:
+            with (
+                path.open("rb") as file,
+                zstandard.ZstdDecompressor(max_window_size=1 << 31).stream_reader(file, read_across_frames=True) as s,
+            ):
                 yield cast("BinaryIO", s)
         except zstandard.ZstdError as error:
             raise _damaged(path, error) from error

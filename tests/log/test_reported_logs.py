@@ -19,7 +19,7 @@ import pytest
 import zstandard
 from log_builders import START, describe, scan_payloads, write_raw, write_run
 
-from hsloc.errors import LogError, LogFormatError
+from hsloc.errors import LogError, LogFormatError, TopicError
 from hsloc.log import ReadOptions, open_log
 from hsloc.log.messages import definitions
 
@@ -96,6 +96,8 @@ def _with(*compress: Callable[[bytes], bytes]) -> Callable[[Path, Path], None]:
     return pack
 
 
+_SKIPPED = b"\x50\x2a\x4d\x18\x04\0\0\0size"
+"""A frame that decompressors skip: pzstd begins with one, and goes on with several that count."""
 _gzip, _zstd = _with(gzip.compress), _with(zstandard.compress)
 
 
@@ -105,6 +107,7 @@ _gzip, _zstd = _with(gzip.compress), _with(zstandard.compress)
         *((_gzip, ".gz"), (_zstd, ".zstd"), (_zstd, ""), (_zip, ".zip"), (_tar, ".tgz")),
         *((_with(bz2.compress), ".bz2"), (_with(lzma.compress), ".xz"), (_with(lz4.frame.compress), ".lz4")),
         (_with(gzip.compress, gzip.compress), ".gz.gz"),
+        (_with(lambda data: _SKIPPED + zstandard.compress(data[:99]) + zstandard.compress(data[99:])), ".zst"),
     ],
 )
 @pytest.mark.parametrize("which", ["bag", "db3", "plain"])
@@ -132,6 +135,30 @@ def test_a_folder_of_packed_files_is_a_recording(tmp_path: Path, db3: Path, expe
     assert events_of(tmp_path) == expected, "a part that is there packed and unpacked is one part"
 
 
+@pytest.mark.parametrize(
+    ("name", "data", "told"),
+    [
+        ("x.7z", b"7z\xbc\xaf\x27\x1c\0", "packed by 7z, which is not read; unpack it first"),
+        ("x.db3-wal", b"\x37\x7f\x06\x82\0", "name the database, x.db3"),
+        ("x.db3", b"", "is empty; its write-ahead log beside it"),
+    ],
+)
+def test_files_that_are_no_logs_are_told_by_what_they_are(tmp_path: Path, name: str, data: bytes, told: str) -> None:
+    (tmp_path / "x.db3-wal").write_bytes(b"")
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(LogFormatError, match=told):
+        open_log(tmp_path / name)
+
+
+def test_a_folder_is_searched_by_content_packed_or_not(tmp_path: Path, plain: Path, expected: list[Any]) -> None:
+    (tmp_path / "recording.xz").write_bytes(lzma.compress(plain.read_bytes()))
+    assert events_of(tmp_path) == expected
+    (tmp_path / "recording.xz").unlink()
+    (tmp_path / "live.db3-wal").write_bytes(b"\x37\x7f\x06\x82\0")
+    with pytest.raises(LogFormatError, match="copy both"):
+        open_log(tmp_path)
+
+
 def test_damaged_packing_is_one_line(tmp_path: Path, plain: Path) -> None:
     packed = ((_gzip, "a.mcap.gz"), (_zstd, "a.mcap.zst"), (_zip, "a.zip"), (_with(bz2.compress), "a.bz2"))
     for pack, name in (*packed, (_with(lzma.compress), "a.xz"), (_with(lz4.frame.compress), "a.lz4")):
@@ -151,7 +178,10 @@ def test_messages_compressed_one_by_one_are_read(tmp_path: Path, plain: Path, ex
     (named,) = log_formats.bag2(plain, tmp_path / "bag", "MESSAGE").glob("*.db3*")
     assert events_of(tmp_path / "bag") == expected
     assert events_of(named) == expected
-    items = [(s, c, t, zstandard.compress(data)) for s, c, t, data in log_formats.messages(plain)]
+    items = [
+        (s, c, t, (zstandard.compress, lz4.frame.compress, gzip.compress)[n % 3](data))
+        for n, (s, c, t, data) in enumerate(log_formats.messages(plain))
+    ]
     assert events_of(log_formats.write(tmp_path / "messages.mcap", items)) == expected
 
 
@@ -224,13 +254,46 @@ def test_log_times_of_a_database_that_overflowed_leave_the_order_alone(
     assert log.losses.log_times_repaired == 2
 
 
-@pytest.mark.parametrize("text", ["sensor_msgs/msg/LaserScan", "LaserScan", "main"])
+@pytest.mark.parametrize(
+    "text",
+    ["sensor_msgs/msg/LaserScan", "LaserScan", "main", "# nothing", "MSG: LaserScan", "not available }{", "\0"],
+)
 def test_an_incomplete_definition_of_a_standard_type_is_replaced_and_named(tmp_path: Path, text: str) -> None:
     full = definitions.definition_text(definitions.LASER_SCAN)
     schema = (definitions.LASER_SCAN, "ros2msg", (full.partition("=" * 80)[0] if text == "main" else text).encode())
     log = open_log(write_raw(tmp_path / "a.mcap", scan_payloads(5), schema=schema), ReadOptions(require_odometry=False))
     assert len(list(log.events())) == 5
     assert any("/scan" in str(warning) and "incomplete" in str(warning) for warning in log.summary.warnings)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "sensor_msgs::msg::dds_::LaserScan_",
+        "sensor_msgs/msg/dds_/LaserScan_",
+        "sensor_msgs::msg::LaserScan",
+        "sensor_msgs.msg.LaserScan",
+        "LaserScan",
+    ],
+)
+@pytest.mark.parametrize(("form", "encoding"), [("ros2msg", "cdr"), ("ros2idl", "CDR"), ("anything", "xcdr2")])
+def test_types_and_encodings_are_known_by_any_usual_name(tmp_path: Path, name: str, form: str, encoding: str) -> None:
+    text = definitions.definition_text(definitions.LASER_SCAN).encode()
+    path = write_raw(tmp_path / "a.mcap", scan_payloads(5), schema=(name, form, text), encoding=encoding)
+    assert len(list(open_log(path, ReadOptions(require_odometry=False)).events())) == 5
+
+
+def test_the_number_of_a_header_of_ros_1_may_stand_in_the_definition_alone(tmp_path: Path) -> None:
+    text = definitions.definition_text(definitions.LASER_SCAN)
+    text = text.replace("MSG: std_msgs/Header\n", "MSG: std_msgs/Header\nuint32 seq\n")
+    path = write_raw(tmp_path / "a.mcap", scan_payloads(5), schema=(definitions.LASER_SCAN, "ros2msg", text.encode()))
+    assert len(list(open_log(path, ReadOptions(require_odometry=False)).events())) == 5
+
+
+def test_an_encoding_that_is_not_read_is_named(tmp_path: Path) -> None:
+    path = write_raw(tmp_path / "a.mcap", scan_payloads(5), encoding="cbor")
+    with pytest.raises(TopicError, match=r"encoded as cbor.*convert them as cdr"):
+        open_log(path)
 
 
 def test_a_definition_that_contradicts_the_standard_one_is_not_replaced(tmp_path: Path) -> None:
@@ -272,12 +335,36 @@ def test_encodings_that_are_not_read_are_named(tmp_path: Path, identifier: bytes
     assert name in " ".join(log.losses.reasons)
 
 
-def test_ros_messages_as_json_are_read(tmp_path: Path, plain: Path, expected: list[Any]) -> None:
+def _camel(value: Any) -> Any:
+    """With names as JavaScript has them, times in nanoseconds, and arrays of numbers as objects."""
+    if isinstance(value, list):
+        numbers = value and isinstance(value[0], float)
+        return {str(k): item for k, item in enumerate(value)} if numbers else [_camel(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    if value.keys() == {"sec", "nanosec"}:
+        return value["sec"] * SECOND + value["nanosec"]
+    first = {key: key.partition("_") for key in value}
+    return {head + rest.title().replace("_", ""): _camel(value[key]) for key, (head, _, rest) in first.items()}
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        lambda message: json.dumps(message).encode(),
+        lambda message: json.dumps(_camel(message)).encode() + b"\0",
+        lambda message: json.dumps({"topic": "/x", "type": "y", "msg": message}).encode(),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["json", "application/json", "cdr"])
+def test_ros_messages_as_json_are_read(
+    tmp_path: Path, plain: Path, expected: list[Any], written: Callable[[Any], bytes], encoding: str
+) -> None:
     items = []
     for schema, channel, log_time, data in log_formats.messages(plain):
         message = log_formats.ROS2.deserialize_cdr(data, schema.name)
-        schema.encoding, schema.data, channel.message_encoding = "jsonschema", b"{}", "json"
-        items.append((schema, channel, log_time, json.dumps(_plain(message)).encode()))
+        schema.encoding, schema.data, channel.message_encoding = "jsonschema", b"", encoding
+        items.append((schema, channel, log_time, written(_plain(message))))
     assert events_of(log_formats.write(tmp_path / "json.mcap", items)) == expected
 
 

@@ -142,7 +142,9 @@ def alignment(data: Payload) -> int:
     found = _ALIGNMENTS.get(identifier)
     if found is None:
         name = _ENCAPSULATIONS.get(identifier)
-        raise ValueError(f"encoded as {name}, which is not read" if name else "not little-endian CDR")
+        if name:
+            raise ValueError(f"encoded as {name}, which is not read; record it as CDR, as ROS 2 does by default")
+        raise ValueError(f"it begins with the bytes {bytes(data[:4]).hex(' ') or 'of nothing'}, which is no CDR")
     return found
 
 

@@ -5,9 +5,13 @@ Are they the definitions we know, and may they be handed to a parser?
 
 from __future__ import annotations
 
+import bz2
 import dataclasses
+import gzip
+import io
+import lzma
 import re
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, cast
 
 from hsloc.errors import LogFormatError
 from hsloc.log.messages import cdr_batch_decode as columns
@@ -33,9 +37,17 @@ FROM_OBJECT = {
     definitions.POINT_CLOUD2: point_cloud.object_point_cloud,
     **{kind.typename: kind.from_object for kind in odometry_kinds.ODOMETRY_KINDS},
 }
-_ENCODINGS = ("cdr", "ros1", "json")
+_ENCODINGS = {
+    **{name: name for name in ("cdr", "ros1", "json")},
+    **dict.fromkeys(("cdr_le", "cdr2", "xcdr", "xcdr1", "xcdr2", "ros2"), "cdr"),
+    **dict.fromkeys(("application/json", "text/json", "rosjson"), "json"),
+    "ros1msg": "ros1",
+}
+"""Encodings of messages that are read, by the names that recorders write in small letters."""
 _ZSTD = b"\x28\xb5\x2f\xfd"
-"""How a payload begins that rosbag2 compressed by itself (`--compression-mode message`); CDR begins with a zero."""
+_PACKED = (_ZSTD, b"\x04\x22\x4d\x18", b"\x1f\x8b", b"BZh", b"\xfd7zXZ")
+"""How a payload begins that was compressed by itself (rosbag2's `--compression-mode message`): zstd, lz4, gzip, bzip2,
+xz. CDR begins with a zero, JSON with a brace."""
 _MAX_UNPACKED_BYTES = 256 << 20
 
 MAX_SCHEMA_BYTES = 64 << 10
@@ -43,6 +55,7 @@ MAX_SCHEMA_BYTES = 64 << 10
 MAX_ARRAY = 4096
 """Longest fixed array in a definition that is not ours: the parser unrolls them."""
 _SEPARATOR = re.compile(r"^=+\s*$", re.MULTILINE)
+_SEQUENCE = re.compile(rb"^\s*uint32\s+seq\s*(#.*)?$", re.MULTILINE)
 _BUILTIN = re.compile(r"(bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string|time|duration)(<=\d+)?")
 Fields = tuple[tuple[str, str], ...]
 """(type, name) of each field, in order."""
@@ -62,24 +75,68 @@ def is_decodable(channel: Channel) -> bool:
     """Whether hsloc has a decoder for the channel's type and encoding."""
     if channel.typename.startswith(foxglove.PREFIX):
         return foxglove.is_foxglove(channel)
-    return channel.message_encoding in _ENCODINGS and canonical_type(channel.typename) in FROM_OBJECT
+    return channel.message_encoding.lower() in _ENCODINGS and is_read(channel)
+
+
+def is_read(channel: Channel) -> bool:
+    """Whether the channel's type is one that hsloc reads, however its messages are encoded."""
+    return canonical_type(channel.typename) in FROM_OBJECT
 
 
 def decoder_for(channel: Channel, warnings: list[RunWarning] | None = None) -> Decoder:
     """A function from payload to one of the tuples of `hsloc.log.messages.decode`; it raises `Undecodable` alone.
 
-    A definition of a standard type that is incomplete is replaced by the standard one, which is added to `warnings`.
+    Payloads that are compressed by themselves are unpacked, and JSON is read whatever the channel calls it. A
+    definition of a standard type that is incomplete is replaced by the standard one, which is added to `warnings`.
     Raises LogFormatError where the channel's definition cannot be used.
     """
     if foxglove.is_foxglove(channel):
-        return _guarded(foxglove.decoder(channel))
+        plain = _guarded(foxglove.decoder(channel))
+    else:
+        plain = _ros_decoder(_normalised(channel), warnings)
+
+    def decoder(data: Payload) -> Any:
+        try:
+            return plain(data)
+        except Undecodable:
+            if bytes(data[:5]).startswith(_PACKED):
+                return plain(_unpacked(bytes(data)))
+            if bytes(data[:1]) == b"{" and channel.message_encoding == "cdr":
+                return _guarded(from_objects.json_decoder(FROM_OBJECT[canonical_type(channel.typename)]))(data)
+            raise
+
+    return decoder
+
+
+_SCHEMAS = ("ros2msg", "ros1msg", "ros2idl", "jsonschema")
+_IDL = re.compile(r"^\s*(IDL:|module\s|#include)", re.MULTILINE)
+
+
+def _normalised(channel: Channel) -> Channel:
+    """The channel with the encodings of its messages and its definition under the names that hsloc knows."""
+    text = channel.schema.decode(errors="replace").removeprefix("\ufeff")
+    form = channel.schema_encoding.lower()
+    if form == "ros2idl" and text.strip() and not _IDL.search(text):
+        form = "ros2msg"
+    return dataclasses.replace(
+        channel,
+        message_encoding=_ENCODINGS.get(channel.message_encoding.lower(), channel.message_encoding),
+        schema_encoding=form if form in _SCHEMAS or not text.strip() else "ros2idl" if _IDL.search(text) else "",
+        schema=text.encode(),
+    )
+
+
+def _ros_decoder(channel: Channel, warnings: list[RunWarning] | None) -> Decoder:
     typename = canonical_type(channel.typename)
     if channel.message_encoding == "json":
         return _guarded(from_objects.json_decoder(FROM_OBJECT[typename]))
     if typename not in BY_HAND and not (channel.message_encoding == "ros1" or channel.schema.strip()):
         channel = dataclasses.replace(channel, schema_encoding="")
-    elif channel.message_encoding == "cdr" and typename in BY_HAND and _is_known(channel, typename):
-        return _by_hand(channel, typename)
+    elif channel.message_encoding == "cdr" and typename in BY_HAND:
+        if _is_known(channel, typename):
+            return _by_hand(channel, typename)
+        if (without := _without_sequence(channel)) is not None and _is_known(without, typename):
+            return _by_hand(without, typename, _by_rosbags(channel, typename))
     if _is_incomplete(channel, typename):
         if warnings is not None:
             text = (
@@ -109,26 +166,35 @@ def _is_known(channel: Channel, typename: str) -> bool:
     return is_known(channel.schema.decode(errors="replace"), typename)
 
 
+def _without_sequence(channel: Channel) -> Channel | None:
+    """The channel without the number that ROS 1 has in its headers; None where its definition has none.
+
+    Converters from ROS 1 to ROS 2 leave it in the definition, although CDR has no such number.
+    """
+    text = _SEQUENCE.sub(b"", channel.schema)
+    return dataclasses.replace(channel, schema=text) if text != channel.schema else None
+
+
 def _is_incomplete(channel: Channel, typename: str) -> bool:
     """Whether a definition says nothing against the standard one: it is empty, a mere name, or lacks its parts."""
-    if channel.schema_encoding not in ("ros2msg", "ros1msg", ""):
+    text = channel.schema.decode(errors="replace")
+    if channel.schema_encoding not in ("ros2msg", "ros1msg", "") or refusal(text, channel.schema_encoding):
         return False
-    return is_incomplete(channel.schema.decode(errors="replace"), typename, channel.message_encoding == "ros1")
+    return is_incomplete(text, typename, channel.message_encoding == "ros1")
 
 
-def _by_hand(channel: Channel, typename: str) -> Decoder:
+def _by_hand(channel: Channel, typename: str, other: Decoder | None = None) -> Decoder:
+    """The decoder made for the type; what it cannot read goes to the `other`, big endian in any case to rosbags."""
     fast = BY_HAND[typename]
-    slow: list[Decoder] = []
+    slow = [] if other is None else [other]
 
     def decoder(data: Payload) -> Any:
         try:
             return fast(data)
         except decode.BAD_PAYLOAD as error:
-            if data[:4] == _ZSTD:
-                return decoder(_unpacked(data))
-            if data[:2] != decode.BIG_ENDIAN:
+            if other is None and data[:2] != decode.BIG_ENDIAN:
                 raise Undecodable(str(error)) from error
-        # Big endian: rare enough for the slow way.
+        # Rare enough for the slow way.
         if not slow:
             slow.append(_by_rosbags(channel, typename))
         return slow[0](data)
@@ -136,18 +202,34 @@ def _by_hand(channel: Channel, typename: str) -> Decoder:
     return decoder
 
 
-def _unpacked(data: Payload) -> bytes:
-    """A payload that was compressed by itself."""
-    import zstandard
-
+def _unpacked(data: bytes) -> bytes:
+    """A payload that was compressed by itself, as one of `_PACKED`."""
     try:
-        with zstandard.ZstdDecompressor().stream_reader(bytes(data)) as reader:
-            found: bytes = reader.read(_MAX_UNPACKED_BYTES + 1)
-    except zstandard.ZstdError as error:
-        raise Undecodable(f"its compression is damaged ({error})") from error
-    if len(found) > _MAX_UNPACKED_BYTES or found[:4] == _ZSTD:
+        with _unpacking(data) as stream:
+            found = stream.read(_MAX_UNPACKED_BYTES + 1)
+    except Exception as error:  # Each library has errors of its own.
+        raise Undecodable(f"its compression is damaged ({_short(error)})") from error
+    if len(found) > _MAX_UNPACKED_BYTES or found.startswith(_PACKED):
         raise Undecodable(f"unpacks to more than {_MAX_UNPACKED_BYTES >> 20} MB, or is packed twice")
     return found
+
+
+def _unpacking(data: bytes) -> IO[bytes]:
+    if data.startswith(_PACKED[0]):
+        import zstandard
+
+        whole = zstandard.frame_content_size(data)
+        if 0 <= whole <= _MAX_UNPACKED_BYTES:  # Unlike a stream's reader this one notices where the end is missing.
+            return io.BytesIO(zstandard.ZstdDecompressor().decompress(data))
+        return cast("IO[bytes]", zstandard.ZstdDecompressor().stream_reader(data))
+    if data.startswith(_PACKED[1]):
+        import lz4.frame
+
+        return cast("IO[bytes]", lz4.frame.open(io.BytesIO(data)))
+    packed = io.BytesIO(data)
+    if data.startswith(_PACKED[2]):
+        return cast("IO[bytes]", gzip.open(packed))
+    return cast("IO[bytes]", bz2.open(packed) if data.startswith(_PACKED[3]) else lzma.open(packed))
 
 
 def _guarded(read: Callable[[Payload], Any]) -> Decoder:
@@ -191,8 +273,6 @@ def _by_rosbags(channel: Channel, typename: str) -> Decoder:
     convert = FROM_OBJECT[typename]
 
     def decoder(data: Payload) -> Any:
-        if data[:4] == _ZSTD:
-            data = _unpacked(data)
         try:
             return convert(deserialise(data, name))
         except Exception as error:  # As above.
@@ -271,6 +351,9 @@ def is_incomplete(text: str, typename: str, is_ros1: bool = False) -> bool:
     if bare in ("", name, typename, name.rpartition("/")[2]):
         return True
     found = parse_definition(text, typename)
+    package = name.partition("/")[0]
+    if not any(_is_field(field, package) for field in found[name]):  # comments, or words that define nothing
+        return True
     for part, fields in found.items():
         known = _KNOWN.get(part)
         if known is None:
@@ -288,6 +371,12 @@ def is_incomplete(text: str, typename: str, is_ros1: bool = False) -> bool:
         seen.add(part)
         needed += [kind.partition("[")[0] for kind, _ in _KNOWN[part] if "/" in kind]
     return not seen - {"builtin_interfaces/Time"} <= found.keys()
+
+
+def _is_field(field: tuple[str, str], package: str) -> bool:
+    """Whether a line of a definition declares something: its type is built in, known, or of another package."""
+    kind, name = field[0].partition("[")[0], field[1]
+    return name.isidentifier() and (kind in _KNOWN or not kind.startswith(f"{package}/"))
 
 
 def refusal(text: str, encoding: str) -> str | None:

@@ -154,9 +154,21 @@ def short_name(typename: str) -> str:
 
 
 def long_name(typename: str) -> str:
-    """`sensor_msgs/LaserScan` as `sensor_msgs/msg/LaserScan`; ROS 2 names stay as they are."""
-    package, _, name = short_name(typename).partition("/")
-    return f"{package}/msg/{name}" if name else typename
+    """The name of a type as ROS 2 spells it: `sensor_msgs/LaserScan` as `sensor_msgs/msg/LaserScan`.
+
+    Recorders beside rosbag2 write the names of DDS (`sensor_msgs::msg::dds_::LaserScan_`), of C++, of Python
+    (`sensor_msgs.msg.LaserScan`), or the last part alone, which is enough where one known type has it.
+    """
+    name = typename.replace("::", "/")
+    if "/" not in name and not name.startswith("foxglove."):
+        name = name.replace(".", "/")
+    if "/dds_/" in name:
+        name = name.replace("/dds_/", "/").removesuffix("_")
+    if "/" not in name:
+        known = [full for full in FIELDS if full.rpartition("/")[2] == name]
+        name = known[0] if len(known) == 1 else name
+    package, _, last = short_name(name).partition("/")
+    return f"{package}/msg/{last}" if last else typename
 
 
 def definition_text(typename: str) -> str:

@@ -1,12 +1,15 @@
 """From message objects of rosbags (ROS 1, big endian, other definitions) or of JSON to the tuples of `decode`.
 
-JSON is that of rosbridge and some recorders: fields by their ROS names. Times are `{"sec", "nanosec"}` (ROS 2) or
-`{"secs", "nsecs"}` (ROS 1). What JSON has no number for is null, or one of the words NaN, Infinity and -Infinity.
+JSON is that of rosbridge and some recorders: fields by their ROS names, also in camel case, arrays of numbers also as
+objects with the indices as keys (JavaScript's typed arrays). Times are `{"sec", "nanosec"}` (ROS 2), `{"secs",
+"nsecs"}` (ROS 1), `{"seconds", "nanos"}`, or one number: seconds, or nanoseconds where it is too large for those. What
+JSON has no number for is null, or one of the words NaN, Infinity and -Infinity.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from base64 import b64decode
 from math import inf, nan
 from types import SimpleNamespace
@@ -38,14 +41,30 @@ if TYPE_CHECKING:
 
 MAX_PAYLOAD_BYTES = 64 << 20
 _WORDS = {"nan": nan, "inf": inf, "infinity": inf, "+infinity": inf, "-inf": -inf, "-infinity": -inf}
-_ALIASES = {"secs": "sec", "nsecs": "nanosec", "nsec": "nanosec"}
+_ALIASES = {
+    **dict.fromkeys(("secs", "seconds"), "sec"),
+    **dict.fromkeys(("nsecs", "nsec", "nanos", "nanoseconds", "nanosecs"), "nanosec"),
+}
+_CAMEL = re.compile(r"(?<=[a-z])[A-Z]")
 _NUMBERS = ("ranges", "intensities", "covariance")
-_DEFAULTS: dict[str, Any] = {"intensities": [], "scan_time": 0.0, "time_increment": 0.0, "child_frame_id": ""}
+_DEFAULTS: dict[str, Any] = {
+    "intensities": [],
+    "scan_time": 0.0,
+    "time_increment": 0.0,
+    "angle_max": nan,
+    "child_frame_id": "",
+    **dict.fromkeys(("sec", "nanosec"), 0),
+}
+_LARGEST_SECONDS = 1e11
+"""Stamps beyond are in nanoseconds: of our time these are some 10^18, of seconds 10^9."""
 
 
 def object_header(message: Any) -> tuple[int, str]:
     """(stamp in ns, frame_id) of a message object."""
     stamp = message.header.stamp
+    if isinstance(stamp, int | float):
+        ns = int(stamp) if stamp > _LARGEST_SECONDS else round(stamp * NANOSECONDS)
+        return ns, str(message.header.frame_id).lstrip("/")
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec), str(message.header.frame_id).lstrip("/")
 
 
@@ -132,7 +151,7 @@ class _Message(SimpleNamespace):
         try:
             return _DEFAULTS[name]
         except KeyError:
-            raise ValueError(f"the field {name} is missing") from None
+            raise AttributeError(f"the field {name} is missing") from None
 
 
 def json_decoder(convert: Callable[[Any], Any]) -> Callable[[Payload], Any]:
@@ -141,8 +160,8 @@ def json_decoder(convert: Callable[[Any], Any]) -> Callable[[Payload], Any]:
     def decode(data: Payload) -> Any:
         if len(data) > MAX_PAYLOAD_BYTES:
             raise ValueError(f"a message of {len(data)} bytes, at most {MAX_PAYLOAD_BYTES} are read")
-        message = json.loads(bytes(data))
-        if isinstance(message, dict) and set(message) == {"op", "topic", "msg"}:  # as rosbridge sends it
+        message = json.loads(bytes(data).rstrip(b"\0"))
+        if isinstance(message, dict) and isinstance(message.get("msg"), dict):  # as rosbridge sends it
             message = message["msg"]
         return convert(_object(message, ""))
 
@@ -150,9 +169,11 @@ def json_decoder(convert: Callable[[Any], Any]) -> Callable[[Payload], Any]:
 
 
 def _object(value: Any, name: str) -> Any:
+    if isinstance(value, dict) and name in _NUMBERS:
+        value = list(value.values())
     if isinstance(value, dict):
-        fields = {str(_ALIASES.get(key, key)): _object(item, str(key)) for key, item in value.items()}
-        return _Message(**fields)
+        names = {key: _CAMEL.sub(lambda found: f"_{found[0].lower()}", str(key)) for key in value}
+        return _Message(**{_ALIASES.get(names[key], names[key]): _object(value[key], names[key]) for key in value})
     if name in _NUMBERS and isinstance(value, list):
         return np.array([_number(item) for item in value])
     if name == "data" and isinstance(value, str):  # rosbridge writes int8[] in base64

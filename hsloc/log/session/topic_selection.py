@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from hsloc.errors import TopicError
 from hsloc.log.messages import definitions
-from hsloc.log.messages.decoders import canonical_type, is_decodable
+from hsloc.log.messages.decoders import canonical_type, is_decodable, is_read
 from hsloc.log.messages.odometry_kind import Rank
 from hsloc.log.messages.odometry_kinds import ODOMETRY_KINDS, POSE_TYPES, kind_among
 from hsloc.log.session.transform_topics import is_static_topic, is_transform_topic, namespace
@@ -198,6 +198,9 @@ def _pick(
                 "point clouds are read as scans with --slice LOW,HIGH, the heights above the base [m] between which "
                 "walls are seen"
             )
+        unread = sorted({c.message_encoding or "nothing" for c in channels if not is_decodable(c) and is_read(c)})
+        if unread:
+            remedy = f"messages encoded as {', '.join(unread)} are not read: record or convert them as cdr"
         text = f"{where}: no {what} topic ({typename}); the log holds {listed(channels)}"
         warning = RunWarning(WarningCode.TOPIC_MISSING, text, remedy)
     if required:
@@ -242,9 +245,15 @@ def _truth(where: str, channels: Sequence[Channel], options: ReadOptions) -> str
     raise TopicError(f"{where}: no topic {named} to take as truth; --truth-topic may be {remedy}")
 
 
+def _spelt(channel: Channel) -> list[str]:
+    """Type and encoding; the type alone where the encoding is one that is read."""
+    unread = is_read(channel) and not is_decodable(channel)
+    return [channel.typename or channel.message_encoding, *([channel.message_encoding or "nothing"] if unread else [])]
+
+
 def listed(channels: Sequence[Channel]) -> str:
     """Topics with their types, for a message."""
-    names = sorted({f"{c.topic} ({c.typename or c.message_encoding})" for c in channels})
+    names = sorted({f"{c.topic} ({', encoded as '.join(_spelt(c))})" for c in channels})
     if not names:
         return "no messages"
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""

@@ -16,6 +16,12 @@ if TYPE_CHECKING:
 
 _LEAST_TRUST = 0.05
 """Part of the information of the worst match that is accepted."""
+_NEARLY_USUAL = 0.95
+"""Ratio to the usual fitness below which a match may lie beside the right place: half a metre along a corridor, where
+wheels slipped, most walls still fit."""
+_REGAINED = 0.05
+"""Least gain in fitness of a match in a wide window over one that is not as fit as usual: fitness at the right place
+scatters by 0.02 from scan to scan, so that two of them differ by as much once in thirteen times."""
 _WEIGHT_OF_NEW = 0.05
 """Weight of a new match in the usual fitness: its memory is about 20 matches."""
 
@@ -78,6 +84,14 @@ class MatchGate:
         limits = self._limits
         usual = limits.min_fitness if self.usual is None else self.usual
         return wide >= max(refused + limits.recovery_gain, limits.recovery_fitness_ratio * usual)
+
+    def fits_as_usual(self, fitness: float) -> bool:
+        """Whether a match of this fitness is as fit as usual, or nearly so; true while nothing is usual yet."""
+        return self.usual is None or fitness >= _NEARLY_USUAL * self.usual
+
+    def is_regained(self, worse: float, wide: float) -> bool:
+        """Whether a match of fitness `wide` in a wide window takes the place of one that was not as fit as usual."""
+        return self.fits_as_usual(wide) and wide >= worse + _REGAINED
 
     def trust(self, fitness: float) -> float:
         """Part of the information of an accepted match that counts: all at the usual fitness, little at the least.

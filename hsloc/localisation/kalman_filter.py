@@ -9,8 +9,8 @@ variance grows with it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from math import cos, log, sin
+from dataclasses import dataclass
+from math import cos, exp, log, sin
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -34,11 +34,8 @@ _METRES_PER_RADIAN = 0.5
 """Metres that a radian counts for in the share of the motion: about the track width of an indoor robot."""
 _REMEMBERED = 0.98
 """Weight of an innovation after the next one: about 50 are remembered, the 10 m of a match each 0.2 m."""
-_ASSUMED = 2.5
-"""Information of the assumption that the odometry is as noisy as stated: that of five innovations due to it."""
-_MOST_OF_ONE = 10.8
-"""One innovation counts for at most this multiple of its expected square: the 99.9 % quantile of chi squared with one
-degree of freedom. Beyond it a wheel slipped."""
+_ASSUMED = 7.5
+"""Information of the assumption that the odometry is as noisy as stated: that of five innovations."""
 _EXCESS_GAIN = 0.1
 """Gain of the running mean of squared innovations by their expected ones: it follows within about ten matches."""
 _MOST_EXCESS = 10.0
@@ -94,88 +91,52 @@ def fuse_match(prediction: Pose2, covariance: F64, match: Match, information: F6
 class Innovations:
     """What the innovations of a run show: how noisy the odometry is, and whether covariances are too small.
 
-    `noise_scale` is the variance of the odometry by the assumed one, ahead, sideways and in heading, as seen from the
-    base, by maximum likelihood: a robot whose wheels slip may well have a good gyroscope. With `S` the covariance of an
-    innovation `v` and `D` its derivative by the logarithm of a scale, that of the log likelihood is
-    `(v^T S^-1 D S^-1 v - tr(S^-1 D)) / 2`, its information `tr((S^-1 D)^2) / 2`. `D` has the noise of all motions since
-    the direction was last measured in it, not of the last one alone: along a corridor the odometry is seen to err at
-    the next door. What a scale was found from is forgotten as new information about it comes. The filter takes no
-    scale below 1: errors of the map last while a wall is seen, and where it trusts the odometry more it averages over
-    them as over independent ones.
+    `noise_scale` is the variance of the odometry by the assumed one, by maximum likelihood. With `S` the covariance of
+    an innovation `v` and `Q` the part of it that is due to the odometry, the derivative of the log likelihood by the
+    log of the scale is `(v^T S^-1 Q S^-1 v - tr(S^-1 Q)) / 2`, its information `tr((S^-1 Q)^2) / 2`. Old innovations
+    are forgotten. The filter takes no scale below 1: errors of the map last while a wall is seen, and where it trusts
+    the odometry more it averages over them as over independent ones.
 
     `excess`, 1 or more, is what is left: the running mean of squared innovations by what is expected of them then.
     Covariances that are reported grow by it. Whether odometry or matches are worse than assumed it does not show.
     """
 
     def __init__(self) -> None:
-        self.noise_scale = np.ones(3)
-        self._sum, self._information = np.zeros(3), np.zeros(3)
+        self.noise_scale = 1.0
+        self._sum, self._information = 0.0, 0.0
         self._excess = 1.0
-        self._noise = np.zeros((3, 3))
-        self._heading = 0.0
-        self._by_scale = np.zeros((3, 3, 3))
 
     @property
     def excess(self) -> float:
         """See the class."""
         return max(self._excess, 1.0)
 
-    def restart(self) -> None:
-        """The pose was found anew: its covariance is due to no odometry."""
-        self._by_scale = np.zeros((3, 3, 3))
-
-    def moved(self, pose: Pose2, motion: Pose2, noise: F64) -> F64:
-        """The covariance (3, 3) that a motion from `pose` adds in the map frame; `noise` (3, 3) is the assumed one."""
-        f = transition(pose, motion)
-        self._noise, self._heading = noise, pose.theta
-        self._by_scale = f @ self._by_scale @ f.T + self._by_each_scale(np.maximum(self.noise_scale, 1.0))
-        return rotated(scaled_noise(noise, self.noise_scale, 1.0), pose.theta)
-
-    def add(self, innovation: F64, information: F64, propagated: F64) -> None:
+    def add(self, innovation: F64, information: F64, propagated: F64, noise: F64) -> None:
         """Take an innovation (3,): a measured pose of known information (3, 3) less a prediction.
 
-        The prediction's covariance is that of the pose before, `propagated` (3, 3), and that of the last motion; both
-        in the map frame. Directions that are not measured count for none: the inverse of the innovation's covariance is
-        `L (I + P L)^-1`, its degrees of freedom are the trace of the gain.
+        The prediction's covariance is that of the pose before, `propagated` (3, 3), and the assumed one of the motion,
+        `noise` (3, 3), by the scale; all in the map frame. Directions that are not measured count for none: the inverse
+        of the innovation's covariance is `L (I + P L)^-1`, its degrees of freedom are the trace of the gain.
         """
-        covariance = propagated + rotated(scaled_noise(self._noise, self.noise_scale, 1.0), self._heading)
-        kept = np.linalg.inv(np.eye(3) + covariance @ information)
-        weight = information @ kept
+        covariance = propagated + max(self.noise_scale, 1.0) * noise
+        weight = information @ np.linalg.inv(np.eye(3) + covariance @ information)
         squared = float(innovation @ weight @ innovation)
         freedom = float(np.trace(covariance @ weight))
-        by_scale, self._by_scale = self._by_scale, kept @ self._by_scale @ kept.T
         if freedom <= 0.0:
             return
         self._excess += _EXCESS_GAIN * (min(squared / freedom, _MOST_EXCESS) - self._excess)
-        if self.noise_scale.min() < 1.0:
-            covariance = propagated + rotated(scaled_noise(self._noise, self.noise_scale), self._heading)
-            weight = information @ np.linalg.inv(np.eye(3) + covariance @ information)
-            by_scale = by_scale + self._by_each_scale(self.noise_scale)
-            by_scale -= self._by_each_scale(np.maximum(self.noise_scale, 1.0))
-        parts = weight @ by_scale
-        expected = np.trace(parts, axis1=1, axis2=2)
-        found = np.minimum(parts @ weight @ innovation @ innovation, _MOST_OF_ONE * expected)
-        score = 0.5 * (found - expected)
-        weighed = 0.5 * np.einsum("aij,aji->a", parts, parts)
-        remembered = _REMEMBERED ** (2.0 * weighed)
-        self._sum = remembered * self._sum + weighed * np.log(self.noise_scale) + score
-        self._information = remembered * self._information + weighed
-        logarithm = self._sum / (self._information + _ASSUMED)
-        self.noise_scale = np.exp(np.clip(logarithm, log(_LEAST_NOISE), log(_MOST_NOISE)))
-
-    def _by_each_scale(self, scale: F64) -> F64:
-        """Derivatives (3, 3, 3) of the last motion's covariance in the map frame by the logarithm of each scale."""
-        noise = scaled_noise(self._noise, scale)
-        c, s = cos(self._heading), sin(self._heading)
-        turn = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
-        rows = np.eye(3)[:, :, None] * noise[:, None, :]
-        return np.asarray(turn @ (0.5 * (rows + rows.transpose(0, 2, 1))) @ turn.T)
-
-
-def scaled_noise(noise: F64, scale: F64, least: float = 0.0) -> F64:
-    """A motion's covariance (3, 3) in the frame in which it began, its variances times `scale` (3,), or `least`."""
-    factor = np.sqrt(np.maximum(scale, least))
-    return np.asarray(factor[:, None] * noise * factor)
+        if self.noise_scale < 1.0:
+            scaled = propagated + self.noise_scale * noise
+            weight = information @ np.linalg.inv(np.eye(3) + scaled @ information)
+            squared = float(innovation @ weight @ innovation)
+        part = weight @ (self.noise_scale * noise)
+        limited = min(1.0, _MAX_SQUARED / squared) if squared > 0.0 else 1.0  # a slip is not noise
+        score = 0.5 * (limited * float(innovation @ part @ weight @ innovation) - float(np.trace(part)))
+        weighed = 0.5 * float(np.trace(part @ part))
+        self._sum = _REMEMBERED * self._sum + weighed * log(self.noise_scale) + score
+        self._information = _REMEMBERED * self._information + weighed
+        found = self._sum / (self._information + _ASSUMED)
+        self.noise_scale = exp(min(max(found, log(_LEAST_NOISE)), log(_MOST_NOISE)))
 
 
 def difference(pose: Pose2, other: Pose2) -> F64:
@@ -188,7 +149,8 @@ class Anchor:
     """A match of a track: the pose in the odometry's and in the map's frame, and its covariance (3, 3).
 
     `count` odometry messages came before. `begins` says that it does not continue the anchor before. The odometry up
-    to here is `noise_scale` (3,) times as noisy as assumed (variances ahead, sideways, in heading).
+    to here is `noise_scale` times as noisy as assumed (variances).
+    `fits_as_usual` says that the match was as fit as usual.
     """
 
     count: int
@@ -196,7 +158,8 @@ class Anchor:
     T_map_base: Pose2
     covariance: F64
     begins: bool
-    noise_scale: F64 = field(default_factory=lambda: np.ones(3))
+    noise_scale: float = 1.0
+    fits_as_usual: bool = True
 
 
 class SmoothedMatches(NamedTuple):
@@ -210,31 +173,38 @@ class SmoothedMatches(NamedTuple):
 def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> SmoothedMatches:
     """The poses of the matches, T_map_base, each smoothed by those of its track that follow, and their covariances.
 
-    The covariances follow by the same recursion: `P_i + C (P_(i+1) - P_(i+1|i)) C^T`.
+    The covariances follow by the same recursion: `P_i + C (P_(i+1) - P_(i+1|i)) C^T`. Where a match is farther from the
+    prediction than noise explains, the wheels slipped, then or before: matches before it that were not as fit as usual
+    may be off by as much.
     """
     poses = np.array([anchor.T_map_base.to_array() for anchor in anchors]).reshape(-1, 3)
     covariances = np.array([anchor.covariance for anchor in anchors]).reshape(-1, 3, 3)
     variances = np.zeros((len(anchors), 3))
+    jump = np.zeros((3, 3))
     for k in range(len(anchors) - 2, -1, -1):
         here, following = anchors[k], anchors[k + 1]
+        if following.begins or here.fits_as_usual:
+            jump = np.zeros((3, 3))
         if following.begins:
             continue
         motion = here.T_odom_base.between(following.T_odom_base)
         noise = motion_model.covariance(motion)
-        scale = following.noise_scale
-        variances[k + 1] = np.diag(rotated(scaled_noise(noise, scale), here.T_map_base.theta))
-        noise = scaled_noise(noise, scale, 1.0)
+        variances[k + 1] = following.noise_scale * np.diag(rotated(noise, here.T_map_base.theta))
+        noise = max(following.noise_scale, 1.0) * noise
         predicted = here.T_map_base @ motion
         variance = predict_covariance(here.covariance, here.T_map_base, motion, noise) + _NO_NOISE
         off = difference(Pose2.from_array(poses[k + 1]), predicted)
         weighted = np.linalg.solve(variance, off)
         if off @ weighted > _MAX_SQUARED:
+            if not here.fits_as_usual:
+                jump = np.outer(off, off)
+            covariances[k] += jump
             continue
         gain = np.linalg.solve(variance, transition(here.T_map_base, motion) @ here.covariance).T
         poses[k] += gain @ off
         poses[k, 2] = wrap_angles(poses[k, 2:])[0]
         smoothed = here.covariance + gain @ (covariances[k + 1] - variance) @ gain.T
-        covariances[k] = 0.5 * (smoothed + smoothed.T)
+        covariances[k] = 0.5 * (smoothed + smoothed.T) + jump
     return SmoothedMatches(poses, covariances, variances)
 
 

@@ -26,7 +26,7 @@ from hsloc.matching.local_refinement import refine
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Evidence, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
-from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.model.pose2 import IDENTITY, Pose2, rotated
 from hsloc.parameters import Angle, Count, NonNegative, OneOf, Parameters, Positive, Ratio
 
 if TYPE_CHECKING:
@@ -223,8 +223,8 @@ class Localiser:
         if not self._match_gate.is_fresh and not self._motion_gate.is_open(motion):
             return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
         propagated = predict_covariance(self._covariance, self._T_map_match, motion, np.zeros((3, 3)))
-        noise = self._motion_model.covariance(motion)
-        covariance = propagated + self._innovations.moved(self._T_map_match, motion, noise)
+        noise = rotated(self._motion_model.covariance(motion), self._T_map_match.theta)
+        covariance = propagated + max(self._innovations.noise_scale, 1.0) * noise
         points = paired.points_base()
         for each in (self._monitor, self._map_scale):
             if each is not None:
@@ -243,10 +243,11 @@ class Localiser:
         if p.fuse:
             if information is not None:
                 information = self._match_gate.trust(match.fitness) * information
-                self._innovations.add(difference(match.pose, predicted), information, propagated)
+                self._innovations.add(difference(match.pose, predicted), information, propagated, noise)
             pose, covariance = fuse_match(predicted, covariance, match, information)
         else:
             pose, covariance = match.pose, match.covariance
+        is_usual = self._match_gate.fits_as_usual(match.fitness)
         self._match_gate.accept(match.fitness)
         self._take(pose, covariance, T_odom_base)
         evidence = None if self._monitor is None else self._monitor.matched(paired, pose, points)
@@ -268,6 +269,7 @@ class Localiser:
             evidence=evidence,
             certificate=match.certificate,
             noise_scale=self._innovations.noise_scale,
+            fits_as_usual=is_usual,
         )
 
     def _wall_variance(self) -> float | None:
@@ -285,7 +287,7 @@ class Localiser:
         return self._innovations.excess * covariance
 
     def _match(self, points: F64, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
-        """Match in the window of the prediction; a refused match may give way to one in a wider window."""
+        """Match in the window of the prediction; a match that is not as fit as usual may give way in a wider window."""
         p = self._parameters
         window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
         usual = self._match_gate.usual
@@ -297,7 +299,7 @@ class Localiser:
             evaluations = refined.evaluations
         best = self._match_in(points, window)
         evaluations += best.evaluations
-        if usual is not None and self._match_gate.refusal(best.fitness):
+        if usual is not None and not self._match_gate.fits_as_usual(best.fitness):
             wide = Window(
                 predicted,
                 max(window.half_x, p.wide_window),
@@ -306,7 +308,9 @@ class Localiser:
             )
             match = self._match_in(points, wide)
             evaluations += match.evaluations
-            if self._match_gate.is_recovered(best.fitness, match.fitness):
+            is_refused = bool(self._match_gate.refusal(best.fitness))
+            takes = self._match_gate.is_recovered if is_refused else self._match_gate.is_regained
+            if takes(best.fitness, match.fitness):
                 best = match
         return best, evaluations
 
@@ -350,7 +354,6 @@ class Localiser:
         if result.is_sure:
             self._searching = False
             self._match_gate.restart(result.fitness)
-            self._innovations.restart()
             if self._monitor is not None:
                 self._monitor.begin()
             status = Status.RELOCALISED

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from hsloc.model.certificate import Certificate
@@ -115,8 +114,10 @@ class Estimate:
     """What the scan says about the track, of an estimator that weighs it."""
     certificate: Certificate | None = None
     """What was proven about the match, where it was asked for."""
-    noise_scale: NDArray[np.float64] = field(default_factory=lambda: np.ones(3))
-    """Variances (3,) of the odometry ahead, sideways and in heading by the assumed ones, as the scans so far show."""
+    noise_scale: float = 1.0
+    """Variance of the odometry by the assumed one, as the scans so far show it."""
+    fits_as_usual: bool = True
+    """Whether the match was as fit as usual, or nearly so."""
     places: tuple[LikelyPlace, ...] = ()
     """While several places fit: the most probable ones."""
 

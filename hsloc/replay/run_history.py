@@ -117,6 +117,7 @@ class RunHistory:
                     estimate.covariance,
                     begins,
                     estimate.noise_scale,
+                    estimate.fits_as_usual,
                 )
             )
             self._anchor_scans.append(len(self._scan_stamps) - 1)

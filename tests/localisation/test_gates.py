@@ -57,6 +57,17 @@ def test_a_wide_match_must_gain_and_reach_most_of_the_usual_fitness() -> None:
     assert not gate.is_recovered(0.72, 0.815)
 
 
+def test_a_match_that_is_not_as_fit_as_usual_gives_way_to_one_that_is() -> None:
+    gate = MatchGate(LIMITS)
+    assert gate.fits_as_usual(0.1)
+    gate.accept(0.96)
+    assert gate.fits_as_usual(0.92)
+    assert not gate.fits_as_usual(0.9)
+    assert gate.is_regained(0.88, 0.95)
+    assert not gate.is_regained(0.9, 0.93)
+    assert not gate.is_regained(0.8, 0.9)
+
+
 def test_a_restart_takes_the_fitness_of_the_place_that_was_found() -> None:
     gate = MatchGate(LIMITS)
     gate.refuse()

@@ -47,7 +47,7 @@ TOLERATED_PREDICTED = 0.05
 _REMEDIES = {
     State.PREDICTED: "use the standard deviations in states.csv; a lidar with more range or field of view sees more",
     State.AMBIGUOUS: "give the start (--initial-pose), or a longer log",
-    State.OFF_MAP: "give a map that covers the way, or extend this one (--resume)",
+    State.OFF_MAP: "give a map that covers the path, or extend this one (--resume)",
     State.LOST: "give the start (--initial-pose); check map, mounting (--laser-pose) and odometry (hsloc check)",
 }
 _WORDS = {

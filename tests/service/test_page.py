@@ -108,6 +108,8 @@ def test_upload_watch_look_download(
     page.click("text=← all jobs")
     page.wait_for_function("() => document.querySelectorAll('#jobs tbody tr').length === 2")
     compare_two(page, need_accessible)
+    with live.client() as client:
+        state_loops_by_two_clicks(page, client)
     report = open_page(f"{live.url}/v1/jobs/{job['id']}/results/report.html?download=false")
     report.wait_for_selector(".rv-now")
     need_accessible(report)
@@ -130,6 +132,7 @@ def look_before_it_runs(page: Any) -> None:
     assert (page.input_value("[data-option=initial_pose]") or "").endswith(", 0.000")
     picture(page, "10-inspected")
     page.evaluate("document.querySelector('[data-option=initial_pose]').value = ''")
+    page.evaluate("""document.querySelector('[data-option="read.end_s"]').value = '20'""")
 
 
 def share_by_a_link(page: Any, open_page: Callable[..., Any]) -> None:
@@ -178,6 +181,35 @@ def compare_two(page: Any, need_accessible: Callable[[Any], None]) -> None:
     rows = page.locator("#comparison table tr").all_text_contents()
     assert any(re.fullmatch(r"APE rmse(\d+\.\d+ cm / \d+\.\d+°){2}", row) for row in rows)  # the same run: no change
     leave_before_it_is_compared(page)
+
+
+def state_loops_by_two_clicks(page: Any, client: Any) -> None:
+    """On a built map: which two places are one, for the next run."""
+    log = client.get("/v1/files").json()["files"][0]["id"]
+    built = client.post("/v1/jobs", json={"log": log, "mode": "slam", "read": {"end_s": 3.0}}).json()["id"]
+    page.evaluate("(id) => { location.hash = `job=${id}`; }", built)
+    page.wait_for_selector("#job-state .succeeded", timeout=120_000)
+    page.wait_for_selector("#view [data-do=loop]")
+    page.click("#view [data-do=loop]")
+    assert page.is_disabled("#one-place")
+    box = page.locator("#view .rv-over").bounding_box()
+    tried = [(0.1 * column, 0.1 * row) for row in range(1, 10) for column in range(1, 10)]
+    for across, down in tried:  # wherever the trajectory is
+        if page.is_enabled("#one-place"):
+            break
+        page.mouse.click(box["x"] + across * box["width"], box["y"] + down * box["height"])
+    assert re.fullmatch(r"\d\.\d s and \d\.\d s: .*", page.text_content("#state-loops p") or "")
+    page.click("#two-places")
+    found = page.input_value("#forbid-loop")
+    assert len(found.split(",")) == 2
+    picture(page, "11-loops")
+    page.click("#state-loops >> text=Run again")
+    page.wait_for_function("(id) => !location.hash.includes(id)", arg=built)
+    again = page.url.partition("job=")[2]
+    request = client.get(f"/v1/jobs/{again}").json()["request"]
+    assert (request["mode"], request.get("assert_loop")) == ("slam", None)
+    assert [float(t) for t in request["forbid_loop"].split(",")] == [float(t) for t in found.split(",")]
+    client.post(f"/v1/jobs/{again}/cancel")
 
 
 def leave_before_it_is_compared(page: Any) -> None:
@@ -237,7 +269,7 @@ def look_around_by_keyboard(page: Any) -> None:
     assert page.text_content(".rv-now") == now
     page.focus("#view input[type=range]")
     page.keyboard.press("End")
-    assert (page.text_content(".rv-now") or "").startswith("112")
+    assert (page.text_content(".rv-now") or "").startswith("20.0 s")
     page.keyboard.press("Home")
     assert (page.text_content(".rv-now") or "").startswith("0.0 s")
     page.keyboard.press("Space")

@@ -33,7 +33,7 @@ def test_the_form_offers_what_the_server_does(
     page.fill("[data-option='read.start_s']", "1.5")
     page.fill("[data-option=seed]", "7")
     page.select_option("[data-option=matcher]", "icp")
-    page.fill("[data-option=config]", '{"icp": {"iterations": 9}}')
+    page.fill("[data-option=config]", "icp.iterations=9")
     page.set_input_files("#log", str(RECORDINGS / "slip.mcap"))
     page.click("#go")
     page.wait_for_selector("#job-state .state")
@@ -92,7 +92,17 @@ def test_several_logs_are_several_jobs_or_one_and_the_table_finds_them(
     page.check("input[value=jobs]")
     page.click("summary >> text=Sweep: every log")
     page.fill("#sweep-seeds", "0-1, 5")
-    page.fill("#sweep-configs", '{"few": {"hide": {"budget": 100}}, "many": {"hide": {"budget": 800}}}')
+    page.fill("#sweep-configs", "few: hide.budget=100\nmany: hide.buget=800")
+    page.click("#go")
+    page.wait_for_function("() => document.querySelector('#notice').textContent.includes('no hide.buget')")
+    page.fill("#sweep-configs", "few: hide.budget=100\nmany:")
+    page.fill("[list=sweep-configs-names]", "hide.budget")
+    assert "240 by default; it must be a whole number from 1." in (
+        page.text_content("#sweep-options [role=status]") or ""
+    )
+    page.keyboard.press("Enter")  # adds it with its default, which is selected
+    page.keyboard.type("800")
+    assert page.input_value("#sweep-configs") == "few: hide.budget=100\nmany: hide.budget=800"
     page.click("#go")
     page.wait_for_function("() => document.querySelectorAll('#matrix .succeeded').length === 12", timeout=60_000)
     assert page.locator("#matrix thead th").all_text_contents() == ["few", "many"]

@@ -2,9 +2,9 @@
 // Mouse, fingers and keys of the map: see view.js, whose `ResultView` is the `view` here.
 globalThis.lengthText = (m) => m < 1 ? `${(100 * m).toFixed(m < 0.1 ? 1 : 0)} cm` : `${m.toFixed(2)} m`;
 globalThis.listenToView = (view) => {
-  function nearest(px, py) {
+  function nearest(px, py, within = 14) {
     const path = view.data.trajectory, [mx, my] = view.metres(px, py);
-    let best = null, least = (14 * view.ratio / view.scale) ** 2;
+    let best = null, least = (within * view.ratio / view.scale) ** 2;
     for (let k = 0; k < path.x.length; k += 1) {
       const [x, y] = view.local(path.x[k], path.y[k]), far = (x - mx) ** 2 + (y - my) ** 2;
       if (far < least) { least = far; best = k; }
@@ -27,8 +27,14 @@ globalThis.listenToView = (view) => {
       view.drawOver();
       return;
     }
-    const k = nearest(px, py);
-    if (k !== null) view.seek(view.data.trajectory.t[k]);
+    const k = nearest(px, py, view.picking ? 40 : 14);
+    if (k === null) return;
+    const t = view.data.trajectory.t[k];
+    if (view.picking) view.picked = [...(view.picked.length > 1 ? [] : view.picked), t];
+    view.seek(t);
+    if (view.picking && view.picked.length > 1) {
+      view.root.dispatchEvent(new CustomEvent("loop", { detail: [...view.picked].sort((a, b) => a - b) }));
+    }
   }
   const { signal } = view.listening, over = view.$over, place = (event) => [event.offsetX * view.ratio, event.offsetY * view.ratio];
   over.addEventListener("wheel", (event) => {
@@ -71,14 +77,23 @@ globalThis.listenToView = (view) => {
   over.addEventListener("pointerleave", () => { view.$place.textContent = ""; view.charts.cursor(view.time); });
   over.addEventListener("dblclick", (event) => view.zoom(2, ...place(event)));
   const measure = () => { view.measure = view.measure ? null : []; over.classList.toggle("rv-measuring", Boolean(view.measure)); view.drawOver(); };
+  const toggle = (name, on) => {
+    over.classList.toggle("rv-measuring", on);
+    view.root.querySelector(`[data-do=${name}]`).setAttribute("aria-pressed", String(on));
+    view.drawOver();
+  };
   const pose = () => {
     view.posing = !view.posing;
     view.arrow = view.posing ? null : view.arrow;
-    over.classList.toggle("rv-measuring", view.posing);
-    view.root.querySelector("[data-do=pose]").setAttribute("aria-pressed", String(view.posing));
-    view.drawOver();
+    toggle("pose", view.posing);
   };
-  const actions = { pose, in: () => view.zoom(1.5), out: () => view.zoom(1 / 1.5), all: () => view.all(), measure, picture: () => globalThis.saveView.picture(view), drawing: () => globalThis.saveView.drawing(view),
+  const loop = () => {
+    view.picking = !view.picking;
+    view.picked = [];
+    toggle("loop", view.picking);
+    view.root.dispatchEvent(new CustomEvent("loop", { detail: [] }));
+  };
+  const actions = { pose, loop, in: () => view.zoom(1.5), out: () => view.zoom(1 / 1.5), all: () => view.all(), measure, picture: () => globalThis.saveView.picture(view), drawing: () => globalThis.saveView.drawing(view),
     play: () => view.play(), less: () => view.step(-1), more: () => view.step(1), back: () => view.jump(false), next: () => view.jump(true) };
   view.root.addEventListener("click", (event) => actions[event.target.closest?.("button[data-do]")?.dataset.do]?.(), { signal });
   view.root.addEventListener("change", (event) => {

@@ -158,6 +158,20 @@
       this.$scale.firstChild.style.width = `${metres * this.scale / this.ratio}px`;
       this.$scale.lastChild.textContent = metres >= 1000 ? `${metres / 1000} km` : metres >= 1 ? `${metres} m` : `${Number((100 * metres).toPrecision(3))} cm`;
     },
+    // Loops that the user states, and the places that are clicked for the next one.
+    drawStated(c, px) {
+      const path = this.data.trajectory, place = (t) => {
+        const k = path.t.findLastIndex((each) => each <= t + 1e-9);
+        return this.local(path.x[Math.max(k, 0)], path.y[Math.max(k, 0)]);
+      };
+      const lines = [...this.stated, ...(this.picked.length ? [[...this.picked, "robot"]] : [])];
+      for (const line of lines) {
+        const ink = this.ink(line.at(-1)), ends = line.slice(0, -1).map(place);
+        c.strokeStyle = c.fillStyle = ink; c.lineWidth = 2.5 * px;
+        c.beginPath(); c.moveTo(...ends[0]); c.lineTo(...ends.at(-1)); c.stroke();
+        for (const end of ends) { c.beginPath(); c.arc(...end, 5 * px, 0, 2 * Math.PI); c.fill(); }
+      }
+    },
     drawArrow(c, px) {
       const [[x, y], [tx, ty]] = this.arrow, length = Math.hypot(tx - x, ty - y), head = Math.min(14 * px, length / 2);
       c.save();

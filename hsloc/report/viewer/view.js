@@ -21,7 +21,7 @@
     constructor(root, data, image, charts) {
       this.$charts = charts;
       this.root = root; this.data = data; this.image = image;
-      this.time = 0; this.fingers = new Map(); this.measure = null; this.playing = null; this.speed = 10;
+      this.time = 0; this.fingers = new Map(); this.measure = null; this.picked = this.stated = []; this.playing = null; this.speed = 10;
       this.ox = (data.extent[0] + data.extent[2]) / 2;
       this.oy = (data.extent[1] + data.extent[3]) / 2;
       this.local = (x, y) => [x - this.ox, y - this.oy];
@@ -42,10 +42,15 @@
     }
 
     // A tool by which an arrow is dragged: the event `pose` has [x, y, yaw] in the frame of the map (m, rad).
-    offerPose(title) {
-      this.$tools.append(make("button", { type: "button", "data-do": "pose", title, "aria-label": title, "aria-pressed": "false" }, "⇗"));
-    }
+    offerPose(title) { this.offer("pose", "⇗", title); }
     setPose(arrow) { this.arrow = arrow; this.drawOver(); }
+    // A tool by which two places of the trajectory are clicked: the event `loop` has their times (s).
+    offerLoop(title) { this.offer("loop", "∞", title); }
+    // Pairs of times [t1, t2, ink] that are drawn as lines between the places of the trajectory then.
+    setLoops(loops) { this.stated = loops; this.picked = []; this.drawOver(); }
+    offer(name, sign, title) {
+      this.$tools.append(make("button", { type: "button", "data-do": name, title, "aria-label": title, "aria-pressed": "false" }, sign));
+    }
 
     // Frees what the page holds beyond the element.
     end() {
@@ -143,10 +148,22 @@
     }
     all() {
       const [x0, y0, x1, y1] = this.data.extent;
-      this.x = this.y = 0;
       this.scale = Math.min(this.$base.width / (x1 - x0), this.$base.height / (y1 - y0));
+      [this.x, this.y] = this.middle();
       this.whole = true;
       this.draw();
+    }
+    // Where all is shown there is room beside it or above: rather for more of the map than for what is not known.
+    middle() {
+      const { map, extent: [x0, y0, x1, y1] } = this.data;
+      if (!map || map.corner[2] !== 0) return [0, 0];
+      const along = (low, high, corner, size, shown) => {
+        const first = Math.min(low, corner), last = Math.max(high, corner + size), middle = (low + high) / 2;
+        if (last - first <= shown) return (first + last) / 2 - middle;
+        return Math.min(Math.max(middle, first + shown / 2), last - shown / 2) - middle;
+      };
+      return [along(x0, x1, map.corner[0], map.side * map.width, this.$base.width / this.scale),
+        along(y0, y1, map.corner[1], map.side * map.height, this.$base.height / this.scale)];
     }
     zoom(factor, px = this.$base.width / 2, py = this.$base.height / 2) {
       const [mx, my] = this.metres(px, py), size = Math.max(this.data.extent[2] - this.data.extent[0], 1);
@@ -184,7 +201,7 @@
       const px = this.ratio / this.scale, stroke = (path, colour, width, dash = []) => {
         c.strokeStyle = colour; c.lineWidth = width * px; c.setLineDash(dash.map((n) => n * px)); c.stroke(path.canvas); c.setLineDash([]);
       };
-      c.lineJoin = c.lineCap = "round";
+      c.lineJoin = "bevel"; c.lineCap = "round"; // round joins of thousands of points take twice as long
       if (this.shown.has("heat")) this.drawHeat(c);
       if (this.shown.has("scans")) for (const k of d.scans.t.keys()) this.drawScan(c, k, 1.2 * px);
       if (this.shown.has("points")) this.dots(c, d.points, this.ink("ink"), 3 * px);
@@ -274,6 +291,7 @@
         c.strokeStyle = this.ink("halo"); c.lineWidth = 1.2 * px; c.stroke();
         c.restore();
       }
+      this.drawStated(c, px);
       if (this.arrow) this.drawArrow(c, px);
       if (this.measure?.length) {
         const [a, b = a] = this.measure;

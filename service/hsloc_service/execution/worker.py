@@ -65,8 +65,12 @@ def main(argv: list[str] | None = None) -> int:
         tell({"failed": "out_of_memory", "message": "the job needed more memory than it is allowed"})
         return 1
     except Exception as error:
-        tell(explain(error))
-        traceback.print_exc()
+        told = explain(error)
+        tell(told)
+        if told["failed"] == "internal_error":
+            traceback.print_exc()
+        else:
+            say(f"{told['failed']}: {told['message']}")
         return 1
     return 0
 

@@ -11,6 +11,7 @@ import * as labels from "./labels.js";
 import { build } from "./options.js";
 import * as result from "./result.js";
 import * as share from "./share.js";
+import * as parameters from "./parameters.js";
 import * as sweeps from "./sweeps.js";
 
 const EVERY_MS = 3000;
@@ -36,9 +37,11 @@ $("token-form").addEventListener("submit", (event) => {
 async function about() {
   const info = await guarded(() => get("/v1/info"));
   if (info) $("server").textContent = `version ${info.version}, ${bytes(info.free_bytes)} free, ${info.tenant}`;
-  const options = info && (await guarded(() => get("/v1/options")))?.run;
+  const options = info && await guarded(() => get("/v1/options"));
   if (!options || $("options").children.length) return;
-  build($("options"), options);
+  parameters.use(options.config_schema);
+  build($("options"), options.run);
+  $("sweep-configs").closest(".grid").append(parameters.finder($("sweep-configs")));
   offerTopics();
 }
 

@@ -4,6 +4,7 @@ import { get, post, postOnce } from "./api.js";
 import { $, bytes, element, guarded, notice, when } from "./dom.js";
 import * as inspection from "./inspect.js";
 import { chosen as chosenOptions } from "./options.js";
+import * as parameters from "./parameters.js";
 import * as sweeps from "./sweeps.js";
 import { upload } from "./upload.js";
 
@@ -101,7 +102,7 @@ async function submit() {
   const jobs = [], wanted = $("sweep-seeds").value.trim() || $("sweep-configs").value.trim();
   try {
     if (wanted) {
-      const seeds = sweeps.seeds($("sweep-seeds").value.trim() || "0"), configs = sweeps.configs($("sweep-configs").value);
+      const seeds = sweeps.seeds($("sweep-seeds").value.trim() || "0"), configs = parameters.configs($("sweep-configs").value);
       const found = await requests();
       if (found.some((request) => request.logs)) throw new SyntaxError("a sweep runs each log by itself; choose \"a job for each\"");
       if (found[0].resume) throw new SyntaxError("a sweep does not extend maps");

@@ -11,6 +11,17 @@ let offset = 0;
 // Of a table that is polled every row stays while it says the same, so that focus and ticks stay.
 const rows = new Map();
 
+// Under each other in all rows, so that they can be compared at a glance.
+function figures(found) {
+  const box = element("div", "", "of-job");
+  box.append(...found.map(({ name, values }) => {
+    const each = element("div");
+    each.append(element("small", name, "quiet"), " ", element("strong", values.join(" / ")));
+    return each;
+  }));
+  return box;
+}
+
 function row(job) {
   const key = JSON.stringify(job, (name, value) => name === "age_s" || name === "heartbeat_age_s" ? undefined : value);
   const known = rows.get(job.id);
@@ -31,7 +42,7 @@ function row(job) {
     result.append(bar);
   }
   line.append(cell(box), cell(link, ...(job.title ? [element("small", job.log, "quiet name")] : []), ...chips(job.labels)), result,
-    cell(summary.key_figures?.map((figure) => `${figure.name} ${figure.values.join(" / ")}`).join(" · ") || job.message || ""),
+    summary.key_figures?.length ? cell(figures(summary.key_figures)) : cell(job.message || ""),
     cell(summary.mode ?? ""), cell(summary.duration_s ? duration(summary.duration_s) : ""),
     cell(job.started && job.ended ? duration((new Date(job.ended) - new Date(job.started)) / 1000) : ""),
     cell(when(job.created) + (job.rerun_of ? ", run again" : "")));

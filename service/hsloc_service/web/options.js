@@ -1,5 +1,7 @@
 // The form of a run's options, made from /v1/options: whatever the server offers can be chosen here.
 
+import { config, finder } from "./parameters.js";
+
 const FILES = ["relations", "reference", "calibration", "resume"]; // chosen elsewhere on the page
 
 function control(option) {
@@ -11,7 +13,7 @@ function control(option) {
   } else if (option.name === "config") {
     made = document.createElement("textarea");
     made.rows = 3;
-    made.placeholder = '{"hide": {"budget": 500}}';
+    made.placeholder = "hide.budget=500";
   } else {
     made = document.createElement("input");
     made.type = { switch: "checkbox", whole: "number", number: "number" }[option.kind] ?? "text";
@@ -51,7 +53,7 @@ export function build(box, options) {
     help.id += "-help";
     made.setAttribute("aria-describedby", help.id);
     label.append(help);
-    groups.get(option.group).append(label);
+    groups.get(option.group).append(label, ...(option.name === "config" ? [finder(made)] : []));
   }
 }
 
@@ -59,9 +61,7 @@ function value(made) {
   const text = made.value.trim(), name = made.dataset.option;
   if (made.dataset.kind === "switch") return made.checked || null;
   if (!text) return null;
-  if (name === "config") {
-    try { return JSON.parse(text); } catch (error) { throw new SyntaxError(`parameters are not JSON: ${error.message}`); }
-  }
+  if (name === "config") return config(text);
   if (made.dataset.kind === "pose") {
     const found = text.split(/[\s,]+/).map(Number);
     if (found.length !== 3 || found.some(Number.isNaN)) throw new SyntaxError(`${name}: three numbers are needed: x, y (metres) and yaw (radians)`);

@@ -1,7 +1,7 @@
 // One job: its state while it runs, then its result as report.html shows it.
 
 import { events, get, hasToken, post, request } from "./api.js";
-import { $, ACTIVE, badge, button, bytes, cell, element, guarded, heading, list } from "./dom.js";
+import { $, ACTIVE, badge, button, bytes, cell, duration, element, guarded, heading, list } from "./dom.js";
 import * as labels from "./labels.js";
 import * as share from "./share.js";
 
@@ -48,7 +48,8 @@ export async function showShared(secret, time = 0) {
 function begin() {
   leave();
   watching = new AbortController();
-  $("result").hidden = $("job-log").hidden = $("start-here").hidden = true;
+  $("result").hidden = $("job-log").hidden = $("start-here").hidden = $("state-loops").hidden = true;
+  $("headline").replaceChildren();
   $("job-log").lastElementChild.textContent = $("job-notes").textContent = "";
   return watching.signal;
 }
@@ -80,7 +81,9 @@ function render(job, isMine = true) {
   renamed(job);
   labels.show(job);
   const state = $("job-state");
-  state.replaceChildren(element("span", job.state, `state ${job.state}`));
+  // "succeeded" beside the verdict "failed" would be read as a contradiction.
+  const ended = job.state === "succeeded" && job.summary?.verdict_text && job.started ? `ran for ${duration((new Date(job.ended) - new Date(job.started)) / 1000)}` : null;
+  state.replaceChildren(element("span", ended ?? job.state, `state ${job.state}${ended ? " quiet" : ""}`));
   if (job.reason) state.append(` (${job.reason})`);
   if (job.message) state.append(`: ${job.message}`);
   if (job.state === "queued") state.append(": waits for a slot");
@@ -149,7 +152,9 @@ async function showResult(job, base, mine, time) {
   if (!loaded || mine.aborted) return;
   summary(job, loaded.data.summary);
   view = new globalThis.ResultView($("view"), loaded.data, loaded.image, $("charts"));
-  if (!isShared && job.summary?.mode !== "slam" && job.summary?.metrics?.run?.mode !== "slam") view.offerPose("run again from a start pose: drag an arrow");
+  const built = job.summary?.mode === "slam" || job.summary?.metrics?.run?.mode === "slam";
+  if (!isShared && !built) view.offerPose("run again from a start pose: drag an arrow");
+  if (!isShared && built && loaded.data.loops && !job.request.resume) offerLoops(job);
   if (time > 0) view.seek(time);
 }
 
@@ -162,6 +167,57 @@ $("view").addEventListener("pose", ({ detail: pose }) => {
   bar.replaceChildren(bar.firstElementChild, button("Run again from here", async () => {
     location.hash = `job=${(await post(`/v1/jobs/${id}/rerun`, { initial_pose: pose, unknown_start: false })).id}`;
   }, "primary"), button("Cancel", () => { bar.hidden = true; view?.setPose(null); }));
+});
+
+// Two places of the trajectory were clicked, of which a person knows whether they are one: loops for the next run.
+const LOOPS = { "assert-loop": "assert_loop", "forbid-loop": "forbid_loop" };
+let clicked = [];
+
+function showLoops(times) {
+  clicked = times;
+  $("state-loops").querySelector("p").textContent = times.length < 2 ? "Click two places of the trajectory: the same place, seen at two times, or two that look alike."
+    : `${times.map((t) => `${t.toFixed(1)} s`).join(" and ")}: one place, or two that look alike?`;
+  $("one-place").disabled = $("two-places").disabled = times.length < 2;
+}
+
+function pairs(id) {
+  const times = $(id).value.split(",").filter((part) => part.trim()).map(Number);
+  if (times.length % 2 || times.some((t) => !(t >= 0))) throw new SyntaxError("loops: pairs of times in seconds are needed, such as 12.5,140");
+  return times;
+}
+
+function drawLoops() {
+  const inks = { "assert-loop": "green", "forbid-loop": "vermillion" }, found = [];
+  for (const [id, ink] of Object.entries(inks)) {
+    const times = pairs(id);
+    for (let k = 0; k < times.length; k += 2) found.push([times[k], times[k + 1], ink]);
+  }
+  view?.setLoops(found);
+}
+
+function offerLoops(job) {
+  for (const [id, name] of Object.entries(LOOPS)) $(id).value = job.request[name] ?? "";
+  view.offerLoop("state a loop: click two places");
+  guarded(drawLoops);
+}
+
+function state(id) {
+  $(id).value = [...$(id).value.split(",").filter((part) => part.trim()), ...clicked.map((t) => t.toFixed(1))].join(",");
+  showLoops([]);
+  guarded(drawLoops);
+}
+
+$("view").addEventListener("loop", ({ detail }) => { $("state-loops").hidden = !view.picking; showLoops(detail); });
+$("one-place").addEventListener("click", () => state("assert-loop"));
+$("two-places").addEventListener("click", () => state("forbid-loop"));
+for (const id of Object.keys(LOOPS)) $(id).addEventListener("change", () => guarded(drawLoops));
+$("state-loops").addEventListener("submit", (event) => {
+  event.preventDefault();
+  const id = shownJob;
+  guarded(async () => {
+    const wanted = Object.fromEntries(Object.entries(LOOPS).map(([box, name]) => [name, pairs(box).join(",") || null]));
+    location.hash = `job=${(await post(`/v1/jobs/${id}/rerun`, wanted)).id}`;
+  });
 });
 
 // The address holds the time that is shown, so that it can be sent.
@@ -214,7 +270,7 @@ function summary(job, whole) {
   if (found.verdict) row("verdict", [short.verdict_text ?? found.verdict]);
   for (const figure of figures) row(figure.name, figure.values, figure.explanation);
   if (found.log) row("log", [`${found.log.duration_s.toFixed(1)} s, ${found.log.path_length_m.toFixed(1)} m, ${found.log.odometry_messages} odometry messages`]);
-  if (short.timings?.times_real_time) row("speed", [`${short.timings.times_real_time.toFixed(0)} times real time`]);
+  if (short.timings?.times_real_time) row("speed", [`${short.timings.times_real_time.toFixed(short.timings.times_real_time < 10 ? 1 : 0)} times real time`]);
   if (found.run) row("run", [`hsloc ${found.run.hsloc}, ${found.run.matcher ?? "graph mapper"}, preset ${found.run.preset}, seed ${found.run.seed}`]);
   if (found.run) row("SHA-256 of the log", [found.run.input_sha256]);
   $("metrics").tBodies[0].replaceChildren(...rows);

@@ -18,14 +18,6 @@ export function seeds(text) {
   return [...new Set(found)];
 }
 
-// {"label": {"hide": {"budget": 200}}}: parameters of each configuration.
-export function configs(text) {
-  if (!text.trim()) return null;
-  let found;
-  try { found = JSON.parse(text); } catch (error) { throw new SyntaxError(`configurations are not JSON: ${error.message}`); }
-  return Object.fromEntries(Object.entries(found).map(([label, config]) => [label, { config }]));
-}
-
 export const submit = (body) => postOnce("/v1/sweeps", body);
 
 export async function list() {

@@ -211,7 +211,8 @@ class MapScaleEstimator:
         """The scale and its standard deviation; None before `_FEWEST_BLOCKS` blocks of path were seen.
 
         Two errors: the scatter of the blocks (jackknife), and that of how walls are drawn, which is the same wherever
-        a wall is seen: a cell's uniform distribution by the spread of the ranges that distinguishes scale from offset.
+        a wall is seen: how far walls are from their place, by the spread of the ranges that distinguishes scale from
+        offset.
         """
         n = len(self._information)
         if n < _FEWEST_BLOCKS:
@@ -223,5 +224,5 @@ class MapScaleEstimator:
         scatter = sqrt((n - 1) / n * float(((without - without.mean()) ** 2).sum()))
         left = total[0, 0] - total[0, 1] ** 2 / total[1, 1]
         spread = sqrt(max(float(left), 1e-12) / max(self._weight, 1e-12))
-        drawn = self._field.resolution / sqrt(12.0) / spread / sqrt(min(n, _MOST_WALLS))
+        drawn = sqrt(self.wall_variance) / spread / sqrt(min(n, _MOST_WALLS))
         return MapScale(1.0 + float(value), hypot(scatter, drawn), self._corner)

@@ -40,7 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--move-to", metavar="URL",
-        help="Copy the data folder's database to an empty PostgreSQL, postgresql://USER@HOST/NAME, and exit.",
+        help="Copy the data folder's database to an empty PostgreSQL, postgresql://USER@HOST/NAME, its uploads and "
+        "results to $HSLOC_STORE_URL if that is set, and exit. Broken off, it is run again and goes on.",
     )  # fmt: skip
     group = parser.add_argument_group("tokens")
     group.add_argument("--first-token", action="store_true", help="Make a token on the first start and print it.")

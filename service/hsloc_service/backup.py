@@ -1,4 +1,4 @@
-"""A data folder copied: all of it while a server runs, as a backup; or its database to PostgreSQL.
+"""A data folder copied: all of it while a server runs, as a backup; or to PostgreSQL and an object store.
 
 A backup has a copy of the database, and of every upload and result that it names. A plain copy of the folder is none
 while a server runs: what is in the database's write-ahead log is missing in a copy of `hsloc.db`. The backup is a data
@@ -12,22 +12,30 @@ import os
 import shutil
 import sqlite3
 from contextlib import closing, suppress
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sqlalchemy import delete, func, insert, select
 
 from hsloc_service.db.database import SQLITE, Database
-from hsloc_service.db.tables import AssetRow, Base, CounterRow, FileRow, JobRow
+from hsloc_service.db.tables import AssetRow, Base, CounterRow, FileRow, JobRow, UploadPartRow
+from hsloc_service.errors import StoreError
 from hsloc_service.jobs.repository import delete_job
+from hsloc_service.results.store import Asset
+from hsloc_service.results.stores import ResultStores
+from hsloc_service.results.upload_parts import ASSET as PART
+from hsloc_service.results.upload_parts import Staging
 from hsloc_service.settings import SettingsError
-from hsloc_service.storage import Storage, sync_folder
+from hsloc_service.storage import Storage, hash_file, sync_folder
+from hsloc_service.uploads.upload_stream import SAFE_EVERY
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from sqlalchemy import Table
     from sqlalchemy.orm import Session
 
+    from hsloc_service.results.store import ResultStore
     from hsloc_service.settings import Settings
 
 BLOCK = 1 << 20
@@ -166,13 +174,17 @@ class MoveReport(NamedTuple):
     jobs: int
     uploads: int
     rows: int
+    copied: int
+    """Bytes that were copied to the store; what an earlier attempt had copied is not counted."""
 
 
 def move(settings: Settings, url: str) -> MoveReport:
-    """Copy the database of the data folder to an empty one at `url`; uploads and results stay where they are.
+    """Copy the database of the data folder to an empty one at `url`; where a store is set, uploads and results to it.
 
-    The folder's own database is left as it is. Raises SettingsError while a server runs on the folder, for a folder
-    without a database, and for a database that holds something already.
+    The data folder is left as it is. The files come first, then all rows in one transaction, or none; called again, it
+    copies what is not in the store yet. Raises SettingsError while a server runs on the folder, for a folder without a
+    database, for a database that holds something already, for a file that is not what its row says, and for a store
+    that does not take the files.
     """
     if settings.database_url:
         raise SettingsError("HSLOC_DATABASE_URL is set; leave it out to move the database of the data folder")
@@ -180,27 +192,117 @@ def move(settings: Settings, url: str) -> MoveReport:
         raise SettingsError(f"{url.partition(':')[0]}: a move is to PostgreSQL; give postgresql://user@host/database")
     path = _database_in(settings.data)
     with (
-        closing(Storage(settings.data, settings.min_free_bytes)),  # raises where a server runs
+        closing(Storage(settings.data, settings.min_free_bytes)) as storage,  # raises where a server runs
         closing(Database(path)) as source,
         closing(Database(url)) as target,
     ):
-        return _copy_tables(source, target)
+        with target.read() as session:
+            _need_empty(session, target.name)
+        stores = ResultStores(storage, settings)
+        copied = FileCopy(source, storage, stores) if stores.parts_store is not None else None
+        if copied is not None:
+            copied.copy()
+        return _copy_tables(source, target, copied)
 
 
-def _copy_tables(source: Database, target: Database) -> MoveReport:
+class FileCopy:
+    """Uploads and results of a data folder on their way to the store of the settings."""
+
+    def __init__(self, source: Database, storage: Storage, stores: ResultStores) -> None:
+        assert stores.parts_store is not None
+        self._source, self._storage, self._results, self._uploads = source, storage, stores.current, stores.parts_store
+        self.parts: list[dict[str, Any]] = []
+        """Rows of the parts of the uploads."""
+        self.bytes = 0
+        """Bytes that were written."""
+
+    def copy(self) -> None:
+        """Copy what is not there. Raises SettingsError."""
+        with self._source.read() as session:
+            files = session.scalars(select(FileRow).order_by(FileRow.id)).all()
+            jobs = session.scalars(select(JobRow).where(JobRow.folder.is_not(None), JobRow.store.is_(None))).all()
+            rows = session.scalars(select(AssetRow).where(AssetRow.job_id.in_(select(JobRow.id)))).all()
+        assets: dict[str, list[Asset]] = {}
+        for row in rows:
+            assets.setdefault(row.job_id, []).append(Asset(row.name, row.size, row.sha256, row.media_type))
+        try:
+            for file in files:
+                self._copy_upload(file)
+            for job in jobs:
+                self._copy_result(job.folder or "", assets.get(job.id, []))
+        except (StoreError, OSError) as error:
+            raise SettingsError(f"{error}; when it is mended, run the same again: it goes on from there") from error
+
+    def adapt(self, row: dict[str, Any]) -> dict[str, Any]:
+        """The row of a job, with the place where its results are now."""
+        moved = row["folder"] is not None and row["store"] is None
+        return row | {"store": self._results.url} if moved else row
+
+    def _copy_upload(self, row: FileRow) -> None:
+        """In parts of SAFE_EVERY bytes, numbered from 0, so that those of a broken attempt have the same names."""
+        path, size, digest = self._storage.upload_path(row.id), row.received, hashlib.sha256()
+        staging = Staging(self._storage.work)
+        if size == 0:
+            return
+        with path.open("rb") as file:
+            for number, start in enumerate(range(0, size, SAFE_EVERY)):
+                block = file.read(min(SAFE_EVERY, size - start))
+                digest.update(block)
+                part = Asset(PART, len(block), "", "application/octet-stream")
+                name = f"{row.id}.{number}"
+                if not _is_there(self._uploads, name, part):
+                    descriptor = staging.open()
+                    try:
+                        with os.fdopen(descriptor, "wb") as staged:
+                            staged.write(block)
+                        self._uploads.publish(staging.folder, name, [part])
+                    finally:
+                        staging.remove()
+                    self.bytes += len(block)
+                self.parts.append({"file_id": row.id, "start": start, "size": len(block), "number": number})
+            if file.tell() != size or (row.sha256 is not None and digest.hexdigest() != row.sha256):
+                raise SettingsError(f"{path}: damaged: it is not what the database says; delete that upload first")
+
+    def _copy_result(self, folder: str, assets: list[Asset]) -> None:
+        output = self._storage.results / folder
+        for asset in assets:
+            if hash_file(output / asset.name) != (asset.size, asset.sha256):
+                raise SettingsError(f"{output / asset.name}: damaged: it is not what the database says; delete its job")
+        if not all(_is_there(self._results, folder, asset) for asset in assets):
+            self._results.publish(output, folder, assets)
+            self.bytes += sum(asset.size for asset in assets)
+
+
+def _is_there(store: ResultStore, name: str, asset: Asset) -> bool:
+    """Whether an earlier attempt has copied the file to its last byte."""
+    with suppress(StoreError, FileNotFoundError):
+        return len(store.read(name, asset.name, max(asset.size - 1, 0), min(asset.size, 1))) == min(asset.size, 1)
+    return False
+
+
+def _need_empty(session: Session, name: str) -> None:
+    """Raises SettingsError."""
+    for table in Base.metadata.sorted_tables:
+        if table.name != CounterRow.__tablename__ and session.scalar(select(func.count()).select_from(table)):
+            raise SettingsError(f"{name}: its table {table.name} has rows; give an empty database")
+
+
+def _copy_tables(source: Database, target: Database, copied: FileCopy | None) -> MoveReport:
     """All rows in one transaction, or none."""
     tables = Base.metadata.sorted_tables
     counts: dict[str, int] = {}
     with source.read() as old, target.write() as new:
         target.lock(new, "migration")
-        for table in tables:
-            if table.name != CounterRow.__tablename__ and new.scalar(select(func.count()).select_from(table)):
-                raise SettingsError(f"{target.name}: its table {table.name} has rows; give an empty database")
+        _need_empty(new, target.name)
         new.execute(delete(CounterRow))  # the marks of its own migration, which the old one has, too
         for table in tables:
-            counts[table.name] = _copy_table(old, new, table)
+            adapt = copied.adapt if copied is not None and table.name == JobRow.__tablename__ else dict
+            counts[table.name] = _copy_table(old, new, table, adapt)
             _continue_numbers(new, table)
-    return MoveReport(counts[JobRow.__tablename__], counts[FileRow.__tablename__], sum(counts.values()))
+        if copied is not None and copied.parts:
+            new.execute(insert(UploadPartRow), copied.parts)
+    size = 0 if copied is None else copied.bytes
+    return MoveReport(counts[JobRow.__tablename__], counts[FileRow.__tablename__], sum(counts.values()), size)
 
 
 def _continue_numbers(session: Session, table: Table) -> None:
@@ -212,10 +314,10 @@ def _continue_numbers(session: Session, table: Table) -> None:
         session.execute(select(func.setval(sequence, highest + 1, False)))
 
 
-def _copy_table(old: Session, new: Session, table: Table) -> int:
+def _copy_table(old: Session, new: Session, table: Table, adapt: Callable[[dict[str, Any]], dict[str, Any]]) -> int:
     count = 0
     found = old.execute(select(table).execution_options(yield_per=BATCH))
     for batch in found.mappings().partitions():
-        new.execute(insert(table), [dict(row) for row in batch])
+        new.execute(insert(table), [adapt(dict(row)) for row in batch])
         count += len(batch)
     return count

@@ -155,12 +155,16 @@ def back_up_folder(settings: Settings, target: Path) -> int:
 
 
 def move_database(settings: Settings, url: str) -> int:
-    """Move the database of the data folder to PostgreSQL and show what was moved. Raises SettingsError."""
+    """Move the data folder to PostgreSQL, and to the store that is set; show what was moved. Raises SettingsError."""
     report = move(settings, url)
-    sys.stdout.write(
-        f"{report.jobs} jobs, {report.uploads} uploads, {report.rows} rows; start with HSLOC_DATABASE_URL and the same "
-        "--data, which keeps uploads and results\n"
-    )
+    counts = f"{report.jobs} jobs, {report.uploads} uploads, {report.rows} rows"
+    if settings.store_url:
+        rest = (
+            f"{report.copied} bytes copied to {settings.store_url}; start with HSLOC_DATABASE_URL and HSLOC_STORE_URL"
+        )
+    else:
+        rest = "start with HSLOC_DATABASE_URL and the same --data, which keeps uploads and results"
+    sys.stdout.write(f"{counts}; {rest}\n")
     return 0
 
 

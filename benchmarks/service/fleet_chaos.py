@@ -163,11 +163,15 @@ class Handler(BaseHTTPRequestHandler):
         pass
 
 
-def submit_all(client: Client, count: int, seed: int, hook: str, accepted: dict[str, tuple[int, str]]) -> None:
+def submit_all(
+    client: Client, count: int, seed: int, hook: str, accepted: dict[str, tuple[int, str]], until: float
+) -> None:
     """Upload and submit, as a client that tries again; one in ten is cancelled soon after."""
     rng = random.Random(seed)
     path = Path(tempfile.gettempdir()) / f"fleet-{os.getpid()}-{seed}.mcap"
     for k in range(count):
+        if time.monotonic() > until:
+            break
         path.write_bytes(f"slow {rng.uniform(0.5, 3.0):.3f} {k} ".encode() + rng.randbytes(50_000))
         number = seed * 100_000 + k
         job = client.submit(client.upload(path), seed=number, webhook=hook)
@@ -229,6 +233,7 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=3)
     parser.add_argument("--lease-s", type=float, default=LEASE_S)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=60.0, help="Submit and mistreat for so long at most.")
     parser.add_argument("--network", action="store_true", help="Network namespaces and S3; needs root and moto.")
     arguments = parser.parse_args()
     folder, rng = Path(tempfile.mkdtemp(prefix="hsloc-fleet-")), random.Random(arguments.seed)
@@ -250,15 +255,16 @@ def main() -> int:
         fleet = Fleet(folder, database, arguments.workers, arguments.lease_s, network, store, clock)
         stack.callback(kill_all, *fleet.servers, *fleet.workers)
         begin = time.monotonic()
+        until = begin + 60.0 * arguments.minutes
         clients = []
         for k, server in enumerate(fleet.servers):
             client = Client(server.url, attempts=300, timeout_s=10.0, block=20_000)
             client.request("GET", "/healthz")  # a server that never answered is given up sooner
-            work = (client, arguments.jobs // 2, arguments.seed * 10 + k, hook, accepted)
+            work = (client, arguments.jobs // 2, arguments.seed * 10 + k, hook, accepted, until)
             clients.append(threading.Thread(target=submit_all, args=work, daemon=True))
             clients[-1].start()
         done: Counter[str] = Counter()
-        while sum(done.values()) < arguments.kills:
+        while sum(done.values()) < arguments.kills and time.monotonic() < until:
             time.sleep(rng.uniform(0.05, 1.5))
             done[fleet.mistreat(rng)] += 1
         for thread in clients:

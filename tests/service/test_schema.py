@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import ast
-import errno
 import sqlite3
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 from fastapi.testclient import TestClient
 from live_service import settings, wait
 from sqlalchemy import event
-from sqlalchemy.exc import OperationalError
 
 from hsloc_service.auth import ANYBODY
 from hsloc_service.db import database, migrations
-from hsloc_service.db.database import Database, is_unreachable
+from hsloc_service.db.database import Database
 from hsloc_service.db.tables import SCHEMA_VERSION
 from hsloc_service.http.app import create_app
 from hsloc_service.settings import SettingsError
 from hsloc_service.uploads.repository import need_quota
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
-    from postgresql import Server
     from sqlalchemy import Connection
 
 FIRST = Path(__file__).parent / "schema1.sql"
@@ -252,34 +249,3 @@ def test_a_full_disk_does_not_keep_a_server_from_starting(old: Path, monkeypatch
     full = True
     with pytest.raises(SettingsError, match="disk is full; make room on its disk"):
         Database(old)
-
-
-def test_a_socket_that_fails_is_a_database_that_is_away(postgresql: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As an OSError it would be taken for a disk that is full, and end a job whose results are there."""
-    psycopg = pytest.importorskip("psycopg")
-    database = Database(postgresql.new_database())
-
-    def broken(owner: Any, name: str, connection: Callable[[Any], Any], at: int = 1) -> list[Exception]:
-        real, calls, errors = getattr(owner, name), list[str](), list[Exception]()
-
-        def fail(self: Any, *arguments: Any, **options: Any) -> Any:
-            calls.append(name)
-            if len(calls) == at:
-                connection(self).close()
-                raise OSError(errno.EINVAL, "Invalid argument")
-            return real(self, *arguments, **options)
-
-        with monkeypatch.context() as context:
-            context.setattr(owner, name, fail)
-            for _ in range(2):
-                try:
-                    with database.write() as session:
-                        assert database.now(session) > 0.0
-                except OperationalError as error:
-                    errors.append(error)
-        return errors
-
-    assert broken(psycopg.Cursor, "execute", lambda cursor: cursor.connection) == []  # the pool takes another
-    assert [is_unreachable(each) for each in broken(psycopg.Cursor, "execute", lambda c: c.connection, 2)] == [True]
-    assert [is_unreachable(each) for each in broken(psycopg.Connection, "commit", lambda each: each)] == [True]
-    database.close()

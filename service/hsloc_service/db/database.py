@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from sqlalchemy import Connection
-    from sqlalchemy.engine import ExceptionContext
 
     from hsloc_service.settings import Settings
 
@@ -230,40 +229,7 @@ def _engine(where: Path | str) -> tuple[Engine, str]:
         )
     except ModuleNotFoundError as error:
         raise SettingsError(f"HSLOC_DATABASE_URL is {name}: pip install 'hsloc[postgresql]'") from error
-    _type_errors(engine)
     return engine, name
-
-
-def _type_errors(engine: Engine) -> None:
-    """Let what psycopg passes on of a socket be an OperationalError: the connection was lost.
-
-    It waits for a file descriptor that libpq may have closed meanwhile. An OSError would be taken for a full disk, and
-    the results of a job thrown away.
-    """
-    driver: Any = engine.dialect.loaded_dbapi
-    ping: Callable[[Any], bool] = engine.dialect.do_ping
-
-    @event.listens_for(engine, "do_connect")
-    def connect(dialect: Any, _record: Any, arguments: Any, options: Any) -> Any:
-        try:
-            return dialect.connect(*arguments, **options)
-        except OSError as error:
-            raise driver.OperationalError(str(error)) from error
-
-    @event.listens_for(engine, "handle_error")
-    def handle(context: ExceptionContext) -> None:
-        error = context.original_exception
-        if isinstance(error, OSError):
-            context.is_disconnect = True
-            raise OperationalError(context.statement, context.parameters, error, connection_invalidated=True) from error
-
-    def is_alive(connection: Any) -> bool:
-        try:
-            return ping(connection)
-        except OSError:
-            return False
-
-    engine.dialect.do_ping = is_alive  # type: ignore[assignment, method-assign]
 
 
 def _lock_key(name: str) -> int:

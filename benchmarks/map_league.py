@@ -1,12 +1,13 @@
 """Maps of simulated drives: errors, verdicts, and whether the covariances hold.
 
-    python benchmarks/map_league.py [--first SEED] [--count N] [--slips]
+    python benchmarks/map_league.py [--first SEED] [--count N] [--slips] [--random]
 
-Each seed draws a world, a range (8 to 20 m), a noise of the ranges (1 to 3 cm), an odometry, a number of laps and, with
---slips, one to six moments in which the odometry counts 0.3 to 1 m, or 20 to 90 deg, that were not driven. A line for
-each drive: error of the keyscans relative to the first (rmse and largest), their standard deviation, the mean
-normalised error squared (3 is expected), and the verdict. Then means over all drives, with the coverage of the
-ellipsoids.
+Each seed draws a world (one that is built in or, with --random, one of `random_worlds`), a range (8 to 20 m), a noise
+of the ranges (1 to 3 cm), an odometry, a number of laps and, with --slips, one to six moments in which the odometry
+counts 0.3 to 1 m, or 20 to 90 deg, that were not driven. With --random people walk about in a third of the drives, and
+in a sixth a door is closed behind the robot. A line for each drive: error of the keyscans relative to the first (rmse
+and largest), their standard deviation, the mean normalised error squared (3 is expected), and the verdict. Then means
+over all drives, with the coverage of the ellipsoids.
 """
 
 from __future__ import annotations
@@ -18,22 +19,25 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from random_worlds import random_world
 
 from hsloc.config import Config
 from hsloc.evaluation.association import interpolate_poses
-from hsloc.model import Trajectory, Truth, wrap_angles
+from hsloc.model import Scan, Trajectory, Truth, wrap_angles
 from hsloc.model.pose2 import relative_poses
 from hsloc.replay.engine import replay
 from hsloc.simulation import presets
 from hsloc.simulation.built_in import built_in
 from hsloc.simulation.odometer import OdometryNoise, Slip
+from hsloc.simulation.scenario import Scenario
 from hsloc.simulation.simulator import events
 from hsloc.slam.mapper import Mapper
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hsloc.simulation.scenario import Scenario
+    from hsloc.model import Event
+    from hsloc.simulation.world import World
     from hsloc.slam.result import MappingResult
 
 WORLDS = ("corridor-loop", "corridor-loop", "figure-of-eight", "office", "hall", "symmetric-corridor")
@@ -72,10 +76,58 @@ def slip(random: np.random.Generator, duration: float, speed: float) -> Slip:
     return Slip(at, seconds, 1.0, angle / seconds)
 
 
-def mapped(drive: Scenario) -> tuple[MappingResult, NDArray[np.float64]]:
+def random_scenario(seed: int, with_slips: bool) -> tuple[Scenario, World, float | None]:
+    """A drive in a random world, and when in it a door is closed, if one is."""
+    random = np.random.default_rng((seed, 1))
+    world = random_world(random)
+    sensor = replace(
+        (presets.WIDE, presets.AHEAD)[random.integers(2)],
+        range_max=float(random.choice([6.0, 8.0, 12.0, 20.0])),
+        range_noise=float(random.choice([0.01, 0.02, 0.03])),
+    )
+    odometry = (OdometryNoise(), presets.DRIFTING)[random.integers(2)]
+    laps = float(random.choice([0.9, 1.05, 1.3, 2.05]))
+    robot = replace(presets.BRISK, speed=float(random.choice([0.6, 1.2])))
+    duration = world.lap_length() * laps / robot.speed
+    longest = 150.0
+    if duration > longest:
+        laps, duration = laps * longest / duration, longest
+    slips = tuple(slip(random, duration, robot.speed) for _ in range(random.integers(1, 7))) if with_slips else ()
+    people = int(random.choice([0, 0, 2]))
+    closed_at = float(random.uniform(0.2, 0.7) * duration) if random.random() < 1.0 / 6.0 else None
+    name = world.name
+    drive = Scenario(
+        name, seed=seed, robot=robot, sensor=sensor, odometry=odometry, laps=laps, people=people, slips=slips
+    )
+    return drive, world, closed_at
+
+
+def with_a_door_closed(drive: Scenario, world: World, at_s: float) -> list[Event]:
+    """The drive's events; from `at_s` on a door stands across the path where the robot was two seconds before."""
+    log = list(events(drive, world))
+    at_ns = drive.start_stamp_ns + round(at_s * 1e9)
+    truths = [event for event in log if isinstance(event, Truth) and event.stamp_ns <= at_ns - 2_000_000_000]
+    pose = truths[-1].T_map_base
+    door = (pose @ np.array(((0.0, -0.48), (0.0, 0.48)))).reshape(1, 4)
+    closed = replace(world, segments=np.vstack((world.segments, np.round(door, 6))))
+    later = events(drive, closed)
+    return [b if isinstance(a, Scan) and a.stamp_ns >= at_ns else a for a, b in zip(log, later, strict=True)]
+
+
+def recorded(seed: int, with_slips: bool, is_random: bool) -> tuple[Scenario, list[Event]]:
+    """The drive of a seed, and its events."""
+    if not is_random:
+        drive = scenario(seed, with_slips)
+        return drive, list(events(drive, built_in(drive.world)))
+    drive, world, closed_at = random_scenario(seed, with_slips)
+    if closed_at is None:
+        return drive, list(events(drive, world))
+    return drive, with_a_door_closed(drive, world, closed_at)
+
+
+def mapped(log: list[Event]) -> tuple[MappingResult, NDArray[np.float64]]:
     """The map, and the true poses of its keyscans (n, 3) relative to the first."""
     mapper = Mapper(Config().graph_mapper, np.random.default_rng(0))
-    log = list(events(drive, built_in(drive.world)))
     truth = [event for event in log if isinstance(event, Truth)]
     for _ in replay(log, mapper):
         pass
@@ -92,12 +144,13 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--slips", action="store_true")
+    parser.add_argument("--random", action="store_true")
     arguments = parser.parse_args()
     means, verdicts = [], Counter[tuple[str, str]]()
     for seed in range(arguments.first, arguments.first + arguments.count):
         begin = time.process_time()
-        drive = scenario(seed, arguments.slips)
-        result, truth = mapped(drive)
+        drive, log = recorded(seed, arguments.slips, arguments.random)
+        result, truth = mapped(log)
         error = result.keyscan_poses - truth
         error[:, 2] = wrap_angles(error[:, 2])
         covariances = result.keyscan_covariances

@@ -18,7 +18,7 @@ from hsloc.slam.loop_closer import TORN, LoopCloser, loop_edges
 from hsloc.slam.map_extension import connect, unconnected
 from hsloc.slam.map_session import LEFT_THE_MAP
 from hsloc.slam.map_state import MapState, fingerprint
-from hsloc.slam.marginals import all_edges, marginal_covariances
+from hsloc.slam.marginals import all_edges, marginal_covariances, observed_terms
 from hsloc.slam.occupancy_mapper import build_grid
 from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
 from hsloc.slam.result import MappingQuality, MappingResult
@@ -95,14 +95,17 @@ def finish_session(
         raise MapError(unconnected(extended))
     edges = Edges.concatenate([gathered.steps, loop_edges])
     refined, passes = _refine(poses, gathered.scans, edges, parameters, lambda part: report(0.5 + 0.4 * part))
-    stretches = compare_with_odometry(refined, gathered.steps)
+    arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
+    observed = observed_terms(refined, arrays)
+    stretches = compare_with_odometry(refined, gathered.steps, arrays, observed)
     if parameters.use_odometry and stretches.contradicted.any():
         steps = without_slips(gathered.steps, stretches.slipped(len(gathered.steps)))
         gathered = replace(gathered, steps=steps)
         edges = Edges.concatenate([steps, loop_edges])
         refined, more = _refine(refined.poses, gathered.scans, edges, _near_the_end(parameters), _silent, refined)
         passes += more
-    covariances = marginal_covariances(refined, edges)
+        observed = observed_terms(refined, arrays)
+    covariances = marginal_covariances(refined, observed, edges)
     grid = build_grid(refined.poses, gathered.scans, parameters.occupancy)
     report(1.0)
     of_log = refined.poses[gathered.first :]
@@ -119,7 +122,7 @@ def finish_session(
         keyscan_covariances=covariances,
         odometry_covariances=odometry_covariances,
         scan_covariances=scan_covariances,
-        graph=PoseGraph(gathered.stamps_ns, refined.poses, all_edges(refined, edges)),
+        graph=PoseGraph(gathered.stamps_ns, refined.poses, all_edges(refined, observed, edges)),
         loops=tuple(loops),
         submap_references=gathered.places.reference,
         quality=_quality(refined, covariances, passes, loops, loop_edges, grid, gathered.scans, track.anchored),

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from room_scans import DEGREE, room_scan, terms
 
 from hsloc.kernels.point_to_line import bearing, choose_hits
+from hsloc.kernels.wall_agreement import add_information, displaced_agreement
 from hsloc.model import Pose2, Scan
 from hsloc.slam.keyscans import KeyScan, KeyScans
 
@@ -119,3 +121,48 @@ def test_what_lies_beyond_a_short_range_was_not_looked_through() -> None:
     near = KeyScans.from_scans([KeyScan.of(room_scan(Pose2(3.5, 2.0, 0.0))), KeyScan.of(short)])
     _, _, counts = terms(near, 0, 1, (0.0, 0.0, 0.0))
     assert counts[1] > 10, "a wall 2.5 m ahead was looked through"
+
+
+def information_of_both_normals(scans: KeyScans, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    information = np.empty((3, 3))
+    add_information(1, 0, pose, scans.arrays(10_000), 0.3, 1e6, information)
+    return information
+
+
+def corridor(noise: float) -> tuple[KeyScans, NDArray[np.float64]]:
+    """The room's walls without those at its ends: a corridor 4 m wide."""
+    poses = [Pose2(2.0, 1.5, 0.1), Pose2(3.0, 1.8, -0.1)]
+    kept = []
+    for seed, pose in enumerate(poses):
+        scan = room_scan(pose, beams=361, noise=noise, seed=seed)
+        walls = np.abs((pose @ scan.points_base())[:, 1] - 2.0) > 1.9
+        kept.append(KeyScan.of(replace(scan, ranges=np.where(walls, scan.ranges, np.nan).astype(np.float32))))
+    return KeyScans.from_scans(kept), poses[0].between(poses[1]).to_array()
+
+
+def test_without_noise_both_normals_give_the_information_of_one(two: tuple[KeyScans, NDArray[np.float64]]) -> None:
+    scans, true = two
+    information, _, _ = terms(scans, 1, 0, true)
+    np.testing.assert_allclose(information_of_both_normals(scans, true), information, rtol=0.02, atol=0.5)
+
+
+def test_noise_of_normals_is_no_information_along_a_bare_corridor() -> None:
+    scans, true = corridor(0.02)
+    along = np.array((np.cos(0.1), -np.sin(0.1), 0.0))
+    of_one, of_both = terms(scans, 1, 0, true)[0], information_of_both_normals(scans, true)
+    assert along @ of_one @ along > 0.15
+    assert abs(along @ of_both @ along) < 0.3 * (along @ of_one @ along)
+
+
+@pytest.mark.parametrize("is_bare", [False, True])
+def test_a_displaced_scan_agrees_less_unless_the_corridor_is_bare(
+    two: tuple[KeyScans, NDArray[np.float64]], is_bare: bool
+) -> None:
+    scans, true = corridor(0.0) if is_bare else two
+    first = Pose2(2.0, 1.5, 0.1 if is_bare else 0.3)
+    poses = np.array((first.to_array(), (first @ Pose2.from_array(true)).to_array()))
+    agreement = np.empty(2)
+    groups = (np.array([0]), np.array([1]))
+    displaced_agreement(poses, groups, np.array(((0.0, 0.0), (0.5, 0.0))), scans.arrays(10_000), 0.15, 0.05, agreement)
+    assert agreement[0] > 0.95
+    assert agreement[0] - agreement[1] < 0.02 if is_bare else agreement[0] - agreement[1] > 0.3

@@ -40,7 +40,7 @@ def lap() -> Recorded:
 def stretches(sigma: np.ndarray, normalised: np.ndarray) -> Stretches:
     """Three stretches, of which the first two overlap."""
     ends = np.array([(40, 60), (45, 65), (120, 140)])
-    return Stretches(ends, np.zeros((3, 3)), normalised, sigma)
+    return Stretches(ends, np.zeros((3, 3)), normalised, sigma, np.zeros(3), np.full(3, np.inf))
 
 
 def test_slips_and_stretches_in_which_none_would_be_noticed_are_named(lap: Recorded) -> None:
@@ -52,6 +52,12 @@ def test_slips_and_stretches_in_which_none_would_be_noticed_are_named(lap: Recor
     (reason,) = weigh(replace(lap, stretches=stretches(np.array((0.2, 0.3, 0.2)), np.ones(3)))).reasons
     assert reason.code == "unobserved"
     np.testing.assert_allclose(reason.times_s, ((39.0, 65.0), (119.0, 140.0)))
+    hidden = stretches(np.array((0.2, 0.3, 0.2)), np.ones(3))
+    assert codes(replace(lap, stretches=replace(hidden, margin=np.full(3, 0.1)))) == ("good", []), "displaced fits less"
+    held = replace(hidden, visits_sigma=np.full(3, 0.02))
+    assert codes(replace(lap, stretches=held)) == ("good", []), "other visits hold both ends"
+    contradicted = replace(held, normalised=np.full(3, 9.0))
+    assert codes(replace(lap, stretches=contradicted))[1] == ["slip"], "a visit may be of a place that looks alike"
 
 
 def codes(recorded: Recorded) -> tuple[str, list[str]]:
@@ -95,7 +101,7 @@ def test_scans_around_refused_steps_may_agree_after_all(
 
 @pytest.mark.parametrize(
     ("sigma", "conflict", "wanted"),
-    [(0.01, 1.0, []), (0.1, 1.0, ["open-joint", "odometry"]), (0.01, 60.0, ["open-joint", "odometry"])],
+    [(0.01, 1.0, []), (0.1, 1.0, ["open-joint", "odometry"]), (0.01, 60.0, ["open-joint", "stray-scan", "odometry"])],
 )
 def test_a_slip_that_the_scans_measured_step_by_step_is_no_doubt(
     lap: Recorded, sigma: float, conflict: float, wanted: list[str]
@@ -113,7 +119,9 @@ def test_a_slip_that_the_scans_measured_step_by_step_is_no_doubt(
         odometry=odometry,
         pairs=np.vstack((lap.pairs, np.column_stack((steps, steps + 1)))),
         counts=np.vstack((lap.counts, counts)),
-        stretches=Stretches(np.array([(110, 190)]), np.zeros((1, 3)), np.array((9.0,)), np.array((sigma,))),
+        stretches=Stretches(
+            np.array([(110, 190)]), np.zeros((1, 3)), np.array((9.0,)), np.array((sigma,)), np.zeros(1), np.zeros(1)
+        ),
     )
     assert codes(slipped)[1] == wanted
 
@@ -138,6 +146,14 @@ def test_a_person_who_stands_in_the_way_is_no_wrong_map(lap: Recorded) -> None:
     counts = lap.counts.copy()
     counts[20:22, :2] = (50.0, 100.0)
     assert codes(replace(lap, counts=counts)) == ("good", [])
+
+
+def test_a_refused_scan_that_does_not_fit_is_named(lap: Recorded) -> None:
+    refused, counts = lap.refused.copy(), lap.counts.copy()
+    counts[50, :2] = (70.0, 30.0)
+    assert codes(replace(lap, counts=counts)) == ("good", []), "people stand in the way of a scan that was believed"
+    refused[50] = True
+    assert codes(replace(lap, counts=counts, refused=refused)) == ("check", ["stray-scan"])
 
 
 def test_odometry_that_contradicts_is_told_where_no_loop_spans(lap: Recorded) -> None:

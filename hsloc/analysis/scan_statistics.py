@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.kernels.beams import look_up
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2
@@ -72,12 +73,9 @@ class Residuals:
 
     def distances(self, scan: Scan, T_map_base: Pose2) -> NDArray[np.float32]:
         """Distance of each point of a scan (n,) to the nearest occupied cell [m]; outside the map, the largest one."""
-        local = (self._T_grid_map @ T_map_base) @ scan.points_base()
-        cells = np.floor(local / self._grid.resolution).astype(np.int64)
-        height, width = self._distance.shape
-        inside = (cells[:, 0] >= 0) & (cells[:, 0] < width) & (cells[:, 1] >= 0) & (cells[:, 1] < height)
-        distance = np.full(len(cells), _MAX_DISTANCE_M, dtype=np.float32)
-        distance[inside] = self._distance[cells[inside, 1], cells[inside, 0]]
+        points, pose = scan.points_base(), (self._T_grid_map @ T_map_base).to_array()
+        distance = np.empty(len(points), dtype=np.float32)
+        look_up(self._distance, points, pose, self._grid.resolution, _MAX_DISTANCE_M, distance)
         return distance
 
     def add(self, scan: Scan, distance: NDArray[np.float32]) -> None:

@@ -132,6 +132,21 @@ def classify_beams(
 
 
 @njit(cache=True, nogil=True)
+def look_up(values: F32, points: F64, pose: F64, cell: float, outside: float, found: F32) -> None:
+    """Write the value of the cell that each of the points (n, 2), seen from `pose` (3,), lies in to `found` (n,).
+
+    `values` (h, w) are those of cells of side `cell` (m) from the origin on; `outside` stands for those beyond.
+    """
+    height, width = values.shape
+    c = cos(pose[2])
+    s = sin(pose[2])
+    for i in range(len(points)):
+        u = floor((pose[0] + c * points[i, 0] - s * points[i, 1]) / cell)
+        v = floor((pose[1] + s * points[i, 0] + c * points[i, 1]) / cell)
+        found[i] = values[v, u] if 0 <= u < width and 0 <= v < height else np.float32(outside)
+
+
+@njit(cache=True, nogil=True)
 def wall_normals(points: F64, max_gap: float, noise_variance: float, normals: F64) -> None:
     """Write the unit normal of the wall of each of the points (n, 2), in the order of the beams, into `normals` (n, 2).
 

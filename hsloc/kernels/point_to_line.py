@@ -72,6 +72,25 @@ class Term(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
+def list_beams(ranges: F32, limits: F32, beams: I32, hit_of_beam: I32, clean: F32) -> int:
+    """Write the beams that hit to `beams` (n,), for each beam its hit or -1, and `clean` ranges; returns how many hit.
+
+    A hit is within the `limits` (2,), both included. Of the others those without a return stay infinite; what is
+    invalid becomes NaN.
+    """
+    count = 0
+    for k in range(len(ranges)):
+        value = ranges[k]
+        is_hit = np.isfinite(value) and limits[0] <= value <= limits[1]
+        hit_of_beam[k] = count if is_hit else -1
+        clean[k] = value if is_hit or value == np.inf else np.float32(np.nan)
+        if is_hit:
+            beams[count] = k
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
 def fit_surfels(
     points: F32, beams: I32, spacing: float, radius: float, normals: F32, centroids: F32, origin: F64
 ) -> None:

@@ -70,6 +70,8 @@ class Scene(NamedTuple):
     first_moving: int
     scan_poses: F64
     """Of the fixed scans in the map, of the moving ones as seen from the pose that is sought, shape (n, 3)."""
+    rows: I64
+    """Which of `scans` each of the n is."""
     scans: ScanArrays
 
 
@@ -115,8 +117,8 @@ def add_pairs(pose: F64, scene: Scene, gate: float, p: RegistrationParameters, t
         pull[:] = 0.0
         for m in range(first_moving):
             for direction in range(2):
-                i = k if direction == 0 else m
-                j = m if direction == 0 else k
+                i = scene.rows[k if direction == 0 else m]
+                j = scene.rows[m if direction == 0 else k]
                 if direction == 0:
                     relative(scan_poses[m], moved, rel)
                 else:

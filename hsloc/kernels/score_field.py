@@ -14,7 +14,7 @@ hsloc/kernels/fitness.py.
 from __future__ import annotations
 
 from math import cos, exp, hypot, sin, sqrt
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
     F32 = NDArray[np.float32]
     F64 = NDArray[np.float64]
+    U8 = NDArray[np.uint8]
 
 _EMPTY = -(1 << 62)
 """A column of cells that no point lies in."""
@@ -106,21 +107,51 @@ def decay_table(sigma: float, radius: float) -> F32:
 
 
 @njit(cache=True, nogil=True)
-def splat(scores: F32, packed: F32, points: F32, table: F32, radius: float, known: float) -> int:
-    """Add points (n, 2) to `scores` (h, w) and bring `packed` (h - 1, w - 1, 4) up to date around them.
+def bounds(points: F64) -> tuple[float, float, float, float]:
+    """Least x and y, and largest x and y of points (n, 2), n at least 1."""
+    low_x = high_x = points[0, 0]
+    low_y = high_y = points[0, 1]
+    for i in range(1, len(points)):
+        low_x = min(low_x, points[i, 0])
+        high_x = max(high_x, points[i, 0])
+        low_y = min(low_y, points[i, 1])
+        high_y = max(high_y, points[i, 1])
+    return low_x, low_y, high_x, high_y
+
+
+class GrowingField(NamedTuple):
+    """Scores on the nodes of a map that grows; in this module because its type decides whether a kernel is cached."""
+
+    scores: F32
+    """Shape (h, w)."""
+    stale: U8
+    """Which tiles of 8 x 8 nodes changed since they were packed; node [v, u] lies in [(v + v0) // 8, (u + u0) // 8]."""
+    corner: I64
+    """Node [0, 0], counted in nodes from the origin of the map, (u, v): `u0` and `v0` are its remainders by 8."""
+    resolution: float
+    """Distance of two nodes [m]."""
+
+
+@njit(cache=True, nogil=True)
+def splat(field: GrowingField, points: F64, table: F32, radius: float, known: float) -> int:
+    """Add points (n, 2), in metres in the map, to the scores.
 
     `table` is `decay_table(sigma, radius)`; a node farther than `radius` from a point is not touched. A point whose
     nearest node already scores more than `known` is passed over: the map has it. Points outside are
     left out. Returns the number of points added.
     """
+    scores = field.scores
+    stale = field.stale
     height, width = scores.shape
+    u0 = field.corner[0] % 8
+    v0 = field.corner[1] % 8
     reach = int(radius) + 1
     added = 0
     steps = np.float32(_STEPS)
     limit = np.float32(radius * radius)
     for i in range(len(points)):
-        x = points[i, 0]
-        y = points[i, 1]
+        x = np.float32(points[i, 0] / field.resolution - field.corner[0])
+        y = np.float32(points[i, 1] / field.resolution - field.corner[1])
         if not (x > reach and y > reach and x < width - 2 - reach and y < height - 2 - reach):
             continue
         iu = int(x + np.float32(0.5))
@@ -136,8 +167,59 @@ def splat(scores: F32, packed: F32, points: F32, table: F32, radius: float, know
                 if squared <= limit:
                     score = table[int(squared * steps)]
                     scores[v, u] = max(scores[v, u], score)
-        pack(scores, packed, iv - reach - 1, iv + reach + 1, iu - reach - 1, iu + reach + 1)
+        for v in range((iv - reach + v0) >> 3, ((iv + reach + v0) >> 3) + 1):
+            for u in range((iu - reach + u0) >> 3, ((iu + reach + u0) >> 3) + 1):
+                stale[v, u] = 1
     return added
+
+
+@njit(cache=True, nogil=True)
+def pack_stale(field: GrowingField, packed: F32) -> None:
+    """Bring `packed` (h - 1, w - 1, 4) up to date where the scores have changed."""
+    height, width = field.scores.shape
+    u0 = field.corner[0] % 8
+    v0 = field.corner[1] % 8
+    rows, columns = field.stale.shape
+    for v in range(rows):
+        for u in range(columns):
+            if field.stale[v, u]:
+                field.stale[v, u] = 0
+                # The squares that have one of the tile's nodes as a corner.
+                low_v = max(8 * v - v0 - 1, 0)
+                low_u = max(8 * u - u0 - 1, 0)
+                high_v = min(8 * v - v0 + 8, height - 1)
+                high_u = min(8 * u - u0 + 8, width - 1)
+                pack(field.scores, packed, low_v, high_v, low_u, high_u)
+
+
+@njit(cache=True, nogil=True)
+def mean_score(field: GrowingField, points: F64, pose: F64) -> float:
+    """The `fitness` of points (n, 2), in metres, at a pose (x, y in nodes of the field, theta), without packing it."""
+    scores = field.scores
+    height, width = scores.shape
+    limit_u = np.float32(width - 1)
+    limit_v = np.float32(height - 1)
+    zero = np.float32(0.0)
+    c = np.float32(cos(pose[2]))
+    s = np.float32(sin(pose[2]))
+    x32 = np.float32(pose[0])
+    y32 = np.float32(pose[1])
+    total = np.float64(0.0)
+    for i in range(len(points)):
+        px = np.float32(points[i, 0] / field.resolution)
+        py = np.float32(points[i, 1] / field.resolution)
+        u = x32 + c * px - s * py
+        v = y32 + s * px + c * py
+        if u >= zero and u < limit_u and v >= zero and v < limit_v:
+            iu = np.int32(u)
+            iv = np.int32(v)
+            fu = u - np.float32(iu)
+            fv = v - np.float32(iv)
+            a = scores[iv, iu]
+            b = scores[iv, iu + 1] - a
+            d = scores[iv + 1, iu + 1] - scores[iv + 1, iu] - b
+            total += np.float64(a + fu * b + fv * ((scores[iv + 1, iu] - a) + fu * d))
+    return total / max(len(points), 1)
 
 
 @njit(cache=True, nogil=True)

@@ -53,6 +53,11 @@ class RangeRule:
         return self.largest if whole and self.repeats >= CLIP_REPEATS else None
 
     @property
+    def _first_special_cm(self) -> float:
+        """No reading up to this one (cm) is special."""
+        return NO_RETURN_CM - 1.0 if self.clip is None else min(100.0 * self.clip, NO_RETURN_CM) - 1.0
+
+    @property
     def range_max(self) -> float:
         """The largest range that can be measured, metres."""
         return NO_RETURN_CM / 100.0 if self.clip is None else self.clip
@@ -61,6 +66,8 @@ class RangeRule:
         """Readings with their special values as in ROS (REP 117)."""
         centimetres = ranges * np.float32(100.0)
         result = ranges.copy()
+        if not (centimetres > self._first_special_cm).any():
+            return result
         result[np.abs(centimetres - NO_RETURN_CM) < 0.5] = np.inf
         result[np.isfinite(ranges) & (centimetres > NO_RETURN_CM + 0.5)] = np.nan
         if self.clip is not None:

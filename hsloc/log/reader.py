@@ -48,6 +48,11 @@ class Log:
         """What the log holds and what is taken from it."""
         return self._summary
 
+    @property
+    def is_unpacked(self) -> bool:
+        """Whether it takes disk space for files that were unpacked, as long as it lives."""
+        return self._scratch is not None
+
     def events(self) -> Iterator[Event]:
         """All events in a total, repeatable order (see `hsloc.log.session.ordering`), with their own header stamps.
 

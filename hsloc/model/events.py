@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -88,14 +89,22 @@ class Scan:
     def points_base(self) -> NDArray[np.float64]:
         """The hits as points in the base's frame, metres, shape (m, 2), in the order of the beams."""
         hits = self.hits()
-        ranges = self.ranges[hits].astype(np.float64)
-        angles = self.angles()[hits]
-        points = self.T_base_laser @ np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))
+        directions = _directions(len(hits), self.angle_min, self.angle_increment)[hits]
+        points = self.T_base_laser @ (self.ranges[hits].astype(np.float64)[:, None] * directions)
         if self.T_base_beam is None:
             return points
         x, y, theta = self.T_base_beam[hits].T
         c, s = np.cos(theta), np.sin(theta)
         return np.column_stack((x + c * points[:, 0] - s * points[:, 1], y + s * points[:, 0] + c * points[:, 1]))
+
+
+@lru_cache(maxsize=16)
+def _directions(beams: int, angle_min: float, increment: float) -> NDArray[np.float64]:
+    """Unit vectors (n, 2) along the beams in the laser's frame: a lidar measures along the same ones in each scan."""
+    angles = angle_min + increment * np.arange(beams, dtype=np.float64)
+    directions = np.column_stack((np.cos(angles), np.sin(angles)))
+    directions.flags.writeable = False
+    return directions
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -53,7 +53,10 @@ class Pose2:
                 wrap_angle(self.theta + other.theta),
             )
         px, py = other[..., 0], other[..., 1]
-        return np.stack((self.x + c * px - s * py, self.y + s * px + c * py), axis=-1)
+        moved = np.empty((*px.shape, 2))
+        moved[..., 0] = self.x + c * px - s * py
+        moved[..., 1] = self.y + s * px + c * py
+        return moved
 
     def inverse(self) -> Pose2:
         """The other frame's pose in this one."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -101,6 +101,8 @@ class Result:
     ambiguities: tuple[Ambiguity, ...] = ()
     lidar_only: bool = False
     deskewed: bool = False
+    log: Log | None = field(default=None, repr=False)
+    """The log as it was opened, to be read once more; None where that would keep unpacked files on the disk."""
 
     def __repr__(self) -> str:
         scans, share = self.diagnostics, 100.0 * float(self.localised.mean()) if len(self.localised) else 0.0
@@ -262,6 +264,7 @@ def _run_with(
         ambiguities=history.ambiguities(states),
         lidar_only=lidar_only,
         deskewed=deskew,
+        log=None if log.is_unpacked else log,
     )
 
 

@@ -24,9 +24,9 @@ from hsloc.model.estimate import Status
 from hsloc.model.pose2 import IDENTITY, Pose2, rotated, wrap_angle
 from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive, Ratio
 from hsloc.slam.calibration import FLOOR, odometry_chi, odometry_scale
-from hsloc.slam.keyscans import SURPRISE, MovingScan, RecentScans, ScanRegistration, fused_covariance, moving_scans
 from hsloc.slam.known_map import KnownMap, KnownMapTracker
 from hsloc.slam.local_map import LocalMap
+from hsloc.slam.scan_registration import SURPRISE, RecentScans, fused_covariance, moving_scans
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     from hsloc.model.events import PairedScan
     from hsloc.slam.known_map import Anchor
+    from hsloc.slam.scan_registration import MovingScan, ScanRegistration
 
     F64 = NDArray[np.float64]
 
@@ -199,7 +200,7 @@ class FrontEnd:
         if not enough:
             found = LocalMatch(predicted, motion, covariance, Status.NO_RETURNS, False, reason=f"{len(points)} returns")
         else:
-            scans = moving_scans(paired)
+            scans = moving_scans(paired, points)
             near = points[np.hypot(*points.T) < p.local_range]
             on_map = self._followed(paired, near, scans, motion, covariance)
             if on_map is not None:
@@ -268,7 +269,7 @@ class FrontEnd:
         predicted = key @ motion
         in_map = rotated(covariance, key.theta)
         found, evaluations = self._search(points, scans, predicted, in_map)
-        fitness = self._maps[0][0].field.fitness(points, found.pose)
+        fitness = self._maps[0][0].fitness(points, found.pose)
         if reason := found.refusal():
             self._match_gate.refuse()
             if found.is_contradicted():
@@ -371,7 +372,7 @@ class FrontEnd:
     def _keep(self, paired: PairedScan, points: F64, found: LocalMatch) -> LocalMatch:
         """Make the scan a keyscan: add it to the local maps."""
         p = self._parameters
-        scans = found.scans or moving_scans(paired)
+        scans = found.scans or moving_scans(paired, points)
         self._way += self._length(found.motion)
         if self._match_gate.refusals >= p.restart_after:
             self._maps = []

@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.model.pose2 import Pose2, rotated
-from hsloc.slam.keyscans import MovingScan, register_onto, views
+from hsloc.slam.keyscans import views
+from hsloc.slam.scan_registration import MovingScan, register_onto
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hsloc.slam.keyscans import KeyScans, ScanRegistration
+    from hsloc.slam.keyscans import KeyScans
+    from hsloc.slam.scan_registration import ScanRegistration
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]

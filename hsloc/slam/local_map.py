@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.score_field import decay_table, splat
+from hsloc.kernels.score_field import GrowingField, bounds, decay_table, mean_score, pack_stale, splat
 from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.model.pose2 import Pose2
 
@@ -30,24 +30,34 @@ class LocalMap:
         self._radius = max_distance / resolution
         self._table = decay_table(sigma / resolution, self._radius)
         self._margin = int(self._radius) + 4
-        self._scores = np.zeros((0, 0), dtype=np.float32)
-        self._packed = np.zeros((0, 0, 4), dtype=np.float32)
-        self._corner = np.zeros(2, dtype=np.int64)
-        self._low = np.zeros(2)
-        self._high = np.zeros(2)
+        self._grown = GrowingField(
+            np.zeros((0, 0), dtype=np.float32),
+            np.zeros((1, 1), dtype=np.uint8),
+            np.zeros(2, dtype=np.int64),
+            resolution,
+        )
+        self._packed: F32 | None = None
         self.added = 0
 
     @property
     def field(self) -> LikelihoodField:
         """The field as it is now."""
-        corner = self._corner * self._resolution
-        pose = Pose2(float(corner[0]), float(corner[1]), 0.0)
-        return LikelihoodField(self._packed, self._resolution, pose, self._sigma)
+        if self._packed is None:
+            height, width = self._grown.scores.shape
+            self._packed = np.zeros((max(height - 1, 0), max(width - 1, 0), 4), dtype=np.float32)
+        pack_stale(self._grown, self._packed)
+        return LikelihoodField(self._packed, self._resolution, self._origin(), self._sigma)
 
     @property
     def scores(self) -> F32:
         """Scores on the nodes, shape (h, w)."""
-        return self._scores
+        return self._grown.scores
+
+    def fitness(self, points: F64, pose: Pose2) -> float:
+        """That of `field`, of points (n, 2) in metres, seen from `pose`; 0 for no point."""
+        origin = self._origin()
+        cells = np.array(((pose.x - origin.x) / self._resolution, (pose.y - origin.y) / self._resolution, pose.theta))
+        return float(mean_score(self._grown, points, cells))
 
     def add(self, points: F64, saturation_score: float = 0.98) -> int:
         """Add points (n, 2) in metres in the map's frame but those whose nearest node has `saturation_score` already.
@@ -57,16 +67,21 @@ class LocalMap:
         if len(points) == 0:
             return 0
         self._make_room(points)
-        cells = np.ascontiguousarray(points / self._resolution - self._corner, dtype=np.float32)
-        added = int(splat(self._scores, self._packed, cells, self._table, self._radius, saturation_score))
+        added = int(splat(self._grown, points, self._table, self._radius, saturation_score))
         self.added += added
         return added
 
+    def _origin(self) -> Pose2:
+        corner = self._grown.corner * self._resolution
+        return Pose2(float(corner[0]), float(corner[1]), 0.0)
+
     def _make_room(self, points: F64) -> None:
-        low = np.floor(points.min(axis=0) / self._resolution).astype(np.int64) - self._margin
-        high = np.ceil(points.max(axis=0) / self._resolution).astype(np.int64) + self._margin
-        height, width = self._scores.shape
-        old_low, old_high = self._corner, self._corner + np.array((width, height))
+        box = np.array(bounds(points)) / self._resolution
+        low = np.floor(box[:2]).astype(np.int64) - self._margin
+        high = np.ceil(box[2:]).astype(np.int64) + self._margin
+        grown = self._grown
+        height, width = grown.scores.shape
+        old_low, old_high = grown.corner, grown.corner + np.array((width, height))
         if height == 0:
             new_low, new_high = low, high
         elif (low >= old_low).all() and (high <= old_high).all():
@@ -77,13 +92,20 @@ class LocalMap:
             new_high = np.where(high > old_high, np.maximum(high, old_high) + spare, old_high)
         size = new_high - new_low
         scores = np.zeros((int(size[1]), int(size[0])), dtype=np.float32)
-        packed = np.zeros((int(size[1]) - 1, int(size[0]) - 1, 4), dtype=np.float32)
+        tiles = (new_high >> 3) - (new_low >> 3) + 1
+        stale = np.zeros((int(tiles[1]), int(tiles[0])), dtype=np.uint8)
         if height:
-            du, dv = (int(n) for n in old_low - new_low)
-            scores[dv : dv + height, du : du + width] = self._scores
-            packed[dv : dv + height - 1, du : du + width - 1] = self._packed
             # The old border is nowhere near a point: its score is zero, and so are the squares across it.
-        self._corner, self._scores, self._packed = new_low, scores, packed
+            du, dv = (int(n) for n in old_low - new_low)
+            scores[dv : dv + height, du : du + width] = grown.scores
+            tile_u, tile_v = (int(n) for n in (old_low >> 3) - (new_low >> 3))
+            rows, columns = grown.stale.shape
+            stale[tile_v : tile_v + rows, tile_u : tile_u + columns] = grown.stale
+            if self._packed is not None:
+                packed = np.zeros((int(size[1]) - 1, int(size[0]) - 1, 4), dtype=np.float32)
+                packed[dv : dv + height - 1, du : du + width - 1] = self._packed
+                self._packed = packed
+        self._grown = GrowingField(scores, stale, new_low, self._resolution)
 
 
 def field_of_points(points: F64, resolution: float, sigma: float, max_distance: float) -> LikelihoodField:

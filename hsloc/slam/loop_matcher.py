@@ -15,14 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.kernels.branch_and_bound import Excluded, Lattice, best_on_lattice, pool
-from hsloc.kernels.point_to_line import ScanArrays
 from hsloc.kernels.registration import Prior, RegistrationParameters, Scene, register
 from hsloc.matching.harmony_search import low_discrepancy_order
 from hsloc.matching.hide import Hide
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2, relative_poses
 from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive, Ratio
-from hsloc.slam.keyscans import starts_of
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -137,7 +135,7 @@ class LoopMatcher:
         self._scans = scans
         self._parameters = parameters
         self._rng = rng
-        self._chosen = scans.chosen(_COMPARED_HITS)
+        self._arrays = scans.arrays(_COMPARED_HITS)
         self._fields: dict[int, tuple[LikelihoodField, F32]] = {}
         self._last_cloud: tuple[int, F64] = (-1, np.zeros((0, 2)))
 
@@ -188,7 +186,7 @@ class LoopMatcher:
             for k, m in ((first, old), (second, new))
         ]
         pose, information, counts = start.to_array(), np.zeros((3, 3)), np.zeros(5)
-        scene = Scene(len(old), np.concatenate(seen_from), self._arrays(np.concatenate((old, new))))
+        scene = Scene(len(old), np.concatenate(seen_from), np.concatenate((old, new)), self._arrays)
         register(pose, scene, Prior(centre.to_array(), prior), _REGISTRATION, information, counts)
         seen = max(float(counts[2]), 1.0)
         return Pose2.from_array(pose), information, float(counts[0]) / seen, float(counts[1]) / seen
@@ -196,26 +194,6 @@ class LoopMatcher:
     def _members(self, place: int) -> NDArray[np.int64]:
         members = self._places.members(place, 1)
         return np.unique(np.linspace(members.start, members.stop - 1, _COMPARED_SCANS).astype(np.int64))
-
-    def _arrays(self, rows: NDArray[np.int64]) -> ScanArrays:
-        """The scans of those rows alone, one after the other."""
-        s = self._scans
-        chosen, chosen_start = self._chosen
-        hits = [slice(s.start[k], s.start[k + 1]) for k in rows]
-        beams = [slice(s.table_start[k], s.table_start[k + 1]) for k in rows]
-        picked = [chosen[chosen_start[k] : chosen_start[k + 1]] for k in rows]
-        return ScanArrays(
-            np.concatenate([s.points[part] for part in hits]),
-            np.concatenate([s.normals[part] for part in hits]),
-            np.concatenate([s.centroids[part] for part in hits]),
-            starts_of([part.stop - part.start for part in hits]),
-            np.concatenate([s.hit_of_beam[part] for part in beams]),
-            np.concatenate([s.ranges[part] for part in beams]),
-            starts_of([part.stop - part.start for part in beams]),
-            s.geometry[rows],
-            np.concatenate(picked),
-            starts_of([len(part) for part in picked]),
-        )
 
     def _cloud(self, place: int) -> F64:
         """Hits (n, 2) of a place in its frame; a place is searched for in several others in a row."""

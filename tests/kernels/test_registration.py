@@ -21,7 +21,7 @@ PARAMETERS = RegistrationParameters((0.3, 0.2, 0.15), 0.33, 100.0, np.inf, 10)
 
 
 def scene(first_moving: int, poses: F64, scans: KeyScans) -> Scene:
-    return Scene(first_moving, poses, scans.arrays(10_000))
+    return Scene(first_moving, poses, np.arange(len(poses)), scans.arrays(10_000))
 
 
 def naive_pairs(pose: F64, first_moving: int, scan_poses: F64, scans: KeyScans, gate: float) -> tuple[F64, F64, F64]:

@@ -11,8 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_edt
 
-from hsloc.kernels.fitness import pack
-from hsloc.kernels.score_field import column_distances, decay_table, splat, squared_distances, thinned_cloud
+from hsloc.kernels.fitness import fitness_many, pack
+from hsloc.kernels.score_field import (
+    GrowingField,
+    column_distances,
+    decay_table,
+    mean_score,
+    pack_stale,
+    splat,
+    squared_distances,
+    thinned_cloud,
+)
 from hsloc.model.pose2 import Pose2
 
 if TYPE_CHECKING:
@@ -60,11 +69,12 @@ def drawn(
     batches: int = 1,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], int]:
     scores, packed = np.zeros(shape, np.float32), np.zeros((shape[0] - 1, shape[1] - 1, 4), np.float32)
-    table = decay_table(sigma, radius)
-    count = sum(
-        splat(scores, packed, np.ascontiguousarray(part, np.float32), table, radius, known)
-        for part in np.array_split(points, batches)
-    )
+    table, corner = decay_table(sigma, radius), np.array((-13, 5))
+    field = GrowingField(scores, np.zeros((5, 5), np.uint8), corner, 0.5)
+    count = 0
+    for part in np.array_split(points, batches):
+        count += splat(field, (part + corner) * 0.5, table, radius, known)
+        pack_stale(field, packed)
     return scores, packed, count
 
 
@@ -97,6 +107,11 @@ def test_the_packed_field_is_that_of_all_scores_however_the_points_came() -> Non
     pack(scores, afresh, 0, packed.shape[0], 0, packed.shape[1])
     np.testing.assert_array_equal(packed, afresh)
     np.testing.assert_array_equal(scores, drawn(points)[0])
+    scaled = np.random.default_rng(5).normal(0.0, 6.0, (40, 2))
+    for pose in np.array([(14.0, 11.0, 0.3), (2.0, 20.0, -2.0)]):
+        field = GrowingField(scores, np.zeros((5, 5), np.uint8), np.zeros(2, np.int64), 0.5)
+        wanted = fitness_many(packed, scaled.astype(np.float32), pose[None])[0]
+        assert mean_score(field, 0.5 * scaled, pose) == wanted > 0.0
 
 
 def test_a_point_that_the_map_has_is_spared() -> None:

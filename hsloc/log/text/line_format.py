@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
+_DECIMALS = 9
+"""Decimals of a nanosecond."""
+
+
 class Line(NamedTuple):
     """Content of a line; ranges as written (metres)."""
 
@@ -38,6 +42,10 @@ class LineFormat(Protocol):
 
 def stamp_ns(seconds: str) -> int:
     """Decimal seconds as integer nanoseconds, exactly. Raises ValueError."""
+    whole, _, decimals = seconds.partition(".")
+    is_plain = 0 < len(whole) <= 10 and len(decimals) <= _DECIMALS and (whole + decimals).isdecimal()
+    if is_plain and int(whole) < 2**31:  # As nearly all stamps are written.
+        return int(whole) * 1_000_000_000 + int(decimals.ljust(_DECIMALS, "0"))
     try:
         value = Decimal(seconds)
         if not value.is_finite() or abs(value) >= 2**31:

@@ -111,14 +111,18 @@ class TextSource:
         if line.odometry is not None and (line.scan is not None) == self._laser_lines_count:
             yield line.odometry
         if line.scan is not None:
-            mounting = self._given_mounting or line.scan.T_base_laser
-            yield replace(
-                line.scan,
-                stamp_ns=line.scan.stamp_ns + self._scan_offset_ns,
-                ranges=self._code.apply(self._rule.apply(line.scan.ranges)),
+            scan = line.scan
+            yield Scan(  # All fields by name: a copy by `replace` takes as long as the line.
+                stamp_ns=scan.stamp_ns + self._scan_offset_ns,
+                ranges=self._code.apply(self._rule.apply(scan.ranges)),
+                angle_min=scan.angle_min,
+                angle_increment=scan.angle_increment,
                 range_min=RANGE_MIN,
-                range_max=line.scan.range_max or self._rule.range_max,
-                T_base_laser=mounting,
+                range_max=scan.range_max or self._rule.range_max,
+                time_increment=scan.time_increment,
+                T_base_laser=self._given_mounting or scan.T_base_laser,
+                frame_id=scan.frame_id,
+                intensities=scan.intensities,
             )
         if line.truth is not None:
             yield line.truth

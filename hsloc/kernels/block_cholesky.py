@@ -54,6 +54,29 @@ def factor_columns(start: I64, rows: I64, parent: I64, counts: I64) -> None:
 
 
 @njit(cache=True, nogil=True)
+def sum_blocks(order: I64, start: I64, diagonal: F64, off_diagonal: F64, sums: F64) -> None:
+    """Write the sums of groups of blocks to `sums` (k, 3, 3): group k has the numbers order[start[k] : start[k + 1]].
+
+    Numbered are the n of the `diagonal`, the m of `off_diagonal`, and the transposes of these.
+    """
+    n = len(diagonal)
+    m = len(off_diagonal)
+    for k in range(len(sums)):
+        for a in range(3):
+            for b in range(3):
+                total = 0.0
+                for p in range(start[k], start[k + 1]):
+                    block = order[p]
+                    if block < n:
+                        total += diagonal[block, a, b]
+                    elif block < n + m:
+                        total += off_diagonal[block - n, a, b]
+                    else:
+                        total += off_diagonal[block - n - m, b, a]
+                sums[k, a, b] = total
+
+
+@njit(cache=True, nogil=True)
 def factorise(start: I64, rows: I64, upper: F64, diagonal: F64, parent: I64, factor: Factor) -> None:
     """Write rows, lower blocks and inverse of `factor`, whose `start` is known.
 

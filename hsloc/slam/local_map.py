@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import ceil, floor
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
     F32 = NDArray[np.float32]
     F64 = NDArray[np.float64]
+    I64 = NDArray[np.int64]
 
 
 class LocalMap:
@@ -36,6 +38,7 @@ class LocalMap:
             np.zeros(2, dtype=np.int64),
             resolution,
         )
+        self._corner = 0, 0
         self._packed: F32 | None = None
         self.added = 0
 
@@ -72,20 +75,27 @@ class LocalMap:
         return added
 
     def _origin(self) -> Pose2:
-        corner = self._grown.corner * self._resolution
-        return Pose2(float(corner[0]), float(corner[1]), 0.0)
+        return Pose2(self._corner[0] * self._resolution, self._corner[1] * self._resolution, 0.0)
 
     def _make_room(self, points: F64) -> None:
-        box = np.array(bounds(points)) / self._resolution
-        low = np.floor(box[:2]).astype(np.int64) - self._margin
-        high = np.ceil(box[2:]).astype(np.int64) + self._margin
+        low_x, low_y, high_x, high_y = (value / self._resolution for value in bounds(points))
+        low = floor(low_x) - self._margin, floor(low_y) - self._margin
+        high = ceil(high_x) + self._margin, ceil(high_y) + self._margin
+        if self._covers(low, high):
+            return
+        self._grow(np.array(low, dtype=np.int64), np.array(high, dtype=np.int64))
+
+    def _covers(self, low: tuple[int, int], high: tuple[int, int]) -> bool:
+        # Python's own numbers: this is asked for each scan.
+        (u, v), (height, width) = self._corner, self._grown.scores.shape
+        return height > 0 and low[0] >= u and low[1] >= v and high[0] <= u + width and high[1] <= v + height
+
+    def _grow(self, low: I64, high: I64) -> None:
         grown = self._grown
         height, width = grown.scores.shape
         old_low, old_high = grown.corner, grown.corner + np.array((width, height))
         if height == 0:
             new_low, new_high = low, high
-        elif (low >= old_low).all() and (high <= old_high).all():
-            return
         else:
             spare = (old_high - old_low) // 4
             new_low = np.where(low < old_low, np.minimum(low, old_low) - spare, old_low)
@@ -106,6 +116,7 @@ class LocalMap:
                 packed[dv : dv + height - 1, du : du + width - 1] = self._packed
                 self._packed = packed
         self._grown = GrowingField(scores, stale, new_low, self._resolution)
+        self._corner = int(new_low[0]), int(new_low[1])
 
 
 def field_of_points(points: F64, resolution: float, sigma: float, max_distance: float) -> LikelihoodField:

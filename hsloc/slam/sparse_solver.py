@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import bsr_array, csc_array, tril
 from scipy.sparse.linalg import splu
 
-from hsloc.kernels.block_cholesky import Factor, factor_columns, factorise, solve_factor
+from hsloc.kernels.block_cholesky import Factor, factor_columns, factorise, solve_factor, sum_blocks
 from hsloc.kernels.normal_equations import diagonal_blocks, selected_inverse
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ class BlockSystem:
         first = np.concatenate(([True], key[1:] != key[:-1])) if len(key) else np.zeros(0, dtype=bool)
         self._order = order
         self._group = np.flatnonzero(first)
+        self._start = np.append(self._group, len(order))
         self._indices = self._columns[order][first]
         counts = np.bincount(self._rows[order][first], minlength=size)
         self._indptr = np.concatenate(([0], np.cumsum(counts)))
@@ -45,7 +46,9 @@ class BlockSystem:
         """The x (n, 3) of `A x = right`."""
         if self._elimination is None:
             self._elimination = _Elimination(self._indptr, self._indices)
-        return self._elimination.solve(self._summed(diagonal, off_diagonal), right)
+        sums = np.empty((len(self._group), 3, 3))
+        sum_blocks(self._order, self._start, diagonal, off_diagonal, sums)
+        return self._elimination.solve(sums, right)
 
     def inverse_blocks(self, diagonal: F64, off_diagonal: F64) -> F64:
         """The blocks (n, 3, 3) on the diagonal of the inverse: covariances, where the matrix is an information."""

@@ -57,7 +57,7 @@ def stamp_ns(seconds: str) -> int:
 
 def pose(words: Sequence[str], scale: float = 1.0) -> Pose2:
     """x, y, theta; `scale` makes metres of the first two. Raises ValueError for what is not finite."""
-    x, y, theta = (float(word) for word in words)
+    x, y, theta = map(float, words)
     found = Pose2(x * scale, y * scale, theta)
     if not found.is_finite():
         raise ValueError("a pose is not finite")

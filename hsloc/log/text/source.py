@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import zlib
 from dataclasses import replace
+from io import BufferedReader
 from typing import TYPE_CHECKING, BinaryIO, cast
 
 from hsloc.errors import LogFormatError, TopicError
@@ -19,6 +20,7 @@ from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
+    from io import RawIOBase
     from pathlib import Path
 
     from hsloc.log.text.line_format import Line, LineFormat
@@ -37,7 +39,8 @@ def _open(path: Path) -> BinaryIO:
     stream = path.open("rb")
     if stream.read(2) == b"\x1f\x8b":
         stream.close()
-        return cast("BinaryIO", gzip.open(path, "rb"))
+        # Lines of the compressed stream itself are cut in Python.
+        return cast("BinaryIO", BufferedReader(cast("RawIOBase", gzip.open(path, "rb"))))
     stream.seek(0)
     return stream
 

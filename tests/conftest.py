@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
 from paths import DATA, RECORDINGS, ROOT
 
 # Before anything imports numba or matplotlib. The jobs of a service that has just been installed compile all kernels,
@@ -17,6 +18,10 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / "build" / "numba"))
 os.environ.setdefault("MPLCONFIGDIR", str(ROOT / "build" / "matplotlib"))
 
 from hsloc.trajectory_io.tum import write_tum
+
+# How long an example takes says how busy the machine is.
+settings.register_profile("hsloc", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("hsloc")
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -97,7 +97,7 @@ def small_fields(draw: Any) -> Any:
     return np.array(scores).reshape(height, width), np.array(points, dtype=np.float32), np.array(box)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(small_fields(), st.integers(0, 2))
 def test_no_pose_is_fitter_than_the_bound_on_any_field(drawn: Any, shift: Any) -> None:
     scores, points, box = drawn

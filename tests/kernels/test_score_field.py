@@ -34,7 +34,7 @@ def columns_of(occupied: Any, kind: Any) -> Any:
     return columns
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.integers(1, 14), st.integers(1, 14), st.integers(0, 2**32 - 1), st.floats(0.01, 0.9))
 def test_distances_are_those_to_the_nearest_occupied_cell(height: Any, width: Any, seed: Any, share: Any) -> None:
     rng = np.random.default_rng(seed)

@@ -85,7 +85,7 @@ def test_a_cut_bag_is_one_line(tmp_path: Path, bag1: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_bags_raise_nothing_but_our_errors(
     tmp_path_factory: pytest.TempPathFactory, bag1: Path, bag2: Path, data: st.DataObject

@@ -48,7 +48,7 @@ def numbers(data: st.DataObject, payload: bytearray, at: int, count: int) -> Non
             payload[at + 8 * k : at + 8 * k + 8] = np.float64(value).tobytes()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(data=st.data(), name=st.sampled_from(sorted(columns.BY_HAND)), frame=st.sampled_from(("", "odom", "/map")))
 def test_columns_are_the_messages_to_the_last_bit(data: st.DataObject, name: str, frame: str) -> None:
     rng = np.random.default_rng(data.draw(st.integers(0, 1000)))

@@ -111,7 +111,7 @@ def test_ranges_do_not_keep_the_chunk_alive() -> None:
     np.testing.assert_array_equal(scan.ranges, before)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(data=st.data())
 def test_damaged_payloads_raise_bad_payload_or_give_a_value(data: st.DataObject) -> None:
     name = data.draw(st.sampled_from(sorted(decode.BY_HAND)))

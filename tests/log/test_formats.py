@@ -193,7 +193,7 @@ def test_hostile_protobuf_is_undecodable_at_once() -> None:
         assert time.perf_counter() - begin < 1.0
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(data=st.binary(max_size=200), name=st.sampled_from(sorted(foxglove.TYPES)))
 def test_any_protobuf_payload_is_decoded_or_undecodable(data: bytes, name: str) -> None:
     with contextlib.suppress(Undecodable):

@@ -66,7 +66,7 @@ def read_all(path: Path) -> int:
     return count
 
 
-@settings(max_examples=EXAMPLES, deadline=None)
+@settings(max_examples=EXAMPLES)
 @given(data=st.data())
 def test_mutated_bytes(tmp_path_factory: pytest.TempPathFactory, seeds: list[bytes], data: st.DataObject) -> None:
     content = bytearray(data.draw(st.sampled_from(seeds)))
@@ -92,7 +92,7 @@ def test_mutated_bytes(tmp_path_factory: pytest.TempPathFactory, seeds: list[byt
     read_all(path)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(body=st.binary(max_size=400), seed=st.integers(0, 7))
 def test_random_records_behind_a_good_start(
     tmp_path_factory: pytest.TempPathFactory, seeds: list[bytes], body: bytes, seed: int

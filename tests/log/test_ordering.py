@@ -161,7 +161,7 @@ def test_missing_stamps() -> None:
     assert (losses.stamps_zero, losses.stamps_zero_dropped) == ({"/a": 1}, {"/b": 1})
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.data())
 def test_any_delays_below_the_window_come_out_sorted(data: st.DataObject) -> None:
     arrivals = []

@@ -59,7 +59,7 @@ def test_readings_that_no_wall_can_show_are_a_code(low: float, high: float) -> N
     assert np.isfinite(read[:100]).all()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.data())
 def test_no_rectangular_room_makes_a_code(data: st.DataObject) -> None:
     def draw(low: float, high: float) -> float:

@@ -155,7 +155,7 @@ def in_segments(whole: list[ScanMessage], count: int) -> list[ScanMessage]:
     return found
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(count=st.sampled_from([3, 4, 6, 12]), skipped=st.integers(0, 11), clockwise=st.booleans())
 def test_segments_become_turns(count: int, skipped: int, clockwise: bool) -> None:
     """Whatever segment a log begins with, each whole turn comes out as the scan that it was made of."""

@@ -250,7 +250,7 @@ def test_wean_lines_in_centimetres(tmp_path: Path) -> None:
     assert log.losses.undecodable_messages == {"L": 1}
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(data=st.data())
 def test_damaged_text_raises_nothing_but_our_errors(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

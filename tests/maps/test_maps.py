@@ -136,7 +136,7 @@ def test_written_bytes_are_those_of_nav2(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["map.pgm", "map.yaml"]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     cells=arrays(
         np.int8,
@@ -216,7 +216,7 @@ def test_what_is_no_map_at_all(tmp_path: Path) -> None:
         load_map(path)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_damaged_files_raise_nothing_but_a_map_error(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

@@ -26,7 +26,7 @@ def test_nothing_to_draw(xy: np.ndarray) -> None:
     assert joined([]).shape == (0, 2)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 1000), st.integers(1, 10_000), st.floats(0.01, 5.0))
 def test_every_point_is_near_a_kept_one_and_kept_ones_are_points(seed: int, n: int, finest: float) -> None:
     rng = np.random.default_rng(seed)

@@ -130,7 +130,6 @@ def answers_are_as_described(operation: Any) -> Any:
     @schema.include(method=operation.method.upper(), path=operation.path).parametrize()
     @hypothesis.settings(
         max_examples=12,
-        deadline=None,
         derandomize=True,
         database=None,
         phases=[Phase.explicit, Phase.generate],  # to shrink takes minutes, and a request is readable as it is

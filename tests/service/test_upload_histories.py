@@ -162,7 +162,6 @@ def checksum(algorithm: str, body: bytes) -> str:
 Histories.TestCase.settings = settings(
     max_examples=12,
     stateful_step_count=20,
-    deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.too_slow],
 )

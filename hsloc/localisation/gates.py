@@ -19,6 +19,8 @@ _LEAST_TRUST = 0.05
 _NEARLY_USUAL = 0.95
 """Ratio to the usual fitness below which a match may lie beside the right place: half a metre along a corridor, where
 wheels slipped, most walls still fit."""
+_AS_USUAL = 0.98
+"""Ratio to the usual fitness that a match in a wide window reaches there."""
 _REGAINED = 0.05
 """Least gain in fitness of a match in a wide window over one that is not as fit as usual: fitness at the right place
 scatters by 0.02 from scan to scan, so that two of them differ by as much once in thirteen times."""
@@ -91,7 +93,7 @@ class MatchGate:
 
     def is_regained(self, worse: float, wide: float) -> bool:
         """Whether a match of fitness `wide` in a wide window takes the place of one that was not as fit as usual."""
-        return self.fits_as_usual(wide) and wide >= worse + _REGAINED
+        return self.usual is not None and wide >= max(worse + _REGAINED, _AS_USUAL * self.usual)
 
     def trust(self, fitness: float) -> float:
         """Part of the information of an accepted match that counts: all at the usual fitness, little at the least.

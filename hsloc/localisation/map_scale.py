@@ -80,13 +80,13 @@ class MapScale:
         return abs(self.value - 1.0) > max(_SIGMAS * self.sigma, _LEAST)
 
     def position_errors(self, poses: F64) -> F64:
-        """Errors (n, 3) of poses (n, 3) that come from the scale (m, m, 0): the cells grow from the corner.
+        """Errors (n, 2) in x and y of poses (n, 3) that come from the scale (m): the cells grow from the corner.
 
         0 where the scale is not significant.
         """
-        errors = np.zeros((len(poses), 3))
-        if self.is_significant:
-            errors[:, :2] = np.abs(self.value - 1.0) * np.abs(poses[:, :2] - self.corner)
+        if not self.is_significant:
+            return np.zeros((len(poses), 2))
+        errors: F64 = np.abs(self.value - 1.0) * np.abs(poses[:, :2] - self.corner)
         return errors
 
 

@@ -76,16 +76,14 @@ class StateRows:
         return np.array([state is State.LOCALISED for state in self.state], dtype=np.bool_)
 
 
-def with_errors(rows: StateRows, errors: F64, reason: str) -> StateRows:
-    """The rows with further errors (n, 3) of x, y (m) and theta (rad); where they exceed what is localised a pose is
-    predicted.
+def with_position_errors(rows: StateRows, errors: F64, reason: str) -> StateRows:
+    """The rows with further errors (n, 2) of x and y (m); where they exceed what is localised a pose is predicted.
 
-    They are known in size and no standard deviations: beside 2.5 of those they have to stay within 0.25 m and 5 deg.
+    They are known in size and no standard deviations: beside 2.5 of those they have to stay within 0.25 m.
     """
-    noise, sigma = rows.sigma[:, :2].max(axis=1), np.hypot(rows.sigma, errors)
-    far = np.hypot(errors[:, 0], errors[:, 1]) > _WITHIN * (MAX_SIGMA - noise)
-    turned = np.abs(errors[:, 2]) > _WITHIN * (MAX_SIGMA_ANGLE - rows.sigma[:, 2])
-    vague = rows.is_localised() & (far | turned)
+    noise, sigma = rows.sigma[:, :2].max(axis=1), rows.sigma.copy()
+    sigma[:, :2] = np.hypot(sigma[:, :2], errors)
+    vague = rows.is_localised() & (np.hypot(*errors.T) > _WITHIN * (MAX_SIGMA - noise))
     states = tuple(State.PREDICTED if each else state for each, state in zip(vague, rows.state, strict=True))
     reasons = tuple(reason if each else before for each, before in zip(vague, rows.reason, strict=True))
     return replace(rows, state=states, sigma=sigma, reason=reasons)

@@ -15,12 +15,11 @@ from hsloc.localisation.kalman_filter import (
     predict_covariance,
     smooth_matches,
 )
-from hsloc.localisation.states import StateLog, with_errors
+from hsloc.localisation.states import StateLog, with_position_errors
 from hsloc.model.estimate import ScanDiagnostics, State, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
 from hsloc.model.pose2 import Pose2, compose_poses
 from hsloc.model.trajectory import Trajectory
-from hsloc.slam.time_offset import Headings, find_offset, in_words
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -32,13 +31,8 @@ if TYPE_CHECKING:
     from hsloc.localisation.states import StateRows
     from hsloc.model.certificate import Certificate
     from hsloc.model.estimate import Ambiguity, Estimate
-    from hsloc.slam.time_offset import Offset
 
     F64 = NDArray[np.float64]
-
-_CERTAIN = 10.0
-"""Standard deviations by which stamps differ beyond doubt: wheels err for a second at a time, so that the steps of the
-heading are not as independent as the standard deviation takes them for."""
 
 
 class RunHistory:
@@ -183,8 +177,7 @@ class RunHistory:
     def states(self, scale: MapScale | None = None) -> StateRows | None:
         """The state of each pose of the trajectory in hindsight; None for an estimator that weighs no evidence.
 
-        Where the map has another `scale` than the lidar, or the scans are stamped at other moments than the odometry,
-        poses are as uncertain as that makes them.
+        Where the map has another `scale` than the lidar, poses are as uncertain as that makes them.
         """
         if len(self._states) == 0:
             return None
@@ -192,36 +185,10 @@ class RunHistory:
         covariances = dict(zip(self._anchor_states, smoothed.covariances, strict=True))
         between = bridge_variances(self.odometry().poses, self._anchors, smoothed.motion)
         rows = self._states.at_odometry(len(self._odometry_stamps), covariances, between)
-        offset = self._stamp_offset()
-        if offset.is_significant and abs(offset.seconds) > _CERTAIN * offset.sigma:
-            reason = f"the stamps of the scans are {in_words(offset)} those of the odometry"
-            rows = with_errors(rows, self._moved_within(offset.seconds), reason)
         if scale is None or not scale.is_significant:
             return rows
         errors = scale.position_errors(self.trajectory()[0].poses)
-        return with_errors(rows, errors, f"the scale of the map is {scale.value:.3f}")
-
-    def _stamp_offset(self) -> Offset:
-        """By how much the stamps of the scans are later than those of the odometry: by the headings at the matches."""
-        stamps = np.array(self._scan_stamps, dtype=np.int64)[self._anchor_scans]
-        theta = np.array([anchor.T_map_base.theta for anchor in self._anchors])
-        odometry = self.odometry()
-        return find_offset(Headings.of(stamps, theta), Headings.of(odometry.stamps_ns, odometry.poses[:, 2]))
-
-    def _moved_within(self, seconds: float) -> F64:
-        """How far (n, 3) the robot moved in so many seconds before each pose, by the odometry; along the map's axes."""
-        odometry = self.odometry()
-        stamps, at = np.unique(odometry.stamps_ns, return_index=True)
-        poses = odometry.poses[at]
-        poses[:, 2] = np.unwrap(poses[:, 2])
-        now, then = ((odometry.stamps_ns - stamps[0]) * 1e-9 - shift for shift in (0.0, seconds))
-        times = (stamps - stamps[0]) * 1e-9
-        moved = np.column_stack([np.interp(now, times, each) - np.interp(then, times, each) for each in poses.T])
-        turn = self.trajectory()[0].poses[:, 2] - odometry.poses[:, 2]
-        c, s = np.cos(turn), np.sin(turn)
-        along = (c * moved[:, 0] - s * moved[:, 1], s * moved[:, 0] + c * moved[:, 1], moved[:, 2])
-        errors: F64 = np.abs(np.column_stack(along))
-        return errors
+        return with_position_errors(rows, errors, f"the scale of the map is {scale.value:.3f}")
 
     def ambiguities(self, states: StateRows | None) -> tuple[Ambiguity, ...]:
         """Between which places the run does not decide, and when; `states` are those of its poses."""

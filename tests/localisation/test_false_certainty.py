@@ -11,7 +11,7 @@ import pytest
 from hsloc.config import Config
 from hsloc.localisation.localiser import Localiser
 from hsloc.matching import LikelihoodField
-from hsloc.model import Event, OccupancyGrid, Pose2, Scan, State, wrap_angles
+from hsloc.model import Event, OccupancyGrid, Pose2, State, wrap_angles
 from hsloc.replay.engine import replay
 from hsloc.replay.run_history import RunHistory
 from hsloc.simulation.built_in import built_in
@@ -41,7 +41,7 @@ def judge(
     localiser = Localiser.from_parameters(
         grid, field, config.make_matcher(), config.localiser, np.random.default_rng(0), start
     )
-    history = RunHistory(config.localiser.smoothing_model())
+    history = RunHistory()
     for event, estimate in replay(drive, localiser):
         history.add(event, estimate)
     trajectory, _ = history.trajectory()
@@ -76,15 +76,6 @@ def test_on_a_map_of_a_wrong_resolution_poses_are_as_uncertain_as_they_are_wrong
     false, _, states = judge(office_drive(), replace(grid, resolution=1.02 * grid.resolution), world.start())
     assert false == 0.0
     assert states == {State.LOCALISED, State.PREDICTED}
-
-
-def test_where_scans_are_stamped_late_poses_are_as_uncertain_as_they_are_wrong() -> None:
-    world = built_in("office")
-    late = [replace(e, stamp_ns=e.stamp_ns + 200_000_000) if isinstance(e, Scan) else e for e in office_drive()]
-    drive = tuple(sorted(late, key=lambda event: event.stamp_ns))
-    false, _, states = judge(drive, world.occupancy_grid(0.05), world.start())
-    assert false < 0.01
-    assert State.PREDICTED in states
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -126,7 +126,7 @@ def _draw_head(figure: Figure, axes: Axes, title: str, summary: ResultSummary | 
     if summary.reasons:
         more = f" (and {len(summary.reasons) - 1} more)" if len(summary.reasons) > 1 else ""
         reason = summary.reasons[0]
-        line = figure.text(LEFT, 0.909, "", fontsize=11, color=style.MUTED, va="top", parse_math=False)
+        line = figure.text(LEFT, 0.909, "", fontsize=11, color=style.INK, va="top", parse_math=False)
         cuts = [reason + more, *(f"{reason[:most]}…{more}" for most in range(len(reason), 0, -1))]
         _fit(line, cuts, RIGHT - LEFT)
 

@@ -32,6 +32,8 @@
       charts.setAttribute("role", "region"); charts.setAttribute("aria-label", "curves over time");
       root.replaceChildren(this.table(runs), ...(seeds ? this.overSeeds(seeds) : []), make("h2", `Paths on the map of ${first.name}`));
       if (built) root.append(make("p", "A map that a run built has a frame of its own, which begins at the first pose of the log.", "rv-help"));
+      const maps = new Set(runs.map((run) => { const map = run.data.summary?.facts[0] ?? ""; return map.endsWith("map of the log") ? `${map} ${run.data.title}` : map; }));
+      if (!built && maps.size > 1) root.append(make("p", `The runs are on different maps: on that of ${first.name} the paths of the others may mean nothing.`, "rv-help"));
       root.append(view, charts);
       const data = { ...first.data, end: Math.max(...runs.map((run) => run.data.end)), others: [], charts: [], status: [] };
       data.extent = [0, 1, 2, 3].map((k) => Math[k < 2 ? "min" : "max"](...runs.map((run) => run.data.extent[k])));
@@ -60,6 +62,7 @@
         texts.forEach((text, k) => { const cell = make("td", text); if (changes[k]) cell.append(" ", make("small", changes[k], "rv-change")); row.append(cell); });
       };
       line("verdict", runs.map((run) => run.data.summary?.verdict ?? ""));
+      for (const cell of [...body.rows[0].cells].slice(1)) if (cell.textContent) cell.replaceChildren(make("span", cell.textContent, `rv-verdict rv-${cell.textContent}`));
       const figures = runs.map((run) => new Map((run.data.summary?.figures ?? []).map((figure) => [figure.name, figure])));
       for (const name of new Set(figures.flatMap((each) => [...each.keys()]))) {
         const first = figures[0].get(name), any = figures.find((each) => each.has(name)).get(name);

@@ -28,13 +28,13 @@
       this.unpack();
       this.build();
       this.charts = globalThis.ResultCharts(this.$charts, data, (t) => this.seek(t));
-      this.dark = matchMedia("(prefers-color-scheme: dark)");
+      this.dark = matchMedia("screen and (prefers-color-scheme: dark)"); // paper is white
       this.listening = new AbortController();
       const { signal } = this.listening;
-      this.dark.addEventListener("change", () => { this.colours = null; this.charts.draw(); this.draw(); }, { signal });
+      this.dark.addEventListener("change", () => { this.colours = null; this.charts.draw(); this.drawNow(); }, { signal });
       this.observer = new ResizeObserver(() => this.resize());
       this.observer.observe(this.$frame);
-      addEventListener("beforeprint", () => this.all(), { signal });
+      addEventListener("beforeprint", () => { this.all(); this.drawNow(); }, { signal });
       globalThis.listenToView(this);
       this.resize();
       this.all();
@@ -190,6 +190,8 @@
       // Once for each frame of the screen, however many events there were.
       this.drawn = requestAnimationFrame(() => { this.drawn = null; this.drawBase(); this.drawOver(); });
     }
+    // What is printed is taken before the next frame.
+    drawNow() { if (this.scale) { this.drawBase(); this.drawOver(); } }
     drawBase() {
       const c = this.$base.getContext("2d"), d = this.data;
       c.setTransform(1, 0, 0, 1, 0, 0);

@@ -65,7 +65,7 @@ export async function refresh(label) {
   for (const id of rows.keys()) if (!jobs.some((job) => job.id === id)) rows.delete(id);
   const filtered = Boolean(value || $("search").value.trim() || $("label-filter").value);
   $("no-jobs").hidden = total > 0 || filtered;
-  $("jobs").hidden = total === 0 && !filtered;
+  for (const part of [$("jobs"), document.querySelector(".filters"), document.querySelector(".pages")]) part.hidden = total === 0 && !filtered;
   $("page-text").textContent = total ? `${offset + 1} to ${offset + jobs.length} of ${total}` : filtered ? "no such job" : "";
   $("newer").disabled = offset === 0;
   $("older").disabled = offset + jobs.length >= total;

@@ -264,7 +264,7 @@ function summary(job, whole) {
   const rows = [];
   const row = (name, values, explanation = "") => {
     const line = element("tr");
-    line.append(heading("row", name), cell(values.join(", ")), element("td", explanation, "quiet"));
+    line.append(heading("row", name), cell(values.join(" / ")), element("td", explanation, "quiet"));
     rows.push(line);
   };
   if (found.verdict) row("verdict", [short.verdict_text ?? found.verdict]);

@@ -172,6 +172,11 @@ class FrontEnd:
         self._covariance = np.zeros((3, 3))
 
     @property
+    def covariance(self) -> F64:
+        """Covariance (3, 3) of the last keyscan's pose, or of the last followed scan's, since the map was solved."""
+        return self._covariance
+
+    @property
     def is_far_from_known_map(self) -> bool:
         """Whether there is a known map, and only a loop leads back to it."""
         return self._tracker is not None and self._tracker.is_far(self._way)

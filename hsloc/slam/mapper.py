@@ -65,7 +65,6 @@ class Mapper:
         self._T_map_odom = IDENTITY
         self._T_map_key = IDENTITY
         self._T_last_scan = IDENTITY
-        self._covariance = np.zeros((3, 3))
 
     def update(self, event: Odometry | PairedScan) -> Estimate:
         """Take an event; the estimate at its stamp, in the map as it is known so far (it drifts)."""
@@ -82,20 +81,24 @@ class Mapper:
             pose = self._T_map_odom @ event.T_odom_base
             return Estimate(event.scan.stamp_ns, pose, Status.PREDICTED, reason=HELD)
         points = event.points_base()
+        covariance = self._matcher.covariance
         found = self._matcher.update(event, points)
-        covariance = predict_covariance(self._covariance, self._T_map_key, found.motion, found.covariance)
+        if found.is_keyscan or found.anchor is not None:
+            covariance = self._matcher.covariance
+        else:
+            covariance = predict_covariance(covariance, self._T_map_key, found.motion, found.covariance)
         T_odom_base = event.T_odom_base if self._parameters.use_odometry else found.pose
         first_new = len(self._local)
         local = self._keep_companions(event, found) if found.is_keyscan else found
         self._held = []  # No later scan carries them: a robot that waits for hours has no keyscans.
         self._track.add(T_odom_base, is_scan=True, is_key=found.is_keyscan)
         if found.is_keyscan:
-            self._covariance, self._T_map_key = covariance, found.pose
+            self._T_map_key = found.pose
             self._keep(event.scan, found.scans[0].scan, local)
             if found.anchor is not None:
                 self._tie(found.anchor, first_new)
         elif found.anchor is not None:
-            self._covariance, self._T_map_key = covariance, found.pose
+            self._T_map_key = found.pose
             self._track.anchor(found.anchor)
         self._T_map_odom = found.pose @ T_odom_base.inverse()
         self._T_last_scan = found.pose

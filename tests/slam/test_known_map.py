@@ -55,6 +55,9 @@ def test_a_lap_in_a_known_building_adds_nothing(laps: tuple[Events, Trajectory])
     scans = [(event, estimate) for event, estimate in zip(events, said, strict=True) if isinstance(event, PairedScan)]
     lap = [estimate for event, estimate in scans if seconds(event, events) > _LAP_S + 5.0]
     assert sum(estimate.status is Status.MATCHED for estimate in lap) > 0.4 * len(lap), "every second one"
+    matched = [estimate.covariance for estimate in lap if estimate.status is Status.MATCHED]
+    sigmas = [np.sqrt(np.trace(covariance[:2, :2])) for covariance in matched if covariance is not None]
+    assert np.median(sigmas) < 0.03, "on the known map errors do not add up"
     assert (np.linalg.eigvalsh(result.scan_covariances).min(axis=1) > -1e-12).all()
     late = np.sqrt(np.trace(result.scan_covariances[-200:, :2, :2], axis1=1, axis2=2))
     assert late.min() > 0.001, "an anchored scan is less certain than its keyscan"

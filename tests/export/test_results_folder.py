@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from hsloc.errors import OutputError
-from hsloc.export.results_folder import refuse_folder
+from hsloc.export.results_folder import refuse_folder, write_hypotheses
+from hsloc.model import Pose2
+from hsloc.model.estimate import Ambiguity, LikelyPlace
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -26,3 +28,13 @@ def test_only_results_are_overwritten(tmp_path: Path) -> None:
     for name in ("metrics.json", "config.yaml"):
         (tmp_path / name).write_text("{}")
     refuse_folder(tmp_path, True)
+
+
+def test_hypotheses_csv_has_a_line_for_each_place(tmp_path: Path) -> None:
+    places = (LikelyPlace(Pose2(1.0, 2.0, 0.5), 0.75), LikelyPlace(Pose2(-9.0, 2.0, -0.5), 0.25))
+    write_hypotheses(tmp_path / "hypotheses.csv", [Ambiguity(10**9, 3 * 10**9, 2 * 10**9, places)])
+    assert (tmp_path / "hypotheses.csv").read_text(encoding="utf-8").splitlines() == [
+        "begin,end,t,x,y,theta,probability",
+        "1.000000000,3.000000000,2.000000000,1.000,2.000,0.5000,0.7500",
+        "1.000000000,3.000000000,2.000000000,-9.000,2.000,-0.5000,0.2500",
+    ]

@@ -5,6 +5,7 @@ Everything is projected to the plane in one place, at the end: `laser_mounting`.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from math import acos, atan2, hypot, sqrt
 
@@ -80,6 +81,8 @@ class Transform3:
 
 _MAX_STATEMENTS = 8
 """Different values of one static transform that are kept for the warning."""
+_FEW_PLACES = 4
+"""Places of a frame up to which several publishers may have stated one each; a joint that moves has more."""
 MOVED_METRES, MOVED_RADIANS = 1e-3, 2e-3
 """Change (m, rad) above which a mounting counts as moving. Internal: above the noise of a joint's encoder."""
 
@@ -89,7 +92,7 @@ class FrameTree:
 
     def __init__(self) -> None:
         self._links: dict[str, tuple[str, Transform3]] = {}
-        self._moving: set[str] = set()
+        self._changes: Counter[str] = Counter()
         self._statements: dict[str, list[tuple[str, Transform3]]] = {}
 
     def add(self, parent: str, child: str, transform: Transform3) -> None:
@@ -97,12 +100,10 @@ class FrameTree:
         transform = transform.normalised()
         known = self._links.get(child)
         if known is not None and (known[0] != parent or _moved(known[1], transform)):
-            self._moving.add(child)
+            self._changes[child] += 1
         self._links[child] = (parent, transform)
         statements = self._statements.setdefault(child, [])
-        if len(statements) < _MAX_STATEMENTS and not any(
-            above == parent and not _moved(stated, transform) for above, stated in statements
-        ):
+        if len(statements) < _MAX_STATEMENTS and all(differ((parent, transform), each) for each in statements):
             statements.append((parent, transform))
 
     def statements(self, frame: str) -> list[tuple[str, Transform3]]:
@@ -137,7 +138,11 @@ class FrameTree:
 
     def is_moving(self, frame: str) -> bool:
         """Whether the frame's pose in its parent's changed."""
-        return frame in self._moving
+        return frame in self._changes
+
+    def alternates(self, frame: str) -> bool:
+        """Whether the frame's pose changes between a few places, each stated again and again by its own publisher."""
+        return len(self.statements(frame)) <= _FEW_PLACES < self._changes[frame]
 
     def _ancestry(self, frame: str) -> list[str]:
         """The frame, its parent, and so on; ends at the root, or where a loop would close."""
@@ -183,6 +188,11 @@ class FrameTree:
         for frame in frames:
             total = self._links[frame][1] @ total
         return total
+
+
+def differ(first: tuple[str, Transform3], second: tuple[str, Transform3]) -> bool:
+    """Whether two statements of a frame's parent and pose contradict each other."""
+    return first[0] != second[0] or _moved(first[1].normalised(), second[1].normalised())
 
 
 def _moved(first: Transform3, second: Transform3) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from log_builders import MOUNTING, START, describe, make_scan, write_run
 
+from hsloc.errors import TopicError
 from hsloc.log import LogWriter, ReadOptions, check_log, convert_log, open_log
 from hsloc.log.messages import definitions
 from hsloc.log.summary import Losses
@@ -95,6 +96,35 @@ def test_static_transforms_stated_twice_are_both_named(tmp_path: Path) -> None:
     assert any("0.180,0.000,0.000" in finding.text for finding in check_log(open_log(path)).findings)
 
 
+@pytest.mark.parametrize("places", [(0.5,), (0.5, 0.3)])
+def test_places_that_are_stated_on_tf_again_and_again_are_named(tmp_path: Path, places: tuple[float, ...]) -> None:
+    path = tmp_path / "two.mcap"
+    with LogWriter(path) as log:
+        if len(places) > 1:
+            log.odometry(START, Pose2(0.0, 0.0, 0.0))
+            log.scan(make_scan(START))
+        else:
+            _add_robot(log, "", "", "odom", True, MOUNTING)
+        for number in range(10):
+            for x in places:
+                log.transforms(START + number * SECOND // 10, [("base_link", "laser", Pose2(x, 0.0, 0.0))])
+    (warning,) = open_log(path).summary.warnings
+    for x in (*places, *([] if len(places) > 1 else [MOUNTING.x])):
+        assert f"base_link -> laser at {x:.3f},0.000," in str(warning)
+    assert "--laser-pose" in str(warning)
+
+
+@pytest.mark.parametrize("name", ["/robot1/tf", "tf"])
+def test_a_user_may_say_that_transforms_of_any_name_are_the_odometry(tmp_path: Path, name: str) -> None:
+    path = write_robot(tmp_path / "a.mcap", "/robot1", odom="world", topic=False)
+    with pytest.raises(TopicError, match="--odom-topic /robot1/tf"):
+        open_log(path)
+    log = open_log(path, ReadOptions(odom_topic=name))
+    assert log.summary.odom_frame == "world"
+    assert_alike(log.summary.T_base_laser, MOUNTING)
+    assert sum(kind == "odometry" for kind, *_ in map(describe, log.events())) == 30
+
+
 def test_a_frame_with_two_parents_is_looked_up_by_the_one_that_leads_to_the_base(tmp_path: Path) -> None:
     path = tmp_path / "parents.mcap"
     with LogWriter(path) as log:
@@ -131,6 +161,9 @@ GRID = OccupancyGrid(np.zeros((4, 6), dtype=np.int8), 0.05, Pose2(1.0, 2.0, 0.0)
         ("/local_costmap/costmap", "odom", False),
         ("/global_costmap/costmap", "map", False),
         ("/grid", "odom", False),
+        ("/map", "odom", False),
+        ("/map", "base_link", False),
+        ("/map", "rolling", False),
     ],
 )
 def test_a_costmap_is_no_map(tmp_path: Path, topic: str, frame: str, is_map: bool) -> None:
@@ -138,6 +171,8 @@ def test_a_costmap_is_no_map(tmp_path: Path, topic: str, frame: str, is_map: boo
     with LogWriter(path) as log:
         _add_robot(log, "", "", "odom", True, MOUNTING)
         log.occupancy_grid(GRID, START, topic=topic, frame_id=frame)
+        for x in (1.1, 1.2, 1.3) if frame == "rolling" else ():
+            log.occupancy_grid(replace(GRID, origin=Pose2(x, 2.0, 0.0)), START, topic=topic, frame_id=frame)
     log_ = open_log(path)
     assert (log_.map() is not None) is is_map
     assert any(topic in str(warning) for warning in log_.summary.warnings) is not is_map

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import ConfigError
 from hsloc.log.session.transform_topics import BASE_FRAMES, last_name, read_links
-from hsloc.log.transforms import FrameTree, Mounting, Transform3, laser_mounting
+from hsloc.log.transforms import FrameTree, Mounting, Transform3, differ, laser_mounting
 from hsloc.model import IDENTITY, Pose2, wrap_angle
 from hsloc.model.calibration import Calibration, LidarCalibration, OdometryCorrection
 from hsloc.warnings import RunWarning, WarningCode
@@ -182,7 +182,10 @@ class Extrinsics:
     def _warn_if_moving(self, tree: FrameTree, base: str, laser: str) -> None:
         path = tree.path(base, laser)
         moving = sorted(frame for frame in (path[0] + path[1] if path else ()) if tree.is_moving(frame))
-        if moving:
+        few = [frame for frame in moving if tree.alternates(frame)]
+        for frame in few:
+            self._warn_of_places(sorted(self._topics.dynamic), frame, tree.statements(frame), "the last is used")
+        if len(few) < len(moving):
             self.warnings.append(
                 RunWarning(
                     WarningCode.LASER_MOVES,
@@ -194,19 +197,24 @@ class Extrinsics:
         """Static transforms that are stated twice with different values: the later ones were taken."""
         path = tree.path(tree.resolve(base, laser) or base, tree.resolve(laser, base) or laser)
         for frame in path[0] + path[1] if path else (laser,):
-            statements = self._static.statements(frame)
+            statements, topics = self._static.statements(frame), sorted(self._topics.static)
+            dynamic = self._topics.stated.get(frame)
+            if statements and dynamic is not None and all(differ(dynamic, each) for each in statements):
+                statements, topics = [dynamic, *statements], [*topics, *sorted(self._topics.dynamic)]
             if len(statements) > 1:
-                listed = " and ".join(
-                    f"{parent} -> {frame} at {_in_plane(transform)}" for parent, transform in statements
-                )
-                self.warnings.append(
-                    RunWarning(
-                        WarningCode.EXTRINSICS_RESTATED,
-                        f"{', '.join(sorted(self._topics.static))} states the place of {frame} {len(statements)} "
-                        f"times: {listed}; the last that leads to {base} is used",
-                        "choose with --laser-pose x,y,yaw",
-                    )
-                )
+                self._warn_of_places(topics, frame, statements, f"the last that leads to {base} is used")
+
+    def _warn_of_places(
+        self, topics: Sequence[str], frame: str, statements: Sequence[tuple[str, Transform3]], taken: str
+    ) -> None:
+        listed = " and ".join(f"{parent} -> {frame} at {_in_plane(transform)}" for parent, transform in statements)
+        self.warnings.append(
+            RunWarning(
+                WarningCode.EXTRINSICS_RESTATED,
+                f"{', '.join(topics)} states the place of {frame} {len(statements)} times: {listed}; {taken}",
+                "choose with --laser-pose x,y,yaw",
+            )
+        )
 
     def _guessed_base(self) -> str | None:
         for tree in (self._static, self._whole_tree()):

@@ -13,6 +13,7 @@ from hsloc.log.session.scan_geometry import ScanFixes, ScanSurvey, survey
 from hsloc.log.session.split_recordings import check_parts
 from hsloc.log.session.topic_selection import (
     TF,
+    choose_maps,
     choose_scans,
     choose_topics,
     has_name,
@@ -20,7 +21,7 @@ from hsloc.log.session.topic_selection import (
     names_transforms,
     of_type,
 )
-from hsloc.log.session.transform_topics import choose_transforms, is_map_frame, is_odometry_frame
+from hsloc.log.session.transform_topics import BASE_FRAMES, choose_transforms, is_map_frame
 from hsloc.log.summary import LaserSummary, LogSummary, Losses, ReadOptions, TopicSummary
 from hsloc.model import IDENTITY
 from hsloc.warnings import RunWarning, WarningCode
@@ -227,11 +228,14 @@ class LogSession:
         laser = lasers[0] if lasers else LaserSummary("", "", IDENTITY, False, "identity")
         converted = any(c.metadata.get(CONVERTED, {}).get("order") == "log" for c in self.containers)
         self._warn_of_clocks()
+        robot = {*BASE_FRAMES, self.odometry_child, *(laser.frame for laser in lasers)}
+        grids = of_type(self.active, definitions.OCCUPANCY_GRID)
+        self.maps, others, self._map_frames = choose_maps(grids, self.messages, robot)
         self.initial_pose = self.find_initial_pose()
-        self.maps, others = self.map_topics()
         if others and not self.maps:
-            text = f"{', '.join(others)} is a costmap, not a map: it is not used"
-            self._warnings.append(RunWarning(WarningCode.MAP_IS_COSTMAP, text, "give a map with --map"))
+            text = "; ".join(f"{topic} {why}" for topic, why in others.items())
+            remedy = "give a map with --map"
+            self._warnings.append(RunWarning(WarningCode.MAP_IS_COSTMAP, f"{text}: it is not used", remedy))
         starts = [topic.first_ns for topic in statistics if topic.first_ns is not None]
         ends = [topic.last_ns for topic in statistics if topic.last_ns is not None]
         formats = list(dict.fromkeys(container.format for container in self.containers))
@@ -300,21 +304,6 @@ class LogSession:
             return self.choice.odom
         return ",".join(sorted(self.transforms.dynamic)) or TF
 
-    def map_topics(self) -> tuple[list[str], list[str]]:
-        """Topics of maps, the best first, and topics of grids that are none.
-
-        A costmap is no map: it is inflated, and a local one rolls along with the robot in the frame of its odometry.
-        """
-        maps: list[str] = []
-        others: list[str] = []
-        for topic in of_type(self.active, definitions.OCCUPANCY_GRID):
-            is_named_map = topic.strip("/").rpartition("/")[2] == "map"
-            frame = "" if is_named_map else next((m.frame_id for _, m in self.messages(topic)), "")
-            is_map = is_named_map or not ("costmap" in topic or is_odometry_frame(frame))
-            (maps if is_map else others).append(topic)
-        maps.sort(key=lambda topic: (topic.lstrip("/") != "map", not topic.endswith("/map"), topic))
-        return maps, others
-
     def find_initial_pose(self) -> tuple[int, Pose2] | None:
         """(stamp in ns, pose in the map) of the first message on /initialpose that can be used.
 
@@ -326,7 +315,7 @@ class LogSession:
         for name in names[:1]:
             for log_time, message in self.messages(name, topic):
                 frame, stamp = message.frame_id, message.stamp_ns or log_time
-                if not frame or is_map_frame(frame):
+                if not frame or is_map_frame(frame) or frame in self._map_frames:
                     return stamp, message.pose
                 T_map_frame = self._map_to(frame, log_time)
                 if T_map_frame is not None:
@@ -348,7 +337,7 @@ class LogSession:
             if log_time > log_time_ns and found is not None:
                 break
             for link in links:
-                if is_map_frame(link.parent) and link.child == frame:
+                if (is_map_frame(link.parent) or link.parent in self._map_frames) and link.child == frame:
                     found = link.transform.normalised().to_pose2()
         return found
 

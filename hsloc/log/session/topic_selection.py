@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from math import hypot
 from typing import TYPE_CHECKING
 
 from hsloc.errors import TopicError
@@ -11,13 +12,14 @@ from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import canonical_type, is_decodable, is_read
 from hsloc.log.messages.odometry_kind import Rank
 from hsloc.log.messages.odometry_kinds import ODOMETRY_KINDS, POSE_TYPES, kind_among
-from hsloc.log.session.transform_topics import is_static_topic, is_transform_topic, namespace
+from hsloc.log.session.transform_topics import is_odometry_frame, is_static_topic, is_transform_topic, namespace
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
 
     from hsloc.log.container import Channel
+    from hsloc.log.messages.decode import GridMessage
     from hsloc.log.messages.odometry_kind import OdometryKind
     from hsloc.log.summary import ReadOptions
 
@@ -30,6 +32,9 @@ SCAN_TYPES = (definitions.LASER_SCAN, definitions.MULTI_ECHO_LASER_SCAN, definit
 _ECHOES = ("first", "most_intense", "last")
 """Names under which drivers publish the echoes of one laser, the one to read first."""
 _LISTED = 12
+_ROLLING_PLACES = 4
+_COMPARED_CELLS = 50_000_000
+"""Cells of a topic of grids that are looked at. Internal: a large map that is published every second costs time."""
 
 
 @dataclass(slots=True)
@@ -145,6 +150,52 @@ def choose_scans(
     return {topic: kinds[topic] for topic in chosen if topic is not None}
 
 
+def choose_maps(
+    topics: Sequence[str], messages: Callable[[str], Iterator[tuple[int, GridMessage]]], robot: Collection[str | None]
+) -> tuple[list[str], dict[str, str], set[str]]:
+    """Of topics of grids those of maps, the best first; what the others are; and the frames of the maps.
+
+    A costmap is no map: it is inflated, and a local one rolls along with the robot, mostly in the frame of its
+    odometry. `robot` are frames that are fixed to the robot.
+    """
+    maps, others, frames = [], {}, set()
+    for topic in topics:
+        grids = (message for _, message in messages(topic))
+        first = next(grids, None)
+        if first is None:
+            continue
+        if "costmap" in topic:
+            others[topic] = "is a costmap, not a map"
+        elif is_odometry_frame(first.frame_id) or first.frame_id in robot:
+            others[topic] = f"is in the frame {first.frame_id}, as a local costmap is"
+        elif _rolls(first, grids):
+            others[topic] = "moves along with the robot, as a local costmap does"
+        else:
+            maps.append(topic)
+            frames.add(first.frame_id)
+    maps.sort(key=lambda topic: (topic.lstrip("/") != "map", not topic.endswith("/map"), topic))
+    return maps, others, frames
+
+
+def _rolls(first: GridMessage, others: Iterator[GridMessage]) -> bool:
+    """Whether a grid keeps its size and moves; one that a mapper builds moves only as it grows.
+
+    Another map of the same size may be loaded once, so that it takes several places.
+    """
+    size, places = first.grid.cells.shape, [first.grid.origin]
+    left = _COMPARED_CELLS
+    for message in others:
+        grid = message.grid
+        left -= grid.cells.size
+        if grid.cells.shape != size or left < 0:
+            return False
+        if all(hypot(grid.origin.x - place.x, grid.origin.y - place.y) > grid.resolution for place in places):
+            places.append(grid.origin)
+        if len(places) >= _ROLLING_PLACES:
+            return True
+    return False
+
+
 def _odometry_candidates(channels: Sequence[Channel], options: ReadOptions) -> tuple[Rank, list[str]]:
     """Topics of the lowest rank that the log has, and this; where the user names one, all that can be read."""
     found: dict[Rank, list[str]] = {}
@@ -190,6 +241,9 @@ def _pick(
         warning = RunWarning(WarningCode.TOPIC_AMBIGUOUS, text, remedy)
     else:
         remedy = "motion can be estimated from the scans alone: --no-odom" if kind == "odom" and required else ""
+        moving = sorted({c.topic for c in channels if is_transform_topic(c) and not is_static_topic(c.topic)})
+        if remedy and moving:
+            remedy += f"; or it is in the transforms: --odom-topic {moving[0]}"
         for other in ODOMETRY_KINDS if remedy else ():
             if other.missing(options) and (topics := of_type(channels, other.typename)):
                 remedy += f"; or it is made of {topics[0]} with {other.missing(options)}"

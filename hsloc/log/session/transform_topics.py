@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from hsloc.log.container import Channel, Container
     from hsloc.log.messages.decode import LinkMessage
     from hsloc.log.messages.decoders import Decoder
+    from hsloc.log.transforms import Transform3
 
 MAP_FRAME = "map"
 BASE_FRAMES = ("base_footprint", "base_link", "base")
@@ -97,13 +98,15 @@ class TransformTopics:
     """The topics of transforms that are read, and what they say of odometry.
 
     `odometry` is (parent, child) of the link that is odometry, None without one; `has_map_to_odometry` whether a
-    localiser published its correction. `warnings` are what had to be decided.
+    localiser published its correction. `stated` are the parent and the first pose of each frame on the dynamic topics.
+    `warnings` are what had to be decided.
     """
 
     dynamic: frozenset[str] = frozenset()
     static: frozenset[str] = frozenset()
     odometry: tuple[str, str] | None = None
     has_map_to_odometry: bool = False
+    stated: dict[str, tuple[str, Transform3]] = field(default_factory=dict)
     warnings: list[RunWarning] = field(default_factory=list)
 
     @property
@@ -120,13 +123,15 @@ def choose_transforms(
     `named` is a topic of transforms from which the user wants the odometry.
     """
     topics = sorted({c.topic for container in containers for c in container.channels.values() if is_transform_topic(c)})
-    links = {topic: _links(containers, topic) for topic in topics}
+    read = {topic: _links(containers, topic) for topic in topics}
+    links = {topic: list(found) for topic, found in read.items()}
     groups: dict[str, list[str]] = {}
     for topic in topics:
         groups.setdefault(namespace(topic), []).append(topic)
     found = TransformTopics()
-    chosen = groups.get(namespace(named), []) if named is not None and namespace(named) in groups else None
-    if chosen is None:
+    # `tf` means the transforms wherever they are.
+    chosen = [] if named is None else groups.get(namespace(named), [])
+    if all(map(is_static_topic, chosen)):
         chosen = _nearest(groups, links, scans, found.warnings)
     if namespace(chosen[0]) if chosen else "":
         # What a robot's namespace does not say may be said for all: a description on /tf_static, say.
@@ -140,16 +145,24 @@ def choose_transforms(
         found.dynamic = frozenset([named]) if named is not None else found.dynamic
     moving = [link for topic in sorted(found.dynamic) for link in links[topic]]
     resting = [link for topic in sorted(found.static) for link in links[topic]]
-    found.odometry = odometry_link(moving, resting, [frame for _, frame in scans], base)
+    lasers = [frame for _, frame in scans]
+    found.odometry = odometry_link(moving, resting, lasers, base)
+    if found.odometry is None and named is not None:
+        found.odometry = _topmost_link(moving, resting, lasers, base)
+    for topic in sorted(found.dynamic):
+        found.stated.update({child: (parent, first) for (parent, child), first in read[topic].items()})
     found.has_map_to_odometry = any(is_map_frame(parent) for parent, _ in moving) or any(
         is_map_frame(child) and is_odometry_frame(parent) for parent, child in moving
     )
     return found
 
 
-def _links(containers: Sequence[Container], topic: str) -> list[tuple[str, str]]:
-    read = read_links(containers, (topic,), _LINKS_AT_OPENING)
-    return [*dict.fromkeys((link.parent, link.child) for link in read)]
+def _links(containers: Sequence[Container], topic: str) -> dict[tuple[str, str], Transform3]:
+    """(parent, child) of the links on a topic, in their order, each with its first transform."""
+    found: dict[tuple[str, str], Transform3] = {}
+    for link in read_links(containers, (topic,), _LINKS_AT_OPENING):
+        found.setdefault((link.parent, link.child), link.transform)
+    return found
 
 
 def _nearest(
@@ -184,6 +197,27 @@ def _nearest(
             )
         )
     return groups[order[0]]
+
+
+def _topmost_link(
+    moving: Sequence[tuple[str, str]], resting: Sequence[tuple[str, str]], lasers: Sequence[str], base: str | None
+) -> tuple[str, str] | None:
+    """(parent, child) of the dynamic link nearest to the root, or above the base; a map's pose is no odometry.
+
+    Meant where the user says that transforms are the odometry and no frame has the name of one (`world`, say).
+    """
+    dynamic = [link for link in moving if not is_map_frame(link[0])]
+    if base is not None:
+        return next((link for link in dynamic if base in (link[1], last_name(link[1]))), None)
+    parents = {child: parent for parent, child in [*moving, *resting]}
+    top = None
+    for frame in lasers:
+        seen = {frame}
+        while (above := parents.get(frame)) is not None and above not in seen:
+            top = (above, frame) if (above, frame) in dynamic else top
+            seen.add(above)
+            frame = above
+    return top
 
 
 def odometry_link(

@@ -77,6 +77,7 @@ def read_metadata(path: Path) -> MapMetadata:
 
 def _image(path: Path, image: str) -> Path:
     """The image that a YAML names; where that path is of another machine, the file of that name beside the YAML."""
+    image = image.strip()
     named = path.parent / image
     name = image.replace("\\", "/").rstrip("/").rpartition("/")[2]
     beside = path.parent / name
@@ -192,8 +193,11 @@ def _read_image(path: Path, metadata: MapMetadata) -> _Pixels:
                 opened.load()
                 return _planes(opened, metadata.mode)
     except FileNotFoundError as error:
+        others = sorted(each.name for each in path.parent.iterdir() if each.suffix.lower() in IMAGES)
+        there = f"; there is {', '.join(others[:3])}" if others else ""
         raise MapError(
             f"{path}: its image {image} does not exist; put {image.name} beside the YAML, or name it under `image:`"
+            f"{there}"
         ) from error
     except UnidentifiedImageError as error:
         raise MapError(f"{image}: is no PGM, PNG or BMP image; convert it to one of them") from error

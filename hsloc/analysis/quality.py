@@ -9,7 +9,7 @@ import numpy as np
 from hsloc.localisation.states import localisation_reasons
 from hsloc.model.estimate import Status
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
-from hsloc.slam.time_offset import Headings, find_offset, offset_warning, offsets_of_log
+from hsloc.slam.time_offset import Headings, clock_warnings, drift_warning, find_drift, find_offset, offsets_of_log
 from hsloc.trajectory_io.tum import NS_PER_S
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -96,18 +96,17 @@ def offset_warnings(result: Result) -> list[RunWarning]:
         there = np.interp(stamps, odometry.stamps_ns, np.unwrap(odometry.poses[:, 2]))
         theta = result.trajectory.poses[rows, 2] - odometry.poses[rows, 2] + there
     scans = Headings.of(stamps[matched], theta[matched])
-    offset = find_offset(scans, Headings.of(odometry.stamps_ns, odometry.poses[:, 2]))
-    if not offset.is_significant:
-        return []
+    turned = Headings.of(odometry.stamps_ns, odometry.poses[:, 2])
+    offset = find_offset(scans, turned)
+    is_lost = 2 * np.count_nonzero(matched) < len(matched)
+    if not (offset.is_significant or is_lost):
+        drift = find_drift(scans, turned, offset.seconds)
+        return [drift_warning(result.summary.scan_topic or "the scans", drift)] if drift else []
     # Poses are weighed with the odometry, which hides a part of the offset: the scans alone show the whole of it.
     request = result.request
     found = offsets_of_log(request.logs, request.reading(), request.config.graph_mapper.front_end)
     given = request.read.offsets_s()
-    return [
-        offset_warning(topic, each, given.get(topic.lstrip("/"), 0.0))
-        for topic, each in found.items()
-        if each.is_significant
-    ]
+    return [warning for _, warning in clock_warnings(found, given)]
 
 
 def verdict_reasons(result: Result, warnings: Sequence[RunWarning]) -> tuple[VerdictReason, ...]:

@@ -89,10 +89,9 @@ def _offsets(arguments: argparse.Namespace, log: Log) -> dict[str, Offset]:
 def _of_clocks(found: Mapping[str, Offset]) -> list[Finding]:
     """Findings of the offsets that are none by chance."""
     from hsloc.log import Finding, Severity
-    from hsloc.slam.time_offset import offset_warning
+    from hsloc.slam.time_offset import clock_warnings
 
-    warnings = [(topic, offset_warning(topic, offset)) for topic, offset in found.items() if offset.is_significant]
-    return [Finding(w.code, Severity.WARNING, topic, w.text, w.remedy, 1) for topic, w in warnings]
+    return [Finding(w.code, Severity.WARNING, topic, w.text, w.remedy, 1) for topic, w in clock_warnings(found)]
 
 
 def _values(report: CheckReport, paths: list[str], start_ns: int) -> dict[str, Any]:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = [
     "LEAST_JUMP",
     "LONGEST_JUMP_S",
+    "LONGEST_OFFSET_S",
     "MAX_SPEED",
     "TF",
     "TF_NAMES",
@@ -66,7 +67,7 @@ _MODULES = {
     "session.extrinsics": ("read_calibration",),
     "session.topic_selection": ("TF", "TF_NAMES"),
     "session.transform_topics": ("is_static_topic",),
-    "summary": ("LaserSummary", "LogSummary", "Losses", "ReadOptions"),
+    "summary": ("LONGEST_OFFSET_S", "LaserSummary", "LogSummary", "Losses", "ReadOptions"),
     "transforms": ("FrameTree", "Transform3"),
     "writer": ("LogWriter",),
 }

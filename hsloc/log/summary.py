@@ -307,7 +307,10 @@ class Losses:
             ("stamps jump out of line and were not trusted for the order", self.stamp_jumps),
             ("messages without stamp; the log's time was taken", self.stamps_zero),
             ("messages without stamp were dropped", self.stamps_zero_dropped),
-            ("orientations are quaternions of zeros; the heading 0 was taken", self.orientations_unset),
+            (
+                "orientations are quaternions of zeros: left out between others, else taken as heading 0",
+                self.orientations_unset,
+            ),
         )
         plain = (
             (self.damaged_chunks, "damaged chunks were skipped"),

@@ -58,7 +58,7 @@ _CLEAR, _WIDEST = 0.2, 1.2
 """Smallest and largest rotation (rad) between two scans that is looked for."""
 _COMPARED_BEAMS = 360
 _UNSET_WAY = 0.3
-"""Metres of driving without any heading after which it will not come any more."""
+"""Metres of driving without a heading after which it will not come any more."""
 
 
 class ContinuousOdometry:
@@ -139,7 +139,7 @@ class OdometryWatch:
         self._old: tuple[int, NDArray[np.float32]] | None = None
         self._moving_ns = 0
         self._last_scan_ns = 0
-        self._unset = True
+        self._had_heading = False
         self._turns = False
         self._heading = 0.0
         self._turned: deque[float] = deque(maxlen=_TURNS)
@@ -164,11 +164,13 @@ class OdometryWatch:
             self._pose, self._since_ns, self._moving_ns = pose, event.stamp_ns, 0
         self._turns |= last is not None and pose.theta != self._heading
         self._heading = pose.theta
-        self._unset &= not event.has_heading
-        if self._start is None:
+        self._had_heading |= event.has_heading
+        if self._start is None or event.has_heading:
             self._start = (pose.x, pose.y)
-        if self._unset and hypot(pose.x - self._start[0], pose.y - self._start[1]) > _UNSET_WAY:
-            raise UnusableOdometry("its orientations are never set (quaternions of zeros)")
+        # Between others a few are left out when the log is read; those that come have none around them.
+        way = hypot(pose.x - self._start[0], pose.y - self._start[1])
+        if not event.has_heading and (self._had_heading or way > _UNSET_WAY):
+            raise UnusableOdometry("its orientations are not set (quaternions of zeros)")
 
     def _compare(self, scan: Scan) -> None:
         """Count the time for which the scans change and the odometry does not."""

@@ -29,7 +29,7 @@ from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.point_mapper import PointMapper
 from hsloc.slam.stated_loops import StatedLoops
-from hsloc.slam.time_offset import HINT_S, as_option, in_words, offset_warning, offsets_of_log
+from hsloc.slam.time_offset import HINT_S, as_option, clock_warnings, offsets_of_log
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -220,13 +220,13 @@ def _run_with(
         for event, estimate in replay(_reported(log, events, history, progress), estimator, deskew=deskew, first=first):
             history.add(event, estimate)
     replayed = time.perf_counter()
+    lost = "".join(f": {line}" for line in ["; ".join([*log.losses.lines(), *log.losses.reasons])] if line)
     if history.scans == 0:
         where = "between --start and --end" if _cut(request) else f"on {log.summary.scan_topic} that could be read"
-        lost = "".join(f": {line}" for line in ["; ".join([*log.losses.lines(), *log.losses.reasons])] if line)
         raise LogError(f"{request.logs[0]}: no scan {where}{lost}")
     if first is None and not lidar_only:
         where = "between --start and --end" if _cut(request) else f"on {log.summary.odom_topic} that could be read"
-        raise LogError(f"{request.logs[0]}: no odometry {where}")
+        raise LogError(f"{request.logs[0]}: no odometry {where}{lost}; the scans alone can do: --no-odom")
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
     mapping, true_grid = None, None if localise else grid
     if isinstance(estimator, Mapper):
@@ -279,18 +279,9 @@ def with_offset(request: RunRequest, log: Log) -> tuple[Log, tuple[RunWarning, .
         return log, ()
     found = offsets_of_log(request.logs, request.reading(), request.config.graph_mapper.front_end)
     option = as_option(found)
-    if option is None:
-        return log, ()
-    if not automatic:
-        return log, tuple(offset_warning(topic, offset) for topic, offset in found.items() if offset.is_significant)
-    warnings = tuple(
-        RunWarning(
-            WarningCode.CLOCK_OFFSET_APPLIED,
-            f"the stamps of {topic} were {in_words(offset)} those of the odometry, which was corrected",
-        )
-        for topic, offset in found.items()
-        if offset.is_significant
-    )
+    warnings = tuple(warning for _, warning in clock_warnings(found, removed=automatic))
+    if option is None or not automatic:
+        return log, warnings
     return open_log(request.logs, replace(request.reading(), time_offset=option)), warnings
 
 

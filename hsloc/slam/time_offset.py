@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hsloc.log import open_log
+from hsloc.log import LONGEST_OFFSET_S, open_log
 from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.options import AUTO
 from hsloc.slam.laser_odometry import with_laser_odometry
@@ -49,6 +49,11 @@ _LONGEST_HALF_S = 0.5
 _MIN_STEPS = 20
 _HUBER = 1.345
 """Scale of the robust weights in standard deviations (Huber 1981): 95 % efficient on Gaussian errors."""
+_LEAST_AGREEMENT = 0.8
+"""Correlation of the rotations of scans and odometry from which on an offset is believed: what is left explains a third
+of the rotation at most. Offsets of scans whose angles are wrong reach less."""
+_CORRELATED_S = 0.5
+"""Time (s) over which rotations are correlated: longer than the noise of a scan, shorter than a turn."""
 SIGNIFICANT = 4.0
 """Minimum ratio of an offset to its standard deviation; under Gaussian errors once in 16,000 runs."""
 HINT_S = 0.15
@@ -68,6 +73,10 @@ class Offset(NamedTuple):
 
     seconds: float
     sigma: float
+    drift_s: float = 0.0
+    """By how much it grows from the first scan to the last (s), where that matters and is not chance."""
+    is_mirrored: bool = False
+    """The scans turn the other way than the odometry: then there is no offset."""
 
     @property
     def is_significant(self) -> bool:
@@ -187,15 +196,53 @@ def estimate_offset(
     if not scans or not odometry:
         return UNKNOWN
     turns, odometry_turns = _headings(scans), _headings(odometry)
+    found = _best_offset(turns, odometry_turns)
+    if _agreement(turns, odometry_turns, found.seconds) >= _LEAST_AGREEMENT:
+        return found._replace(drift_s=find_drift(turns, odometry_turns, found.seconds))
+    mirrored = Headings(turns.stamps_ns, -turns.theta)
+    back = find_offset(_thinned(mirrored), odometry_turns)
+    if isfinite(back.sigma) and _agreement(mirrored, odometry_turns, back.seconds) >= _LEAST_AGREEMENT:
+        return UNKNOWN._replace(is_mirrored=True)
+    return UNKNOWN
+
+
+def _best_offset(turns: Headings, odometry: Headings) -> Offset:
     # By steps of half a second and more the rotation stands out of the noise of single scans.
-    near = find_offset(_thinned(turns), odometry_turns)
-    whole = find_offset(_thinned(turns), odometry_turns, near_s=RANGE_S)
+    near = find_offset(_thinned(turns), odometry)
+    whole = find_offset(_thinned(turns), odometry, near_s=RANGE_S)
     if not isfinite(whole.sigma):
         return near
-    limit = 1.2 * _misfit(turns, odometry_turns, whole.seconds)
-    if isfinite(near.sigma) and _misfit(turns, odometry_turns, near.seconds) <= limit:
+    limit = 1.2 * _misfit(turns, odometry, whole.seconds)
+    if isfinite(near.sigma) and _misfit(turns, odometry, near.seconds) <= limit:
         return near
     return whole
+
+
+def find_drift(scans: Headings, odometry: Headings, offset_s: float) -> float:
+    """By how much the offset grows from the first scan to the last (s); 0 where that may be chance or does not matter.
+
+    The offsets of both halves of the scans are compared, each as far from the other as half of the whole.
+    """
+    scans = _thinned(scans)
+    middle = len(scans.theta) // 2
+    halves = [
+        find_offset(Headings(scans.stamps_ns[part], scans.theta[part]), odometry, start_s=offset_s)
+        for part in (slice(0, middle), slice(middle, None))
+    ]
+    change = Offset(halves[1].seconds - halves[0].seconds, sqrt(halves[0].sigma ** 2 + halves[1].sigma ** 2))
+    return 2.0 * change.seconds if change.is_significant and 2.0 * abs(change.seconds) >= LARGE_S else 0.0
+
+
+def _agreement(scans: Headings, odometry: Headings, offset_s: float) -> float:
+    """The correlation (-1 to 1) of the rotations between scans with those of the odometry, an offset removed."""
+    thinned = _thinned(scans, _CORRELATED_S)
+    at = thinned.stamps_ns - round(offset_s * NANOSECONDS)
+    inside = (at >= odometry.stamps_ns[0]) & (at <= odometry.stamps_ns[-1])
+    if inside.sum() < 3:
+        return 0.0
+    seen = np.diff(thinned.theta[inside])
+    turned = np.diff(np.interp(at[inside].astype(np.float64), odometry.stamps_ns.astype(np.float64), odometry.theta))
+    return float(np.sum(seen * turned) / max(sqrt(float(np.sum(seen**2) * np.sum(turned**2))), 1e-12))
 
 
 def half_sweep_ns(scan: Scan) -> int:
@@ -241,9 +288,16 @@ def offsets_of_log(paths: Sequence[Path], options: ReadOptions, parameters: Fron
     for topic in topics if options.stamps == "header" else ():
         # A text log has no topics to choose from.
         named = replace(options, scan_topic=topic) if len(topics) > 1 else options
-        offset = estimate_offset(open_log(paths, named).events(), parameters, np.random.default_rng(0))
-        if isfinite(offset.sigma):
-            found[topic] = offset
+        log = open_log(paths, named)
+        # Clocks that are far apart are searched around what the log's times show.
+        apart = log.summary.clocks_apart_s
+        apart = apart if 0.5 * RANGE_S < abs(apart) <= LONGEST_OFFSET_S else 0.0
+        if apart:
+            items = [*([given] if given else []), f"{_first(topic)}={-apart!r}"]
+            log = open_log(paths, replace(named, time_offset=",".join(items)))
+        offset = estimate_offset(log.events(), parameters, np.random.default_rng(0))
+        if isfinite(offset.sigma) or offset.is_mirrored:
+            found[topic] = offset._replace(seconds=offset.seconds + apart)
     return found
 
 
@@ -251,6 +305,42 @@ def in_words(offset: Offset) -> str:
     """An offset with its uncertainty, to be followed by what it is counted from."""
     word = "later than" if offset.seconds > 0.0 else "earlier than"
     return f"{abs(offset.seconds):.3f} +- {offset.sigma:.3f} s {word}"
+
+
+def clock_warnings(
+    found: Mapping[str, Offset], given: Mapping[str, float] | None = None, removed: bool = False
+) -> list[tuple[str, RunWarning]]:
+    """(topic, warning) of the offsets that are none by chance, of clocks that drift, and of scans that are mirrored.
+
+    `given` is what the user adds to the stamps already (s) by topic, without its leading slash; `removed` says that the
+    offsets were removed.
+    """
+    warnings = []
+    for topic, offset in found.items():
+        if offset.is_mirrored:
+            text = (
+                f"the scans of {topic} turn the other way than the odometry: the lidar is mounted upside down, or its "
+                "angles have the wrong sign"
+            )
+            remedy = "--scan-fix angles=negate turns them; increment=negate, if only that has the wrong sign"
+            warnings.append((topic, RunWarning(WarningCode.SCANS_MIRRORED, text, remedy)))
+        if offset.is_significant and removed:
+            text = f"the stamps of {topic} were {in_words(offset)} those of the odometry, which was corrected"
+            warnings.append((topic, RunWarning(WarningCode.CLOCK_OFFSET_APPLIED, text)))
+        elif offset.is_significant:
+            warnings.append((topic, offset_warning(topic, offset, (given or {}).get(topic.lstrip("/"), 0.0))))
+        if offset.drift_s:
+            warnings.append((topic, drift_warning(topic, offset.drift_s)))
+    return warnings
+
+
+def drift_warning(topic: str, drift_s: float) -> RunWarning:
+    """The warning of clocks that do not run equally fast; `drift_s` is by how much they part from start to end (s)."""
+    return RunWarning(
+        WarningCode.CLOCK_DRIFT,
+        f"the clocks of {topic} and the odometry drift apart by about {abs(drift_s):.1f} s during the log, by their headings",
+        "--stamps log takes the times at which messages were recorded; synchronise the clocks (chrony, PTP)",
+    )
 
 
 def offset_warning(topic: str, offset: Offset, given_s: float = 0.0) -> RunWarning:

@@ -199,7 +199,7 @@ def test_a_start_pose_in_the_frame_of_the_odometry_is_moved_or_left_out(tmp_path
 
 def test_orientations_of_zeros_are_counted(tmp_path: Path, plain: Path) -> None:
     def zeroed(number: int, name: str, data: bytes) -> bytes:
-        if name != definitions.ODOMETRY or number >= 40:
+        if name != definitions.ODOMETRY or not (number < 40 or 80 < number < 84):
             return data
         pose = len(data) - 680
         return data[: pose + 24] + bytes(32) + data[pose + 56 :]
@@ -207,9 +207,8 @@ def test_orientations_of_zeros_are_counted(tmp_path: Path, plain: Path) -> None:
     items = [(s, c, t, zeroed(n, s.name, data)) for n, (s, c, t, data) in enumerate(log_formats.messages(plain))]
     log = open_log(log_formats.write(tmp_path / "zeros.mcap", items))
     events = list(log.events())
-    assert (
-        sum(not getattr(event, "has_heading", True) for event in events) == log.losses.orientations_unset["/odom"] > 5
-    )
+    unset = sum(not getattr(event, "has_heading", True) for event in events)
+    assert log.losses.orientations_unset["/odom"] > unset > 5, "those between others are left out"
     assert replace_losses(log.losses) == Losses()
 
 

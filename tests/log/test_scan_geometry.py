@@ -87,6 +87,8 @@ def test_sound_scans_raise_no_word(changes: dict[str, float]) -> None:
         ({"increment": TURN / 180}, "scan_angle_increment", "increment=0.0174533"),
         ({"low": -180.0, "increment": 1.0}, "scan_angle_unit", "angles=degrees"),
         ({"beams": 271, "low": -135.0, "increment": 1.0}, "scan_angle_unit", "angles=degrees"),
+        ({"increment": 1.0, "high": pi}, "scan_angle_unit", "increment=angles"),
+        ({"low": -180.0, "high": 179.0}, "scan_angle_unit", "angles=degrees,increment=angles"),
         ({"step": 0.1 / 360 / 1000}, "scan_time_increment", "time_increment=interval"),
         ({"step": 0.1 / 360 / 20}, "scan_time_increment", "time_increment=interval"),
         ({"step": 0.1 / 360 * 50}, "scan_time_increment", "time_increment=interval"),
@@ -102,6 +104,9 @@ def test_what_does_not_fit_is_named_with_the_flag(changes: dict[str, float], cod
 
 def test_limits_and_ranges_of_another_unit_are_named_and_corrected() -> None:
     plain = scans(1)[0]
+    scan = plain._replace(ranges=plain.ranges * 100, range_min=5.0, range_max=1200.0)
+    assert codes([scan]) == ["scan_range_unit"]
+    assert codes([ScanFixes.parse("ranges=centimetres").apply(scan, 0.1)]) == []
     near = plain._replace(range_min=50.0, range_max=12e3)
     assert codes([near]) == ["scan_range_min"]
     assert codes([ScanFixes.parse("range_min=0.05").apply(near, 0.1)]) == []
@@ -120,6 +125,8 @@ def test_limits_and_ranges_of_another_unit_are_named_and_corrected() -> None:
         ({"increment": -TURN / 360, "high": pi - TURN / 360}, "increment=angles"),
         ({"increment": -TURN / 360, "high": pi - TURN / 360}, "increment=negate"),
         ({"low": -180.0, "increment": 1.0, "high": 179.0}, "angles=degrees"),
+        ({"low": -180.0, "high": 179.0}, "angles=degrees,increment=angles"),
+        ({"low": pi, "increment": -TURN / 360, "high": TURN / 360 - pi}, "angles=negate"),
         ({"step": 1e-9}, "time_increment=interval"),
     ],
 )
@@ -174,6 +181,22 @@ def test_segments_become_turns(count: int, skipped: int, clockwise: bool) -> Non
         np.testing.assert_array_equal(turn.ranges, scan.ranges)
         assert turn.angle_min == scan.angle_min
         assert turn.time_increment == pytest.approx(scan.time_increment, rel=1e-3)
+
+
+def test_segments_that_overlap_become_turns() -> None:
+    whole = scans(6)
+    parts = []
+    for scan in whole:
+        for number, part in enumerate(in_segments([scan], 6)):
+            shared = 5 if number else 0
+            begin = number * 60 - shared
+            low = scan.angle_min + begin * scan.angle_increment
+            parts.append(part._replace(ranges=scan.ranges[begin : begin + 60 + shared], angle_min=low))
+    found = survey(parts)
+    assert found.segments == 6
+    assembler = TurnAssembler(found)
+    turns = [turn for part in parts for turn in assembler.add(part)]
+    assert [turn.ranges.tolist() for turn in turns] == [scan.ranges.tolist() for scan in whole]
 
 
 def test_a_lost_segment_splits_a_turn_and_no_other() -> None:

@@ -54,9 +54,10 @@ def rewritten(target: Path, change: Callable[[int, Pose2], Pose2 | None]) -> Pat
     [
         (lambda number, pose: Pose2(0.0, 0.0, 0.0), "does not move"),
         (lambda number, pose: pose if number < 200 else Pose2(1.0, 2.0, 0.5), "does not move"),
-        (lambda number, pose: None, "never set"),
+        (lambda number, pose: None, "not set"),
+        (lambda number, pose: pose if number < 150 else None, "not set"),
     ],
-    ids=["zero", "freezes", "no heading"],
+    ids=["zero", "freezes", "no heading", "heading lost"],
 )
 def test_unusable_odometry_is_ignored_with_a_warning(
     tmp_path: Path, change: Callable[[int, Pose2], Pose2 | None], reason: str

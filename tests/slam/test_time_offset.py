@@ -17,7 +17,16 @@ from hsloc.model import Odometry, Scan
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
 from hsloc.slam.front_end import FrontEndParameters
-from hsloc.slam.time_offset import UNKNOWN, Headings, as_option, estimate_offset, find_offset, offsets_of_log
+from hsloc.slam.time_offset import (
+    UNKNOWN,
+    Headings,
+    as_option,
+    clock_warnings,
+    estimate_offset,
+    find_drift,
+    find_offset,
+    offsets_of_log,
+)
 
 OFFICE = Path(__file__).resolve().parents[2] / "recordings" / "office.mcap"
 END = ReadOptions(end_s=30.0)
@@ -61,6 +70,24 @@ def test_a_robot_that_does_not_turn_does_not_determine_it() -> None:
 def test_clocks_that_are_seconds_apart_are_found_over_the_whole_range() -> None:
     for offset in (-20.0, 3.2, 30.0):
         assert find_offset(*headings(2, offset, 0.002), near_s=40.0).seconds == pytest.approx(offset, abs=0.02)
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.3, -0.5])
+def test_clocks_that_drift_are_told_from_an_offset(drift: float) -> None:
+    scans, odometry = headings(3, 0.1, 0.001)
+    first, last = scans.stamps_ns[[0, -1]]
+    share = (scans.stamps_ns - first) / (last - first)
+    moved = Headings(scans.stamps_ns + np.round(share * drift * 1e9).astype(np.int64), scans.theta)
+    assert find_drift(moved, odometry, 0.1 + 0.5 * drift) == pytest.approx(drift, abs=0.4 * abs(drift))
+
+
+def test_scans_that_turn_against_the_odometry_are_mirrored_and_not_late() -> None:
+    fix = replace(END, scan_fix="angles=negate")
+    (found,) = offsets_of_log((OFFICE,), fix, FrontEndParameters()).values()
+    assert found.is_mirrored
+    assert not found.is_significant
+    ((_, warning),) = clock_warnings({"/scan": found})
+    assert "angles=negate" in warning.remedy
 
 
 @pytest.mark.parametrize("late", [0.0, 0.1, -0.25])

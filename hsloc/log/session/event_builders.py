@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import cos, isfinite, pi, sin
+from math import cos, hypot, isfinite, pi, sin
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 _LONGEST_S = 1.0
 """A velocity holds for this long (s) at most: publishers that fall silent do so when the robot stands."""
+GAP_METRES = 0.3
+"""Longest way (m) over which orientations may be missing: headings between are interpolated over it."""
 MAX_ABS = 1e7
 """Coordinates beyond (metres) are taken for damage; the Earth's circumference is 4e7."""
 
@@ -181,6 +183,23 @@ class CloudFeed:
         return ((self._clock, scan),)
 
 
+class HeadingGaps:
+    """Which messages without an orientation to leave out: those near one that had it, as some drivers lose single ones.
+
+    Those farther on are passed on: there the orientation is gone for good.
+    """
+
+    def __init__(self) -> None:
+        self._at: Pose2 | None = None
+
+    def is_gap(self, pose: Pose2, has_heading: bool) -> bool:
+        """Whether to leave out the topic's next message."""
+        if has_heading:
+            self._at = pose
+            return False
+        return self._at is not None and hypot(pose.x - self._at.x, pose.y - self._at.y) <= GAP_METRES
+
+
 class OdometryFeed:
     """Messages with a pose to Odometry, or to Truth; the covariance of all but nav_msgs/Odometry is unknown."""
 
@@ -195,6 +214,7 @@ class OdometryFeed:
         self._losses = losses
         self.is_truth = is_truth
         self._T_child_base = T_child_base
+        self._gaps = HeadingGaps()
 
     def events(self, message: OdometryMessage | PoseMessage, log_time_ns: int) -> Iterable[Stamped]:
         """One pose."""
@@ -203,6 +223,7 @@ class OdometryFeed:
             return ()
         if not is_usable(message.pose):
             self._losses.invalid_messages[self.topic] += 1
+            self._losses.note(f"{self.topic}: poses hold NaN or infinity, or are beyond {MAX_ABS:g} m")
             return ()
         pose = message.pose if self._T_child_base is None else message.pose @ self._T_child_base
         if self.is_truth:
@@ -210,6 +231,8 @@ class OdometryFeed:
         has_heading = any(getattr(message, "quaternion", (1.0,)))
         if not has_heading:
             self._losses.orientations_unset[self.topic] += 1
+        if self._gaps.is_gap(message.pose, has_heading):
+            return ()
         return ((self._clock, Odometry(stamp, pose, message.covariance, has_heading)),)
 
     def arrivals(self, columns: PoseColumns, places: Sequence[int], log_times: Sequence[int]) -> Arrivals | None:
@@ -223,6 +246,7 @@ class OdometryFeed:
         if self._clock.offset_ns:
             stamps = [stamp + self._clock.offset_ns for stamp in stamps]
         poses: Iterable[Pose2] = map(Pose2, x.tolist(), y.tolist(), theta)
+        self._gaps.is_gap(Pose2(float(x[-1]), float(y[-1]), 0.0), has_heading=True)
         T_child_base = self._T_child_base
         if T_child_base is not None:
             poses = [pose @ T_child_base for pose in poses]
@@ -306,6 +330,7 @@ class TransformFeed:
         self._losses = losses
         self._T_child_base = T_child_base
         self._T_map_odom: Transform3 | None = None
+        self._gaps = HeadingGaps()
 
     def events(self, message: list[LinkMessage], log_time_ns: int) -> Iterable[Stamped]:
         """Events of the links that matter."""
@@ -335,7 +360,8 @@ class TransformFeed:
                 has_heading = any(link.transform.rotation)
                 if not has_heading:
                     self._losses.orientations_unset[self.topic] += 1
-                yield self._odometry, Odometry(stamp, pose, None, has_heading)
+                if not self._gaps.is_gap(pose, has_heading):
+                    yield self._odometry, Odometry(stamp, pose, None, has_heading)
         if self._truth is None:
             return
         stamp = self._truth.stamp(link.stamp_ns, log_time_ns)

@@ -22,7 +22,7 @@ from hsloc.log.session.topic_selection import (
     of_type,
 )
 from hsloc.log.session.transform_topics import BASE_FRAMES, choose_transforms, is_map_frame
-from hsloc.log.summary import LaserSummary, LogSummary, Losses, ReadOptions, TopicSummary
+from hsloc.log.summary import LONGEST_OFFSET_S, LaserSummary, LogSummary, Losses, ReadOptions, TopicSummary
 from hsloc.model import IDENTITY
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -350,27 +350,33 @@ class LogSession:
         """The first effective stamp."""
         firsts = [first for first in (*self.scans.values(), self.odom) if first is not None]
         stamps = [first.start_log_ns if in_log_time else first.origin_ns for first in firsts]
-        if self.choice.odom == TF:
-            stamps += self._first_transform(in_log_time)
+        link = self._first_transform()
+        if link is not None:
+            stamps.append(link[0] if in_log_time or not link[1] else link[1])
         if not stamps and self.truth is not None:
             stamps.append(self.truth.start_log_ns if in_log_time else self.truth.origin_ns)
         return min(stamps, default=0)
 
-    def _first_transform(self, in_log_time: bool) -> list[int]:
-        for log_time, message in self.messages(TF, definitions.TF_MESSAGE):
+    def _first_transform(self) -> tuple[int, int] | None:
+        """(log time, stamp) of the first transform that is odometry, where transforms are."""
+        for log_time, message in self.messages(TF, definitions.TF_MESSAGE) if self.choice.odom == TF else ():
             for link in message:
                 if (link.parent, link.child) == self.tf_frames:
-                    return [log_time if in_log_time or not link.stamp_ns else link.stamp_ns]
-        return []
+                    return log_time, link.stamp_ns
+        return None
 
     def _warn_of_clocks(self) -> None:
         self._clocks_apart_s = 0.0
-        if self.odom is None or not self.odom.stamp_ns:
+        odom = self._first_transform() if self.odom is None else (self.odom.log_time_ns, self.odom.stamp_ns)
+        if odom is None or not odom[1]:
             return
         for topic, first in self.scans.items():
             if first is None or not first.stamp_ns:
                 continue
-            apart = (first.stamp_ns - first.log_time_ns) - (self.odom.stamp_ns - self.odom.log_time_ns)
+            stamps, log_times = first.stamp_ns - odom[1], first.log_time_ns - odom[0]
+            if abs(stamps) < _SAME_CLOCK_NS < abs(log_times):  # It is the log's times that are wrong.
+                continue
+            apart = stamps - log_times
             if abs(apart) / 1e9 > abs(self._clocks_apart_s):
                 self._clocks_apart_s = apart / 1e9
             if abs(apart) > _CLOCKS_APART_NS:
@@ -379,6 +385,8 @@ class LogSession:
                         WarningCode.CLOCKS_APART,
                         f"the stamps of {topic} and {self.choice.odom} are {apart / 1e9:.1f} s apart, measured by the "
                         "log's clock: they may come from different clocks",
-                        "try --time-offset auto, or --stamps log",
+                        "try --time-offset auto, or --stamps log"
+                        if abs(apart) <= LONGEST_OFFSET_S * 1e9
+                        else "--stamps log takes the times at which messages were recorded",
                     )
                 )

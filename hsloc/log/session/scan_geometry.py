@@ -48,7 +48,11 @@ _FARTHEST_M = 500.0
 """No planar lidar measures as far [m]: readings that are larger are not in metres."""
 
 
-_ONLY = {"angles": ("degrees",), "echo": ("strongest",), "ranges": ("millimetres",)}
+_WIDEST_OVERLAP = 0.25
+"""Part of a segment that the one before may have, too."""
+_FAR_M = 100.0
+"""Half of the readings of a planar lidar are never farther [m]: it would have to stand in an empty field."""
+_ONLY = {"angles": ("degrees", "negate"), "echo": ("strongest",), "ranges": ("millimetres", "centimetres")}
 """Fields of `--scan-fix` that take a word alone."""
 
 
@@ -68,9 +72,10 @@ class ScanFixes:
     """Fields of scans that are overridden (`--scan-fix`). None and False leave the field as it is.
 
     `increment` is an angle in radians, or `angles` (from angle_min, angle_max and the number of beams) or `negate`;
-    `degrees` says that all angles are in degrees; `time_increment` is a time in seconds, or `interval` (from the time
-    between scans); `range_min` and `range_max` are in metres; `millimetres` says that ranges are in millimetres, and
-    their limits, too, if no lidar measures as far; `strongest` takes of each beam the strongest echo, not the first.
+    `degrees` says that all angles are in degrees, `negate` that all have the wrong sign; `time_increment` is a time in
+    seconds, or `interval` (from the time between scans); `range_min` and `range_max` are in metres; `millimetres` and
+    `centimetres` say that ranges are, and their limits, too, if no lidar measures as far; `strongest` takes of each
+    beam the strongest echo, not the first.
     """
 
     increment: float | str | None = None
@@ -80,6 +85,8 @@ class ScanFixes:
     range_max: float | None = None
     strongest: bool = False
     millimetres: bool = False
+    centimetres: bool = False
+    negate: bool = False
 
     @staticmethod
     def parse(text: str | None) -> ScanFixes:
@@ -109,6 +116,8 @@ class ScanFixes:
         low, increment, high = message.angle_min, message.angle_increment, message.angle_max
         if self.degrees:
             low, increment, high = radians(low), radians(increment), radians(high)
+        if self.negate:
+            low, increment, high = -low, -increment, -high
         if self.increment == "angles" and len(message.ranges) > 1 and isfinite(high):
             increment = (high - low) / (len(message.ranges) - 1)
         elif self.increment == "negate":
@@ -124,10 +133,11 @@ class ScanFixes:
             ranges, intensities = strongest_echoes(*message.echoes)
             message = message._replace(ranges=ranges, intensities=intensities)
         nearest, farthest = message.range_min, message.range_max
-        if self.millimetres:
-            message = message._replace(ranges=message.ranges * np.float32(0.001))
+        unit = 0.001 if self.millimetres else 0.01 if self.centimetres else 1.0
+        if unit < 1.0:
+            message = message._replace(ranges=message.ranges * np.float32(unit))
             if farthest > _FARTHEST_M:
-                nearest, farthest = 0.001 * nearest, 0.001 * farthest
+                nearest, farthest = unit * nearest, unit * farthest
         return message._replace(
             angle_min=low,
             angle_increment=increment,
@@ -205,6 +215,9 @@ def _angles(scan: ScanMessage) -> Problem | None:
     is_one_turn = abs(increment) * (beams - 1) <= _LONGEST_TURN
     if is_one_turn and min(abs(end - high + turn) for turn in (-_TURN, 0.0, _TURN)) <= tolerance:
         return None
+    mixed = _mixed_units(low, high, increment, beams - 1, tolerance)
+    if mixed is not None:
+        return mixed
     text = (
         f"angle_min {low:.4f} and {beams} beams of angle_increment {increment:.5f} end at {end:.4f} rad, angle_max is "
         f"{high:.4f}"
@@ -216,6 +229,18 @@ def _angles(scan: ScanMessage) -> Problem | None:
     return Problem(WarningCode.SCAN_ANGLE_INCREMENT, text, remedy)
 
 
+def _mixed_units(low: float, high: float, increment: float, steps: int, tolerance: float) -> Problem | None:
+    """Whether the angles fit each other if the increment alone is in degrees, or the limits alone are."""
+    if abs(low + steps * radians(increment) - high) <= tolerance:
+        text, remedy = f"angle_increment {increment:g} fits the other angles as degrees", "--scan-fix increment=angles"
+    elif abs(radians(low) + steps * increment - radians(high)) <= tolerance:
+        text = f"angle_min {low:g} and angle_max {high:g} fit angle_increment {increment:g} as degrees"
+        remedy = "--scan-fix angles=degrees,increment=angles"
+    else:
+        return None
+    return Problem(WarningCode.SCAN_ANGLE_UNIT, text, f"{remedy} reads them so")
+
+
 _REPAIR = "repair the driver; --scan-fix overrides a field"
 
 
@@ -224,11 +249,14 @@ def _ranges(scans: Sequence[ScanMessage]) -> Problem | None:
     limit, nearest = scans[0].range_max, scans[0].range_min
     readings = np.concatenate([scan.ranges[np.isfinite(scan.ranges)] for scan in scans])
     measured = readings[readings > 0.0]
-    if len(measured) and np.median(measured) > _FARTHEST_M:
+    middle = float(np.median(measured)) if len(measured) else 0.0
+    is_odd = not middle < limit < _FARTHEST_M  # The limit makes no sense in metres either.
+    if middle > _FARTHEST_M or (middle > _FAR_M and is_odd):
+        units = ("millimetres", "centimetres") if middle > _FARTHEST_M else ("centimetres", "millimetres")
         return Problem(
             WarningCode.SCAN_RANGE_UNIT,
-            f"half of the readings are beyond {np.median(measured):.0f} m, farther than any lidar measures",
-            "--scan-fix ranges=millimetres reads them as millimetres",
+            f"half of the readings are beyond {middle:.0f} m, farther than planar lidars measure",
+            f"--scan-fix ranges={units[0]} reads them as {units[0]}; or ranges={units[1]}",
         )
     if np.count_nonzero(measured < nearest) > _NEAR_SHARE * max(len(measured), 1):
         share, first = 100.0 * float(np.mean(measured < nearest)), float(np.percentile(measured, 1.0))
@@ -283,18 +311,36 @@ def _segments(scans: Sequence[ScanMessage]) -> tuple[int, float]:
     rising = first.angle_increment > 0.0
     begin = min(starts) if rising else max(starts)
     places = [k for k, start in enumerate(starts) if abs(start - begin) <= _SPARE_BEAMS * abs(first.angle_increment)]
-    turns = np.diff(places)
-    if len(turns) == 0:
+    if len(places) < 2:
         return 1, 0.0
-    return int(np.median(turns)), begin
+    # Segments may be missing; a turn has as many as there are different beginnings.
+    different = np.diff(np.sort(starts)) > _SPARE_BEAMS * abs(first.angle_increment)
+    return 1 + int(np.count_nonzero(different)), begin
 
 
 def _follows(first: ScanMessage, second: ScanMessage) -> bool:
-    """Whether a segment begins where the one before ended."""
-    end = first.angle_min + len(first.ranges) * first.angle_increment
-    off = (second.angle_min - end + pi) % _TURN - pi
+    """Whether a segment begins where the one before ended, or a little before that."""
     tolerance = _SPARE_BEAMS * abs(first.angle_increment) + 1e-3
-    return abs(off) <= tolerance and abs(second.angle_increment - first.angle_increment) <= 1e-6
+    overlap = _overlap(first, second)
+    widest = _WIDEST_OVERLAP * len(second.ranges) * abs(second.angle_increment)
+    same = abs(second.angle_increment - first.angle_increment) <= 1e-6
+    return same and -tolerance <= overlap <= max(widest, tolerance)
+
+
+def _overlap(first: ScanMessage, second: ScanMessage) -> float:
+    """By how much (rad) a segment begins before the end of the one before; negative for a gap."""
+    end = first.angle_min + len(first.ranges) * first.angle_increment
+    return float(copysign(1.0, first.angle_increment) * ((end - second.angle_min + pi) % _TURN - pi))
+
+
+def _without_overlap(first: ScanMessage, second: ScanMessage) -> ScanMessage:
+    """A segment without the beams that the one before has."""
+    shared = round(_overlap(first, second) / abs(second.angle_increment))
+    if not _SPARE_BEAMS < shared < len(second.ranges):
+        return second
+    strengths = None if second.intensities is None else second.intensities[shared:]
+    begin = second.angle_min + shared * second.angle_increment
+    return second._replace(ranges=second.ranges[shared:], intensities=strengths, angle_min=begin)
 
 
 class TurnAssembler:
@@ -318,6 +364,7 @@ class TurnAssembler:
 
     def _turn(self) -> ScanMessage:
         parts, self._parts = self._parts, []
+        parts = [parts[0], *(_without_overlap(a, b) for a, b in pairwise(parts))]
         first, last = parts[0], parts[-1]
         before = sum(len(part.ranges) for part in parts[:-1])
         step = (last.stamp_ns - first.stamp_ns) / 1e9 / before if before else first.time_increment

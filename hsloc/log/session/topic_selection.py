@@ -29,8 +29,10 @@ TF_NAMES = ("tf", "/tf")
 _TRUTH_NAME = re.compile(r"ground_?truth|(^|/)truth($|/)|(^|/)gt($|/)")
 SCAN_TYPES = (definitions.LASER_SCAN, definitions.MULTI_ECHO_LASER_SCAN, definitions.POINT_CLOUD2)
 """What scans are made of, the plainest first."""
-_ECHOES = ("first", "most_intense", "last")
+_ECHOES = ("first", "1st", "most_intense", "2nd", "last", "3rd")
 """Names under which drivers publish the echoes of one laser, the one to read first."""
+_CLOUDS = re.compile(r"/(PointCloud|CustomMsg|VelodyneScan|\w*Packet\w*)$")
+"""Types of point clouds that are not read: of old ROS 1, of Livox, and raw packets."""
 _LISTED = 12
 _ROLLING_PLACES = 4
 _COMPARED_CELLS = 50_000_000
@@ -135,9 +137,9 @@ def choose_scans(
         names = [*dict.fromkeys(name.strip() for name in options.scan_topic.split(","))]
         candidates = sorted(kinds)
     elif len(candidates) > 1:
-        echoes = [topic for topic in candidates if topic.rpartition("/")[2] in _ECHOES]
+        echoes = [topic for topic in candidates if _echo(topic) in _ECHOES]
         if len(echoes) == len(candidates) and len({namespace(topic) for topic in echoes}) == 1:
-            first_echo = min(echoes, key=lambda topic: _ECHOES.index(topic.rpartition("/")[2]))
+            first_echo = min(echoes, key=lambda topic: _ECHOES.index(_echo(topic)))
             warnings.append(
                 RunWarning(
                     WarningCode.SCAN_ECHOES,
@@ -148,6 +150,11 @@ def choose_scans(
             names = [first_echo]
     chosen = [_pick(where, channels, "scan", first, candidates, name, options, warnings) for name in names]
     return {topic: kinds[topic] for topic in chosen if topic is not None}
+
+
+def _echo(topic: str) -> str:
+    """The last part of a topic's name, without `scan_` before it."""
+    return topic.rpartition("/")[2].removeprefix("scan_")
 
 
 def choose_maps(
@@ -236,7 +243,11 @@ def _pick(
     if candidates:
         listing = ", ".join(candidates[:_LISTED])
         remedy = f"choose with {flag} {candidates[0]}"
-        remedy += f", or take all with {flag} {','.join(candidates[:_LISTED])}" if kind == "scan" else ""
+        made = [(a, b) for a in candidates for b in candidates if b.startswith(f"{a}_")]
+        if kind == "scan" and made:
+            remedy += f"; {made[0][1]} may be made of {made[0][0]}, and no laser of its own"
+        elif kind == "scan":
+            remedy += f", or take all with {flag} {','.join(candidates[:_LISTED])}"
         text = f"{where}: {len(candidates)} {what} topics ({listing})"
         warning = RunWarning(WarningCode.TOPIC_AMBIGUOUS, text, remedy)
     else:
@@ -255,6 +266,9 @@ def _pick(
         unread = sorted({c.message_encoding or "nothing" for c in channels if not is_decodable(c) and is_read(c)})
         if unread:
             remedy = f"messages encoded as {', '.join(unread)} are not read: record or convert them as cdr"
+        clouds = [c for c in channels if _CLOUDS.search(c.typename)]
+        if kind == "scan" and clouds and not remedy:
+            remedy = f"convert {clouds[0].topic} to PointCloud2, which is read with --slice LOW,HIGH"
         text = f"{where}: no {what} topic ({typename}); the log holds {listed(channels)}"
         warning = RunWarning(WarningCode.TOPIC_MISSING, text, remedy)
     if required:

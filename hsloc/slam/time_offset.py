@@ -338,7 +338,7 @@ def drift_warning(topic: str, drift_s: float) -> RunWarning:
     """The warning of clocks that do not run equally fast; `drift_s` is by how much they part from start to end (s)."""
     return RunWarning(
         WarningCode.CLOCK_DRIFT,
-        f"the clocks of {topic} and the odometry drift apart by about {abs(drift_s):.1f} s during the log, by their headings",
+        f"the clocks of {topic} and the odometry drift apart by about {abs(drift_s):.1f} s, by their headings",
         "--stamps log takes the times at which messages were recorded; synchronise the clocks (chrony, PTP)",
     )
 

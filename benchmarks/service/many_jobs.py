@@ -116,7 +116,7 @@ def measure(database: Database, folder: Path, file_id: str, repeats: int) -> dic
         nonlocal seq
         seq = house._delete_jobs(before, seq) or 0
 
-    repeat("retention, batch of 100", delete)
+    repeat("retention, one batch", delete)
     storage.close()
     return times
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 SWEEP_S = 3600.0
-BATCH = 100
+BATCH = 25
 """Rows that are deleted in one transaction."""
 KEY_S = 7 * 86400.0
 """An Idempotency-Key is remembered for a week."""

@@ -130,6 +130,9 @@ _OPEN_LOOPS = 2
 """Accepted loops that verify the steps between their ends."""
 _HEALED = 0.9
 """Consistency of the scans before and after refused steps at which these did no harm, as is asked of a loop."""
+_STRAY = 0.8
+"""Consistency of a refused scan with all scans around it below which it is beside its place: simulated ones that were
+0.3 to 0.6 m off had 0.74 to 0.79, and of the right steps of five real logs 95 of 100 have 0.82 and more."""
 _HEALED_WITHIN = 10
 """Keyscans before and after that are compared."""
 _WINDOW = 20
@@ -237,7 +240,7 @@ def _strays(r: Recorded) -> Reason | None:
     paired, conflict = (
         np.bincount(r.pairs.reshape(-1), weights=np.repeat(r.counts[:, k], 2), minlength=len(r.poses)) for k in (0, 1)
     )
-    stray = r.refused & (paired + conflict >= _VISIT_SEEN) & (paired < _HEALED * (paired + conflict))
+    stray = r.refused & (paired + conflict >= _VISIT_SEEN) & (paired < _STRAY * (paired + conflict))
     if not stray.any():
         return None
     text = f"{int(stray.sum())} scan(s) that were refused do not fit the scans around them"

@@ -82,7 +82,7 @@ def _offsets(arguments: argparse.Namespace, log: Log) -> dict[str, Offset]:
         return {}
     try:
         return offsets_of_log(log.summary.paths, read_options(arguments), FrontEndParameters())
-    except HslocError:  # What stands in the way is among the findings.
+    except HslocError:  # The reason is among the findings.
         return {}
 
 

@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from hsloc.log import open_log
 
-    # What is missing or ambiguous is what a user wants to be told here.
+    # What is missing or ambiguous is what a user wants to see here.
     log = open_log(arguments.log, replace(read_options(arguments), require_scan=False, require_odometry=False))
     counts: dict[str, int] = {}
     losses = log.losses

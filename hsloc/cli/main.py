@@ -190,7 +190,7 @@ def program() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         sys.stdout.flush()
-    except OSError:  # Told already; what is left would be told once more by Python itself, with another exit code.
+    except OSError:  # Reported already; Python itself would report what is left again, with another exit code.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(status)
 

@@ -208,7 +208,7 @@ def _changed(thing: T, **changes: tuple[str, object]) -> T:
 
 
 def _numbers(*counts: int) -> Callable[[str], tuple[float, ...]]:
-    """An argument of so many numbers with commas between."""
+    """An argument of a given number of values with commas between."""
 
     def parse(text: str) -> tuple[float, ...]:
         try:

@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _materials(data: Path | None, own: bool) -> tuple[list[Material], list[str]]:
-    """What to run on. A folder that was named must be there; the default may be missing, which is told."""
+    """What to run on. A folder that was named must be there; the default may be missing, with a warning."""
     from hsloc.reproduction import own_material, report_material
 
     if own:

@@ -1,7 +1,7 @@
 """The localiser: where a robot is on a known map, scan by scan.
 
 Predict with odometry as in an EKF, match inside the window that the predicted covariance gives, test, update ([P] V).
-While the pose is unknown the relocaliser has the word.
+While the pose is unknown the relocaliser decides.
 """
 
 from __future__ import annotations

@@ -274,7 +274,7 @@ def _open_entries(grid: OccupancyGrid, field: LikelihoodField, shift: int) -> ND
     height, width = field.packed.shape[:2]
     is_open = np.zeros((-(-height // step), -(-width // step)), dtype=np.bool_)
     corner = field.T_map_field.between(grid.origin)
-    # A cell may touch four squares of nodes, and in a field of this grid it is not larger than one: its corners tell.
+    # A cell may touch four squares of nodes, and in a field of this grid it is at most one: its corners suffice.
     steps = ceil(grid.resolution / field.resolution)
     corners = [(dx, dy) for dx in _corners(steps) for dy in _corners(steps)]
     rows = max(_PLACES // max(grid.cells.shape[1], 1), 1)

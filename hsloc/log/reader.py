@@ -57,7 +57,7 @@ class Log:
         """All events in a total, repeatable order (see `hsloc.log.session.ordering`), with their own header stamps.
 
         Only those whose effective stamp lies in [start_s, end_s) of the options, counted from `origin_ns`. Each
-        call reads the log anew, and counts its losses anew. Raises LogError where a file vanishes under way.
+        call reads the log and counts its losses again. Raises LogError where a file vanishes under way.
         """
         self.losses = losses = self._source.losses_at_opening.copy()
         events = self._source.events(losses)
@@ -77,7 +77,7 @@ class Log:
     def observations(self) -> Iterator[Observation]:
         """All scans, odometry and transforms of all topics as the log has them, in its order; for checks.
 
-        Counts its losses anew, as `events` does; `start_s` and `end_s` have no say.
+        Counts its losses again, as `events` does; `start_s` and `end_s` are ignored.
         """
         self.losses = self._source.losses_at_opening.copy()
         return self._source.observations(self.losses)

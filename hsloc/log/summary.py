@@ -196,7 +196,7 @@ class LogSummary:
     `origin_ns` is the stamp of the first event, from which `ReadOptions.start_s` counts. `extrinsics` says where
     T_base_laser comes from: `/tf_static`, `/tf`, `option`, `file format` or `identity`. `order` is `stamp` (events
     in the order of their header stamps) or `log` (in the order of the log, where that is the true one). Where several
-    lasers are merged, `scan_topic` names them all, `lasers` tells of each, and the other fields tell of the first.
+    lasers are merged, `scan_topic` names them all, `lasers` describes each, and the other fields the first.
     `parts` are the files that hold scans or odometry that are read, in the order of time. `segments` is how many
     messages make a turn of the lidar, where these were joined. `clocks_apart_s` is by how much the stamps of scans and
     odometry differ beyond what their log times differ: a hint, since messages may be late. `heading_topic` is that of

@@ -204,7 +204,7 @@ def _moved(first: Transform3, second: Transform3) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """How a laser is mounted, as far as the plane can tell.
+    """How a laser is mounted, as far as it matters in the plane.
 
     `flipped` lasers are upside-down: their angles count clockwise. `tilt` (radians) is the angle between the
     laser's plane and the base's.

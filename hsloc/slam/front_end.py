@@ -93,7 +93,7 @@ class LocalMatch:
     """What the front end made of a scan.
 
     `pose` is in the drifting frame of the front end. `motion` and `covariance` (3, 3, in the frame of the last
-    keyscan) tell the motion since the last keyscan. `is_keyscan`: the scan is to be kept.
+    keyscan) give the motion since the last keyscan. `is_keyscan`: the scan is to be kept.
     """
 
     pose: Pose2

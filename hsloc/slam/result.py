@@ -95,7 +95,7 @@ class MappingResult:
     state: MapState | None
     """What is saved to go on from; None if no scan had a return."""
     evidence: Evidence
-    """Whether the map is right, as far as what was recorded tells."""
+    """Whether the map is right, as far as what was recorded shows."""
 
     def loop_ends(self) -> NDArray[np.int64]:
         """Rows of `keyscan_poses` (k, 2) that the k loops join, accepted or not: the frames of their submaps."""

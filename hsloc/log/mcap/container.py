@@ -34,7 +34,7 @@ MAX_TOTAL_RATIO = 100
 FREE_UNPACKED_BYTES = 4 << 30
 """... but in any case as many as this: maps of unknown cells pack 1 : 8000."""
 _FEW = 4096
-"""Messages held back that are rather sorted anew with each segment (a sorted list is a heap as well)."""
+"""Messages held back up to which they are sorted again with each segment (a sorted list is a heap as well)."""
 
 
 class McapContainer:

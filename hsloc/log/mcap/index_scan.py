@@ -33,9 +33,9 @@ _LOOSE_BYTES = 1 << 20
 
 
 class Segment(NamedTuple):
-    """A chunk, or a run of messages outside of chunks (`head` is None), and where it stands in the file.
+    """A chunk, or a run of messages outside of chunks (`head` is None), and its place in the file.
 
-    `channels` are the channels that have messages in it, None where only reading can tell.
+    `channels` are the channels that have messages in it, None where only reading shows them.
     """
 
     start_ns: int

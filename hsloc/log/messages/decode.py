@@ -115,7 +115,7 @@ COVARIANCE_BYTES = 36 * 8
 """Size of a ROS covariance of 6 x 6 doubles."""
 _ODOMETRY_TAIL = POSE_BYTES + COVARIANCE_BYTES + 6 * 8 + COVARIANCE_BYTES
 _STAMPED_TAILS = (POSE_BYTES, POSE_BYTES + COVARIANCE_BYTES)
-"""Bytes behind the head of an odometry message, and of the stamped poses: they tell XCDR1 from XCDR2."""
+"""Bytes behind the head of an odometry message, and of the stamped poses: they differ between XCDR1 and XCDR2."""
 _ZEROS = bytes(COVARIANCE_BYTES)
 PLANE = np.array((0, 1, 5, 6, 7, 11, 30, 31, 35))
 """Where (x, y, yaw) x (x, y, yaw) lie in the 36 values of a ROS covariance over (x, y, z, roll, pitch, yaw)."""

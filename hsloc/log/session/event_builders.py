@@ -79,7 +79,7 @@ class ScanFeed:
         """
         self._fixes = ScanFixes() if fixes is None else fixes
         self._survey = ScanSurvey() if survey is None else survey
-        # A code that is not proved yet starts anew: the scans of the survey come again.
+        # A code that is not proved yet is searched for again: the scans of the survey come again.
         code = self._survey.no_return
         self._code = replace(code) if code.is_known else NoReturnCode()
         self._turns = TurnAssembler(self._survey) if self._survey.segments > 1 else None

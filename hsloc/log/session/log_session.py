@@ -189,7 +189,7 @@ class LogSession:
 
     @property
     def odometry_child(self) -> str | None:
-        """The frame whose pose the odometry tells."""
+        """The frame whose pose the odometry gives."""
         if self.odom is not None:
             return str(getattr(self.odom.message, "child_frame_id", "")) or None
         return self.tf_frames[1] if self.choice.odom == TF and self.tf_frames else None
@@ -308,7 +308,7 @@ class LogSession:
         """(stamp in ns, pose in the map) of the first message on /initialpose that can be used.
 
         RViz publishes the pose in its fixed frame: one in the odometry's frame is moved to the map where a transform
-        tells how, and is left out otherwise.
+        says how, and is left out otherwise.
         """
         topic = definitions.POSE_WITH_COVARIANCE_STAMPED
         names = [t for t in of_type(self.active, topic) if t.strip("/").rpartition("/")[2] == "initialpose"]

@@ -151,7 +151,7 @@ class RosSource:
         return routes
 
     def _stream(self, routes: Iterable[int], losses: Losses) -> Iterator[list[RawMessage]]:
-        """Raw messages of all files in the order of the log, their channels told by keys."""
+        """Raw messages of all files in the order of the log, with the key of their channel."""
         wanted: dict[int, list[int]] = {}
         for key in routes:
             number, channel = divmod(key, _CHANNELS)

@@ -1,7 +1,7 @@
 """Whether several files are parts of one run: they follow each other, or hold different topics of the same time.
 
-Files of different drives would be interleaved by time into a robot that is in two places at once. What tells them: one
-topic recorded in two files at the same time, or odometry that is elsewhere when the next file goes on.
+Files of different drives would be interleaved by time into a robot that is in two places at once. They show
+in one topic recorded in two files at the same time, or in odometry that is elsewhere when the next file goes on.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SHORT_PART = 0.5
 EDGE_NS = NANOSECONDS // 2
 """But so long they always may: the last part may be hardly more than what was written late."""
 GAP_NS = 60 * NANOSECONDS
-"""A longer time without scan or odometry between two parts is told."""
+"""A longer time without scan or odometry between two parts is a warning."""
 POSSIBLE_SPEED, LIKELY_SPEED = 15.0, 2.0
 """m/s; faster between two parts no robot moves, and few robots with a lidar faster than the second."""
 POSSIBLE_JUMP, LIKELY_JUMP = 2.0, 1.0
@@ -132,17 +132,17 @@ def _jumps(
     found: Sequence[tuple[PartSummary, Container]], odometry: Collection[str], tf_frames: tuple[str, str] | None
 ) -> list[RunWarning]:
     ends = [(part, *_edges(container, odometry, tf_frames)) for part, container in found]
-    told = [(part, first, last) for part, first, last in ends if first is not None and last is not None]
+    known = [(part, first, last) for part, first, last in ends if first is not None and last is not None]
     return [
         warning
-        for (before, _, end), (after, begin, _) in pairwise(sorted(told, key=lambda entry: entry[1].log_time_ns))
+        for (before, _, end), (after, begin, _) in pairwise(sorted(known, key=lambda entry: entry[1].log_time_ns))
         for warning in _jump(before, end, after, begin)
     ]
 
 
 def _jump(a: PartSummary, end: _Edge, b: PartSummary, begin: _Edge) -> list[RunWarning]:
     """What the odometry says to one part following the other."""
-    # Where the edges overlap, too, the robot was at either end of so much time.
+    # Where the edges overlap, too, the robot was at both ends within that time.
     seconds = abs(begin.log_time_ns - end.log_time_ns) / NANOSECONDS
     way = hypot(begin.pose.x - end.pose.x, begin.pose.y - end.pose.y)
     if hypot(begin.pose.x, begin.pose.y) < _RESET and hypot(end.pose.x, end.pose.y) > _AWAY:

@@ -39,7 +39,7 @@ def numbers(words: Sequence[str]) -> NDArray[np.float32]:
 
 
 def readings(words: Sequence[str]) -> tuple[NDArray[np.float32], int]:
-    """A count and so many numbers at the head of `words`; returns them and how many words they took."""
+    """A count and that number of values at the head of `words`; returns them and the number of words read."""
     count = int(words[0])
     if not 0 <= count <= MAX_BEAMS or len(words) < 1 + count:
         raise ValueError(f"{words[0]} readings in {len(words)} words")

@@ -167,7 +167,7 @@ class TextSource:
                     first_scan, scan_keyword = line.scan, keyword
             topics.setdefault(keyword, TopicStatistics()).add(latest, latest, 1, 0)
         self._check(bool(kinds["scan"]), bool(kinds["odometry"]))
-        # Of the two kinds of lines one counts: they tell the same way with different delays, and would count it twice.
+        # One of the two kinds of lines is used: both give the same path with different delays.
         of_lasers = [keyword for keyword in kinds["odometry"] if keyword in kinds["scan"]]
         others = [keyword for keyword in kinds["odometry"] if keyword not in kinds["scan"]]
         self._laser_lines_count = bool(of_lasers) and (self._format.laser_odometry or not others)

@@ -44,7 +44,7 @@ class ObjectStore:
         if not parts.scheme or "::" in url:
             raise SettingsError(f"{setting} is {url!r}; it must be a URL such as s3://bucket/prefix")
         if parts.username is not None or parts.password is not None or parts.query:
-            # The URL stands in the database and in errors.
+            # The URL is in the database and in errors.
             raise SettingsError(
                 f"{setting}: leave user, password and query out of the {parts.scheme} URL; "
                 "credentials stand where the file system looks for them, such as AWS_ACCESS_KEY_ID"

@@ -107,6 +107,8 @@ class WarningCode(StrEnum):
     """The odometry does not move while the scans do, or never states a heading; the run goes on without it."""
     SCANS_WITHOUT_PLACE = "scans_without_place"
     """Most scans were rejected, or did not determine the pose on the map."""
+    STRAY_SCAN = "stray_scan"
+    """Single scans of a built map that were rejected do not fit the scans around them: they are beside their place."""
     MAP_SCALE = "map_scale"
     """The map is larger or smaller than what the lidar measures: the resolution in its YAML may be wrong."""
     LASER_MISFIT = "laser_misfit"

@@ -34,6 +34,10 @@ _VERDICTS = {
 }
 """Warnings that concern the whole result, with the verdict that each alone gives."""
 
+_FITS = 0.5
+"""Fitness of scans at several places from which on these fit: people and furniture hide at most half of the beams."""
+_MOST_NAMED = 5
+"""Stray scans whose times a warning names."""
 _MAP_REMEDY = "look at the places on the map; try another --seed, --no-odom, or a cut of the log (--start, --end)"
 _FAILING = {"failed": (Verdict.FAILED,), "check": (Verdict.FAILED, Verdict.CHECK)}
 
@@ -41,8 +45,10 @@ _FAILING = {"failed": (Verdict.FAILED,), "check": (Verdict.FAILED, Verdict.CHECK
 def quality_warnings(result: Result) -> list[RunWarning]:
     """Localisation: the map has another scale than the lidar; or most scans were rejected or left the pose open.
 
-    A pose found once may then be a chance fit.
+    A pose found once may then be a chance fit. Mapping: single scans that are beside their place.
     """
+    if result.mapping is not None:
+        return _stray_warnings(result.mapping, result)
     if result.mode != "localise":
         return []
     of_scale = _scale_warnings(result)
@@ -58,6 +64,21 @@ def quality_warnings(result: Result) -> list[RunWarning]:
             f"{without} of {scans} scans found no place on the map, so {meaning}",
             "check map, mounting (--laser-pose) and odometry (hsloc check), or give the start (--initial-pose)",
         ),
+    ]
+
+
+def _stray_warnings(mapping: MappingResult, result: Result) -> list[RunWarning]:
+    begin, spans = _first_keyscan(result), mapping.evidence.stray_scans
+    if not spans:
+        return []
+    named = ", ".join(f"{end + begin:.1f}" for _, end in spans[:_MOST_NAMED])
+    times = f"{named} s" if len(spans) <= _MOST_NAMED else f"{named} s and {len(spans) - _MOST_NAMED} more"
+    return [
+        RunWarning(
+            WarningCode.STRAY_SCAN,
+            f"rejected scans do not fit the scans around them, and are drawn beside their place: at {times}",
+            "look for doubled walls there; cut that part off (--start, --end) if they matter",
+        )
     ]
 
 
@@ -131,9 +152,7 @@ def verdict_reasons(result: Result, warnings: Sequence[RunWarning]) -> tuple[Ver
 
 def _of_the_map(mapping: MappingResult, result: Result) -> list[VerdictReason]:
     """What the mapper found against its own map."""
-    stamps, first = result.diagnostics.stamps_ns, result.trajectory.stamps_ns
-    # Its times begin with the first keyscan, those of a verdict with the first pose.
-    begin = (int(stamps[0]) - int(first[0])) / NS_PER_S if len(stamps) and len(first) else 0.0
+    begin = _first_keyscan(result)
     return [
         VerdictReason(
             Verdict(reason.verdict),
@@ -147,6 +166,12 @@ def _of_the_map(mapping: MappingResult, result: Result) -> list[VerdictReason]:
     ]
 
 
+def _first_keyscan(result: Result) -> float:
+    """Seconds of the first keyscan, with which the mapper's times begin, since the first pose, with which others do."""
+    stamps, first = result.diagnostics.stamps_ns, result.trajectory.stamps_ns
+    return (int(stamps[0]) - int(first[0])) / NS_PER_S if len(stamps) and len(first) else 0.0
+
+
 def _share(result: Result) -> float:
     return float(result.localised.mean()) if len(result.localised) else 0.0
 
@@ -157,11 +182,14 @@ def _unplaced(result: Result) -> tuple[tuple[float, float], ...]:
 
 
 def _without_place(result: Result) -> NDArray[np.bool_]:
-    """Which scans found no place; those that found several are ambiguous."""
-    stamps = result.diagnostics.stamps_ns
+    """Which scans found no place; those that fit at several are ambiguous."""
+    stamps, fitness = result.diagnostics.stamps_ns, result.diagnostics.fitness
     without: NDArray[np.bool_] = np.isin(result.diagnostics.status, ("searching", "rejected"))
     for each in result.ambiguities:
-        without &= (stamps < each.begin_ns) | (stamps > each.end_ns)
+        within = (stamps >= each.begin_ns) & (stamps <= each.end_ns)
+        known = fitness[within & np.isfinite(fitness)]
+        if len(known) and np.median(known) >= _FITS:
+            without &= ~within
     return without
 
 

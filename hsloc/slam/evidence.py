@@ -59,12 +59,14 @@ class Evidence:
 
     verdict: Verdict
     reasons: tuple[Reason, ...] = ()
+    stray_scans: tuple[tuple[float, float], ...] = ()
+    """Seconds since the first keyscan of single scans beside their place: they spoil what they draw, not the map."""
 
     @staticmethod
-    def of(reasons: list[Reason]) -> Evidence:
+    def of(reasons: list[Reason], stray_scans: tuple[tuple[float, float], ...] = ()) -> Evidence:
         """The worst first."""
         ordered = sorted(reasons, key=lambda reason: reason.verdict != "failed")
-        return Evidence(ordered[0].verdict if ordered else "good", tuple(ordered))
+        return Evidence(ordered[0].verdict if ordered else "good", tuple(ordered), stray_scans)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -163,7 +165,6 @@ def weigh(recorded: Recorded) -> Evidence:
     found = [
         _open_joints(recorded, bridged),
         _second_visits(recorded),
-        _strays(recorded),
         _against_odometry(recorded, bridged),
         _slips(recorded),
         _unobserved(recorded),
@@ -171,7 +172,7 @@ def weigh(recorded: Recorded) -> Evidence:
         _blind(recorded),
         _no_returns(recorded),
     ]
-    return Evidence.of([reason for reason in found if reason is not None])
+    return Evidence.of([reason for reason in found if reason is not None], _strays(recorded))
 
 
 def nothing_seen() -> Evidence:
@@ -235,16 +236,13 @@ def _second_visits(r: Recorded) -> Reason | None:
     return _reason(r, "second-visit", text, wrong, failed=share > _FAILED_SHARE)
 
 
-def _strays(r: Recorded) -> Reason | None:
+def _strays(r: Recorded) -> tuple[tuple[float, float], ...]:
     """Refused keyscans that fit nowhere: single scans beside their place, as while wheels slip, draw walls twice."""
     paired, conflict = (
         np.bincount(r.pairs.reshape(-1), weights=np.repeat(r.counts[:, k], 2), minlength=len(r.poses)) for k in (0, 1)
     )
     stray = r.refused & (paired + conflict >= _VISIT_SEEN) & (paired < _STRAY * (paired + conflict))
-    if not stray.any():
-        return None
-    text = f"{int(stray.sum())} scan(s) that were refused do not fit the scans around them"
-    return _reason(r, "stray-scan", text, spans_of(stray), failed=False)
+    return _seconds(r, spans_of(stray))
 
 
 def _against_odometry(r: Recorded, bridged: Bools) -> Reason | None:
@@ -347,11 +345,16 @@ def _no_returns(r: Recorded) -> Reason | None:
 
 def _reason(r: Recorded, code: str, text: str, runs: list[tuple[int, int]], *, failed: bool) -> Reason:
     named = runs[:_MOST_NAMED]
-    seconds = (r.stamps_ns - r.stamps_ns[0]) * 1e-9
     return Reason(
         code,
         text,
         "failed" if failed else "check",
         tuple((float(r.poses[last, 0]), float(r.poses[last, 1])) for _, last in named),
-        tuple((float(seconds[max(first - 1, 0)]), float(seconds[last])) for first, last in named),
+        _seconds(r, named),
     )
+
+
+def _seconds(r: Recorded, runs: list[tuple[int, int]]) -> tuple[tuple[float, float], ...]:
+    """From the keyscan before each run to its last."""
+    seconds = (r.stamps_ns - r.stamps_ns[0]) * 1e-9
+    return tuple((float(seconds[max(first - 1, 0)]), float(seconds[last])) for first, last in runs)

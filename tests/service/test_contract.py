@@ -43,6 +43,9 @@ def described() -> dict[str, Any]:
     for model, names in FEW.items():
         known = found["components"]["schemas"][model]["properties"]
         found["components"]["schemas"][model]["properties"] = {name: known[name] for name in names}
+    for parameter in found["paths"]["/v1/tus"]["post"]["parameters"]:
+        # To find names and values of just this length takes 10 s, at each collection: test_uploads.py tries it.
+        parameter["schema"].pop("maxLength", None)
     return found
 
 

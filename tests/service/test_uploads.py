@@ -178,6 +178,10 @@ def test_metadata_that_is_not_a_text_does_not_matter_but_its_form_does(client: T
     for value in (",", "filename  cnVu", "filename cnV"):
         answer = client.post("/v1/tus", headers={**TUS, "Upload-Length": "1", "Upload-Metadata": value})
         assert (answer.status_code, answer.json()["code"]) == (400, "tus_metadata"), value
+    for length, status in ((4096, 201), (4097, 422)):
+        value = "filename cnVuLm1jYXA=, ".ljust(length, "k")
+        answer = client.post("/v1/tus", headers={**TUS, "Upload-Length": "1", "Upload-Metadata": value})
+        assert answer.status_code == status, length
 
 
 def test_a_refused_method_is_told_all_that_there_are(client: TestClient) -> None:

@@ -92,7 +92,7 @@ def test_cancel_ends_what_ignores_sigterm_and_leaves_the_group(make_client: Call
     mark = f"{client.app.state.context.storage.instance}:"  # type: ignore[attr-defined]
     job = submit(client, b"ignore-term 60")
     wait(client, job, states=("running",))
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + 30.0
     # Itself, a child, a child in a session of its own; while they start there are some that have yet to become these.
     while (count := len(list(marked(mark)))) != 3 and time.monotonic() < deadline:
         time.sleep(0.02)

@@ -73,7 +73,8 @@ def work(settings: Settings, drain_s: float, metrics_at: str | None = None) -> i
         if warm_up is not None:
             warm_up.start()
         log("start", version=__version__, kind="worker", slots=settings.slots, sandbox=dispatcher.sandbox_kind)
-        while not asked.acquire(timeout=60.0):
+        # A signal that reaches another thread does not end the wait: Python acts on it when this thread wakes up.
+        while not asked.acquire(timeout=1.0):
             pass
         dispatcher.drain()
         presence.beat()

@@ -1,4 +1,4 @@
-"""Draw the pictures of the documentation anew: `python docs/images/draw.py http://127.0.0.1:8000 [INTEL_FOLDER]`.
+"""Draw the pictures of the documentation again: `python docs/images/draw.py http://127.0.0.1:8000 [INTEL_FOLDER]`.
 
 The first argument is a running `hsloc serve`, whose page is shown with recordings/kidnapped.mcap; it needs Playwright
 and a Chromium. With the folder that holds intel.clf.gz and intel.relations the map of the Intel lab is drawn, too.

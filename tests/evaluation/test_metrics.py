@@ -150,17 +150,17 @@ def test_a_constant_shift_by_hand() -> None:
     assert (result.length_reference, result.length_estimate) == pytest.approx((10.0, 10.0))
 
 
-def test_an_error_that_is_one_motion_of_the_whole_is_told_with_that_motion(rng: np.random.Generator) -> None:
+def test_an_error_that_is_one_motion_of_the_whole_is_reported_with_that_motion(rng: np.random.Generator) -> None:
     path = line()
     noise = rng.normal(0.0, 0.01, path.poses.shape)
     moved = compose_poses(np.array((3.0, -1.0, np.pi / 2)), path.poses) + noise
-    told = compare(Trajectory(path.stamps_ns, moved), path).displaced()
-    assert told is not None
-    assert told.code == "reference_displaced"
+    found = compare(Trajectory(path.stamps_ns, moved), path).displaced()
+    assert found is not None
+    assert found.code == "reference_displaced"
     # The motion is that of the estimate onto the reference: back by the inverse.
-    assert "x 1.0" in told.text
-    assert "y 3.0" in told.text
-    assert "-90" in told.text
+    assert "x 1.0" in found.text
+    assert "y 3.0" in found.text
+    assert "-90" in found.text
     bent = path.poses + np.column_stack(
         (np.zeros((len(path), 1)), np.linspace(-1.0, 1.0, len(path)) ** 2 * 4, noise[:, 2])
     )

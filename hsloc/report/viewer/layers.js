@@ -14,6 +14,12 @@
     return made;
   };
   const length = globalThis.lengthText;
+  // The last row whose time is not after t.
+  const before = (times, t) => {
+    let low = 0, high = times.length - 1;
+    while (low < high) { const middle = (low + high + 1) >> 1; if (times[middle] <= t) low = middle; else high = middle - 1; }
+    return low;
+  };
 
   // A path for a canvas, and the same as text for a drawing.
   class Path {
@@ -161,8 +167,8 @@
     // Loops that the user states, and the places that are clicked for the next one.
     drawStated(c, px) {
       const path = this.data.trajectory, place = (t) => {
-        const k = path.t.findLastIndex((each) => each <= t + 1e-9);
-        return this.local(path.x[Math.max(k, 0)], path.y[Math.max(k, 0)]);
+        const k = before(path.t, t + 1e-9);
+        return this.local(path.x[k], path.y[k]);
       };
       const lines = [...this.stated, ...(this.picked.length ? [[...this.picked, "robot"]] : [])];
       for (const line of lines) {
@@ -183,5 +189,5 @@
       c.restore();
     },
   };
-  globalThis.ResultLayers = { MARKS, Path, make, methods };
+  globalThis.ResultLayers = { MARKS, Path, before, make, methods };
 })();

@@ -3,18 +3,12 @@
 // hsloc/report/view.py. Text from the run goes in as text, never as markup. Needs charts.js, layers.js, export.js
 // and input.js, and view.css.
 (() => {
-  const { MARKS, Path, make } = globalThis.ResultLayers;
+  const { MARKS, Path, before, make } = globalThis.ResultLayers;
   const NEAR_CM = 5, FAR_CM = 15;
   const KINDS = [["", "any event"], ["warning", "warning"], ["loss", "loss"], ["ambiguous", "several places fit"], ["loop", "loop"], ["rejected", "refused scan"]];
 
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   const length = globalThis.lengthText;
-  // The last row whose time is not after t.
-  const before = (times, t) => {
-    let low = 0, high = times.length - 1;
-    while (low < high) { const middle = (low + high + 1) >> 1; if (times[middle] <= t) low = middle; else high = middle - 1; }
-    return low;
-  };
 
   class ResultView {
     // `image` is the map's picture, or null; `root` an element that is filled, as is `charts` with the curves.

@@ -11,6 +11,7 @@ import numpy as np
 
 from hsloc.evaluation.association import interpolate_poses
 from hsloc.model import IDENTITY, Status
+from hsloc.report.table import format_probability
 from hsloc.trajectory_io.tum import NS_PER_S
 
 if TYPE_CHECKING:
@@ -177,6 +178,15 @@ class ReportData:
         """Positions (k, 2) of these places [m]."""
         xy = [(place.pose.x, place.pose.y) for each in self.ambiguities for place in each.places]
         return np.array(xy, dtype=np.float64).reshape(-1, 2)
+
+    @property
+    def place_labels(self) -> list[list[str]]:
+        """For each stretch what is written at its places: the probability, and the time where there are several."""
+        found = []
+        for each in self.ambiguities:
+            at = "" if len(self.ambiguities) == 1 else f" at {(each.stamp_ns - self.start_ns) / NS_PER_S:.0f} s"
+            found.append([format_probability(place.probability) + at for place in each.places])
+        return found
 
 
 MOST_AMBIGUITIES = 6

@@ -130,15 +130,13 @@ def _draw_marks(axes: Axes, data: ReportData) -> None:
 
 def _draw_places(axes: Axes, data: ReportData) -> None:
     """Places between which the run does not decide: an arrow along the heading, and the probability."""
-    for each in data.ambiguities:
-        seconds = "" if len(data.ambiguities) == 1 else f" at {(each.stamp_ns - data.start_ns) / 1e9:.0f} s"
-        for place in each.places:
+    for each, labels in zip(data.ambiguities, data.place_labels, strict=True):
+        for place, label in zip(each.places, labels, strict=True):
             xy = (place.pose.x, place.pose.y)
             arrow = MarkerStyle(_PLACE, transform=Affine2D().rotate(place.pose.theta))
-            share = "< 1 %" if place.probability < 0.01 else f"{100.0 * place.probability:.0f} %"
             axes.plot(*xy, marker=arrow, color=style.ORANGE, markersize=15, markeredgecolor=style.INK, zorder=11)
             axes.annotate(
-                f"{share}{seconds}", xy, xytext=(0, -22), textcoords="offset points", fontsize=style.TEXT, ha="center",
+                label, xy, xytext=(0, -22), textcoords="offset points", fontsize=style.TEXT, ha="center",
                 fontweight="bold", color=style.INK, path_effects=HALO, zorder=11,
             )  # fmt: skip
     if data.ambiguities:

@@ -86,6 +86,11 @@ def format_share(share: float) -> str:
     return "> 99.9 %" if share < 1.0 and text == "100.0" else f"{text} %"
 
 
+def format_probability(probability: float) -> str:
+    """In whole per cent; what is small is never rounded to 0 %."""
+    return "< 1 %" if probability < 0.01 else f"{100.0 * probability:.0f} %"
+
+
 def format_duration(seconds: float) -> str:
     """12.3 s, 4 min 05 s, 2 h 03 min."""
     if seconds < 60.0:

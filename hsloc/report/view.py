@@ -20,7 +20,7 @@ from hsloc.report.charts import convergence_charts, run_charts
 from hsloc.report.data import peak_rows, prepare, since, status_counts
 from hsloc.report.map_image import picture_of, shown_extent
 from hsloc.report.summary import ResultSummary
-from hsloc.report.table import STATUS_WORDS
+from hsloc.report.table import STATUS_WORDS, format_probability
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,7 +68,7 @@ def view_of(parts: ReportParts, data: ReportData | None = None) -> ReportView:
     frame, png = _map(parts.grid)
     extent = shown_extent(data, parts.grid, parts.points)
     summary = None if parts.metrics is None else ResultSummary.of(parts.metrics)
-    scans = data.scans
+    scans, ambiguities = data.scans, _ambiguities(data)
     loops = None if parts.mapping is None else _loops(parts.mapping, data.start_ns)
     values = {
         "title": parts.title,
@@ -87,8 +87,8 @@ def view_of(parts: ReportParts, data: ReportData | None = None) -> ReportView:
         "loops": loops,
         "graph": None if parts.mapping is None else graph_view(parts.mapping.graph),
         "ellipses": _ellipses(parts, data.start_ns),
-        "ambiguities": _ambiguities(data),
-        "events": _events(parts, data, loops),
+        "ambiguities": ambiguities,
+        "events": _events(parts, data, loops, ambiguities),
         "status": [] if scans is None else _status_rows(scans),
         "charts": [_chart(chart) for chart in (*run_charts(data), *convergence_charts(parts.convergence))],
     }
@@ -258,16 +258,18 @@ def _ellipses(parts: ReportParts, start_ns: int) -> dict[str, Any] | None:
 def _ambiguities(data: ReportData) -> list[dict[str, Any]]:
     """When several places of the map fit, and the most probable of them, T_map_base, as known at the time `t`."""
     found = []
-    for each in data.ambiguities:
+    for each, labels in zip(data.ambiguities, data.place_labels, strict=True):
         begin, end, t = since(np.array([each.begin_ns, each.end_ns, each.stamp_ns]), data.start_ns).tolist()
         poses = np.array([place.pose.to_array() for place in each.places])
         columns = _columns(x=poses[:, 0], y=poses[:, 1], theta=poses[:, 2])
-        probability = [_round(place.probability) for place in each.places]
-        found.append({"begin": _round(begin), "end": _round(end), "at": _round(t), **columns, "p": probability})
+        columns |= {"p": [_round(place.probability) for place in each.places], "labels": labels}
+        found.append({"begin": _round(begin), "end": _round(end), "at": _round(t), **columns})
     return found
 
 
-def _events(parts: ReportParts, data: ReportData, loops: dict[str, Any] | None) -> list[dict[str, Any]]:
+def _events(
+    parts: ReportParts, data: ReportData, loops: dict[str, Any] | None, ambiguities: list[dict[str, Any]]
+) -> list[dict[str, Any]]:
     """What to jump to, in order of time: reasons of the verdict, losses and what ended them, loops, refused scans."""
     found: list[tuple[float, str, str]] = []
     if parts.metrics is not None:
@@ -278,9 +280,9 @@ def _events(parts: ReportParts, data: ReportData, loops: dict[str, Any] | None) 
         ]
     for begin, end in data.lost:
         found += [(begin, "loss", f"the pose is not known until {end:.1f} s"), (end, "loss", "the pose is known again")]
-    for each in _ambiguities(data):
+    for each in ambiguities:
         triples = zip(each["p"], each["x"], each["y"], strict=True)
-        places = ", ".join(f"x {x:.1f} m, y {y:.1f} m ({100.0 * p:.0f} %)" for p, x, y in triples)
+        places = ", ".join(f"x {x:.1f} m, y {y:.1f} m ({format_probability(p)})" for p, x, y in triples)
         found.append((each["begin"], "ambiguous", f"several places fit until {each['end']:.1f} s: {places}"))
     if loops is not None:
         found += [(t, "loop", "a loop is closed") for t, ok in zip(loops["t"], loops["accepted"], strict=True) if ok]

@@ -242,11 +242,13 @@ def test_places_between_which_a_run_does_not_decide_are_drawn(run: dict[str, Any
     assert len(found) == MOST_AMBIGUITIES
     assert (found[-1]["begin"], found[-1]["end"], found[-1]["at"]) == (0.45, 1.35, 0.9)  # the longest, at 20 Hz
     assert (found[0]["x"], found[0]["theta"], found[0]["p"]) == ([1.0, 99.0], [0.5, 0.5], [0.75, 0.25])
+    assert found[-1]["labels"] == ["75 % at 1 s", "25 % at 1 s"]
     assert view["extent"][2] > 99.0  # all of them are in the picture
     (event, *_) = [each for each in view["events"] if each["kind"] == "ambiguous"]
     assert event["text"].endswith("x 1.0 m, y 2.0 m (75 %), x 99.0 m, y 2.0 m (25 %)")
-    labels = report_figure(shown).axes[-1].get_legend_handles_labels()[1]
-    assert "place that may be right" in labels
+    axes = report_figure(shown).axes[-1]
+    assert "place that may be right" in axes.get_legend_handles_labels()[1]
+    assert {text.get_text() for text in axes.texts} >= {label for each in found for label in each["labels"]}
 
 
 def test_without_a_pose_times_begin_with_the_first_scan(run: dict[str, Any]) -> None:

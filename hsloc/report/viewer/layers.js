@@ -117,14 +117,13 @@
       }
       return found;
     },
-    // The places between which the run does not decide, in pixels: an arrow along the heading, and the probability.
+    // The places between which the run does not decide, in pixels: an arrow along the heading, and its label.
     placeMarks() {
-      const found = [], stretches = this.shown.has("places") ? this.data.ambiguities : [], r = this.ratio;
-      for (const each of stretches) for (const k of each.p.keys()) {
+      const found = [], r = this.ratio;
+      for (const each of this.shown.has("places") ? this.data.ambiguities : []) for (const [k, text] of each.labels.entries()) {
         const [px, py] = this.pixels(...this.local(each.x[k], each.y[k])), cos = Math.cos(each.theta[k]), sin = -Math.sin(each.theta[k]);
         const outline = PLACE.map(([x, y]) => [px + r * (cos * x - sin * y), py + r * (sin * x + cos * y)]);
-        const share = each.p[k] < 0.01 ? "< 1 %" : `${(100 * each.p[k]).toFixed(0)} %`;
-        found.push({ outline, text: stretches.length > 1 ? `${share} at ${each.at.toFixed(0)} s` : share, at: [px, py + 20 * r] });
+        found.push({ outline, text, at: [px, py + 20 * r] });
       }
       return found;
     },

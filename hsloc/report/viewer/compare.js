@@ -55,14 +55,13 @@
         key.style.borderColor = `var(--rv-${INKS[k % INKS.length]})`;
         head.append(heading("col", key, " ", name));
       });
-      const line = (name, texts, explanation = "", changes = []) => {
+      const line = (name, contents, explanation = "", changes = []) => {
         const row = body.insertRow(), label = heading("row", name);
         label.title = explanation;
         row.append(label);
-        texts.forEach((text, k) => { const cell = make("td", text); if (changes[k]) cell.append(" ", make("small", changes[k], "rv-change")); row.append(cell); });
+        contents.forEach((content, k) => { const cell = make("td"); cell.append(content, ...(changes[k] ? [" ", make("small", changes[k], "rv-change")] : [])); row.append(cell); });
       };
-      line("verdict", runs.map((run) => run.data.summary?.verdict ?? ""));
-      for (const cell of [...body.rows[0].cells].slice(1)) if (cell.textContent) cell.replaceChildren(make("span", cell.textContent, `rv-verdict rv-${cell.textContent}`));
+      line("verdict", runs.map((run) => run.data.summary?.verdict ? make("span", run.data.summary.verdict, `rv-verdict rv-${run.data.summary.verdict}`) : ""));
       const figures = runs.map((run) => new Map((run.data.summary?.figures ?? []).map((figure) => [figure.name, figure])));
       for (const name of new Set(figures.flatMap((each) => [...each.keys()]))) {
         const first = figures[0].get(name), any = figures.find((each) => each.has(name)).get(name);

@@ -56,6 +56,9 @@ export const bytes = (n) => n < 1e3 ? `${n} B` : n < 1e6 ? `${(n / 1e3).toFixed(
 export const when = (text) => new Date(text).toLocaleString([], { dateStyle: "short", timeStyle: "short" });
 export const duration = (s) => s < 60 ? `${s.toFixed(1)} s` : s < 3600 ? `${Math.floor(s / 60)} min ${String(Math.round(s % 60)).padStart(2, "0")} s` : `${Math.floor(s / 3600)} h ${String(Math.round(s % 3600 / 60)).padStart(2, "0")} min`;
 
+// How long a job ran.
+export const ran = (job) => duration((new Date(job.ended) - new Date(job.started)) / 1000);
+
 // The verdict of a result, or the state of a job that has none.
 export function badge(job) {
   const verdict = job.state === "succeeded" && (job.summary?.verdict ?? job.summary?.metrics?.verdict);

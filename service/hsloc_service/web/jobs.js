@@ -1,7 +1,7 @@
 // The table of jobs: search, filter, order, pages, and what can be done with those that are ticked.
 
 import { get, post, request } from "./api.js";
-import { $, badge, cell, duration, element, guarded, when } from "./dom.js";
+import { $, badge, cell, duration, element, guarded, ran, when } from "./dom.js";
 import { chips, describe, known, words } from "./labels.js";
 
 const PAGE = 50;
@@ -44,7 +44,7 @@ function row(job) {
   line.append(cell(box), cell(link, ...(job.title ? [element("small", job.log, "quiet name")] : []), ...chips(job.labels)), result,
     summary.key_figures?.length ? cell(figures(summary.key_figures)) : cell(job.message || ""),
     cell(summary.mode ?? ""), cell(summary.duration_s ? duration(summary.duration_s) : ""),
-    cell(job.started && job.ended ? duration((new Date(job.ended) - new Date(job.started)) / 1000) : ""),
+    cell(job.started && job.ended ? ran(job) : ""),
     cell(when(job.created) + (job.rerun_of ? ", run again" : "")));
   if (known && known.line.contains(document.activeElement)) queueMicrotask(() => link.focus());
   rows.set(job.id, { key, line });

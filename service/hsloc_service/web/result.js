@@ -1,7 +1,7 @@
 // One job: its state while it runs, then its result as report.html shows it.
 
 import { events, get, hasToken, post, request } from "./api.js";
-import { $, ACTIVE, badge, button, bytes, cell, duration, element, guarded, heading, list } from "./dom.js";
+import { $, ACTIVE, badge, button, bytes, cell, element, guarded, heading, list, ran } from "./dom.js";
 import * as labels from "./labels.js";
 import * as share from "./share.js";
 
@@ -82,7 +82,7 @@ function render(job, isMine = true) {
   labels.show(job);
   const state = $("job-state");
   // "succeeded" beside the verdict "failed" would be read as a contradiction.
-  const ended = job.state === "succeeded" && job.summary?.verdict_text && job.started ? `ran for ${duration((new Date(job.ended) - new Date(job.started)) / 1000)}` : null;
+  const ended = job.state === "succeeded" && job.summary?.verdict_text && job.started ? `ran for ${ran(job)}` : null;
   state.replaceChildren(element("span", ended ?? job.state, `state ${job.state}${ended ? " quiet" : ""}`));
   if (job.reason) state.append(` (${job.reason})`);
   if (job.message) state.append(`: ${job.message}`);
@@ -170,7 +170,7 @@ $("view").addEventListener("pose", ({ detail: pose }) => {
 });
 
 // Two places of the trajectory were clicked, of which a person knows whether they are one: loops for the next run.
-const LOOPS = { "assert-loop": "assert_loop", "forbid-loop": "forbid_loop" };
+const LOOPS = [["assert-loop", "assert_loop", "green"], ["forbid-loop", "forbid_loop", "vermillion"]]; // field, option, ink
 let clicked = [];
 
 function showLoops(times) {
@@ -180,15 +180,17 @@ function showLoops(times) {
   $("one-place").disabled = $("two-places").disabled = times.length < 2;
 }
 
+const written = (id) => $(id).value.split(",").filter((part) => part.trim());
+
 function pairs(id) {
-  const times = $(id).value.split(",").filter((part) => part.trim()).map(Number);
+  const times = written(id).map(Number);
   if (times.length % 2 || times.some((t) => !(t >= 0))) throw new SyntaxError("loops: pairs of times in seconds are needed, such as 12.5,140");
   return times;
 }
 
 function drawLoops() {
-  const inks = { "assert-loop": "green", "forbid-loop": "vermillion" }, found = [];
-  for (const [id, ink] of Object.entries(inks)) {
+  const found = [];
+  for (const [id, , ink] of LOOPS) {
     const times = pairs(id);
     for (let k = 0; k < times.length; k += 2) found.push([times[k], times[k + 1], ink]);
   }
@@ -196,13 +198,13 @@ function drawLoops() {
 }
 
 function offerLoops(job) {
-  for (const [id, name] of Object.entries(LOOPS)) $(id).value = job.request[name] ?? "";
+  for (const [id, name] of LOOPS) $(id).value = job.request[name] ?? "";
   view.offerLoop("state a loop: click two places");
   guarded(drawLoops);
 }
 
 function state(id) {
-  $(id).value = [...$(id).value.split(",").filter((part) => part.trim()), ...clicked.map((t) => t.toFixed(1))].join(",");
+  $(id).value = [...written(id), ...clicked.map((t) => t.toFixed(1))].join(",");
   showLoops([]);
   guarded(drawLoops);
 }
@@ -210,12 +212,12 @@ function state(id) {
 $("view").addEventListener("loop", ({ detail }) => { $("state-loops").hidden = !view.picking; showLoops(detail); });
 $("one-place").addEventListener("click", () => state("assert-loop"));
 $("two-places").addEventListener("click", () => state("forbid-loop"));
-for (const id of Object.keys(LOOPS)) $(id).addEventListener("change", () => guarded(drawLoops));
+for (const [id] of LOOPS) $(id).addEventListener("change", () => guarded(drawLoops));
 $("state-loops").addEventListener("submit", (event) => {
   event.preventDefault();
   const id = shownJob;
   guarded(async () => {
-    const wanted = Object.fromEntries(Object.entries(LOOPS).map(([box, name]) => [name, pairs(box).join(",") || null]));
+    const wanted = Object.fromEntries(LOOPS.map(([box, name]) => [name, pairs(box).join(",") || null]));
     location.hash = `job=${(await post(`/v1/jobs/${id}/rerun`, wanted)).id}`;
   });
 });

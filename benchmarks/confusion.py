@@ -22,18 +22,13 @@ from random import Random
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from false_certainty import NOISE_20, crowded, mirrored, same, scaled
+from false_certainty import NOISE_20, crowded, mirrored, same, scaled, scored
 from scipy.ndimage import distance_transform_edt, label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from hsloc.benchmark.whole_map import floor
-from hsloc.config import Config
-from hsloc.localisation.localiser import Localiser
-from hsloc.matching import LikelihoodField
-from hsloc.model import Event, OccupancyGrid, Pose2, Scan, wrap_angles
-from hsloc.replay.engine import replay
-from hsloc.replay.run_history import RunHistory
+from hsloc.model import Event, OccupancyGrid, Pose2, Scan
 from hsloc.simulation import presets
 from hsloc.simulation.floor_plan import floor_plan, inset, notched_wall, pillar, polygon
 from hsloc.simulation.odometer import OdometryNoise, Slip
@@ -285,33 +280,18 @@ def measure(name: str, shape: str, seed: int) -> dict[str, Any]:
     drive = list(kind.drive(list(drive_of(kind.scenario(scenario), shape, seed)), seed))
     of_map = world_of(shape, seed + 1000) if "building" in name else world
     grid = kind.change(seed)(of_map.occupancy_grid(0.05))
-    field, config = LikelihoodField.from_grid(grid), Config()
     rng = np.random.default_rng((seed, zlib.crc32(name.encode())))
-    start = start_of(kind, of_map, grid, seed)
-    localiser = Localiser.from_parameters(grid, field, config.make_matcher(), config.localiser, rng, start)
-    history = RunHistory(config.localiser.smoothing_model())
-    for event, estimate in replay(drive, localiser):
-        history.add(event, estimate)
-    trajectory, _ = history.trajectory()
-    states, reference = history.states(localiser.map_scale), history.reference()
-    assert states is not None
-    assert reference is not None
-    off = trajectory.poses - reference.poses
-    off[:, 2] = wrap_angles(off[:, 2])
-    wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.25) | (np.abs(off[:, 2]) > np.radians(5.0))
-    wrong |= kind.is_wrong
-    localised = states.is_localised()
-    known = ~wrong & np.isfinite(states.sigma).all(axis=1)
-    squared = ((off[known] / states.sigma[known]) ** 2).sum(axis=1)
+    found = scored(drive, grid, start_of(kind, of_map, grid, seed), rng, kind.is_wrong)
+    wrong, states, squared = found.wrong, found.states, found.squared()
     doubts: dict[str, float] = {}
-    for k in np.flatnonzero(~wrong & ~localised).tolist():
+    for k in np.flatnonzero(~wrong & ~states.is_localised()).tolist():
         doubts[states.state[k].value] = doubts.get(states.state[k].value, 0.0) + 1.0 / len(wrong)
     return {
         "kind": name,
         "shape": shape,
         "seed": seed,
-        "wrong": float((wrong & localised).mean()),
-        "doubted": float((~wrong & ~localised).sum() / max(int((~wrong).sum()), 1)),
+        "wrong": found.false(),
+        "doubted": found.doubted(),
         "right": float((~wrong).mean()),
         "nees": float(np.mean(squared)) if len(squared) else float("nan"),
         "covered": float(np.mean(squared < 7.81)) if len(squared) else float("nan"),

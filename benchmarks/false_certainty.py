@@ -9,8 +9,9 @@ squared error of the right poses by the variances in states.csv (3 is expected),
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,11 @@ from hsloc.simulation.odometer import OdometryNoise
 from hsloc.simulation.scenario import Kidnap, Scenario
 from hsloc.simulation.simulator import events
 from hsloc.simulation.world import World
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hsloc.localisation.states import StateRows
 
 NOISE_20 = OdometryNoise(4e-2, 2.4e-3, 8e-2, 4e-2)
 PLAIN = World(
@@ -120,37 +126,67 @@ def crowded(drive: list[Event], share: float, seed: int) -> Iterator[Event]:
             yield event
 
 
-def measure(name: str, seed: int, is_known: bool) -> str:
-    scenario, change, crowd = CASES[name]
-    world = PLAIN if scenario.world == "plain" else built_in(scenario.world)
-    drive = list(events(replace(scenario, seed=seed), world))
-    grid = change(world.occupancy_grid(0.05))
+class Scored(NamedTuple):
+    """Errors of a run's poses in x, y and heading (n, 3; m, m, rad), which of them are wrong, and the states."""
+
+    off: NDArray[np.float64]
+    wrong: NDArray[np.bool_]
+    states: StateRows
+
+    def false(self) -> float:
+        """The share of all poses that are wrong and called localised."""
+        return float((self.wrong & self.states.is_localised()).mean())
+
+    def doubted(self) -> float:
+        """The share of the right poses that are called anything else."""
+        return float((~self.wrong & ~self.states.is_localised()).sum() / max(int((~self.wrong).sum()), 1))
+
+    def squared(self) -> NDArray[np.float64]:
+        """The squared errors of the right poses by the variances in states.csv, where these are known."""
+        known = ~self.wrong & np.isfinite(self.states.sigma).all(axis=1)
+        squared: NDArray[np.float64] = ((self.off[known] / self.states.sigma[known]) ** 2).sum(axis=1)
+        return squared
+
+
+def scored(
+    drive: Iterable[Event], grid: OccupancyGrid, start: Pose2 | None, rng: np.random.Generator, is_wrong: bool
+) -> Scored:
+    """Localise on a map; wrong are poses off by more than 0.25 m or 5 deg, and all where the map `is_wrong`."""
     field, config = LikelihoodField.from_grid(grid), Config()
-    start: Pose2 | None = world.start() if is_known else None
-    rng = np.random.default_rng(seed)
     localiser = Localiser.from_parameters(grid, field, config.make_matcher(), config.localiser, rng, start)
     history = RunHistory(config.localiser.smoothing_model())
-    for event, estimate in replay(crowded(drive, crowd, seed) if crowd else drive, localiser):
+    for event, estimate in replay(drive, localiser):
         history.add(event, estimate)
     trajectory, _ = history.trajectory()
     states, reference = history.states(localiser.map_scale), history.reference()
     assert states is not None
     assert reference is not None
     off = trajectory.poses - reference.poses
-    wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.25) | (np.abs(wrap_angles(off[:, 2])) > np.radians(5.0))
-    wrong |= "mirrored" in name or "map of" in name
-    localised = states.is_localised()
-    doubted = (~wrong & ~localised).sum() / max((~wrong).sum(), 1)
-    known = ~wrong & np.isfinite(states.sigma).all(axis=1)
     off[:, 2] = wrap_angles(off[:, 2])
-    squared = ((off[known] / states.sigma[known]) ** 2).sum(axis=1)
+    wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.25) | (np.abs(off[:, 2]) > np.radians(5.0)) | is_wrong
+    return Scored(off, wrong, states)
+
+
+def measure(name: str, seed: int, is_known: bool) -> str:
+    scenario, change, crowd = CASES[name]
+    world = PLAIN if scenario.world == "plain" else built_in(scenario.world)
+    drive = list(events(replace(scenario, seed=seed), world))
+    grid = change(world.occupancy_grid(0.05))
+    start = world.start() if is_known else None
+    found = scored(
+        crowded(drive, crowd, seed) if crowd else drive,
+        grid,
+        start,
+        np.random.default_rng(seed),
+        is_wrong="mirrored" in name or "map of" in name,
+    )
+    squared = found.squared()
     nees = f"{np.mean(squared):6.2f} {100.0 * np.mean(squared < 7.81):5.1f} %" if len(squared) else ""
     start_name = "given" if is_known else "unknown"
-    right = np.hypot(off[~wrong, 0], off[~wrong, 1])
+    right = np.hypot(*found.off[~found.wrong, :2].T)
     rmse = f"{100.0 * np.sqrt(np.mean(right**2)):5.2f} cm" if len(right) else ""
-    return (
-        f"{name:26s} {start_name:8s} {100.0 * (wrong & localised).mean():5.1f} % {100.0 * doubted:5.1f} % {rmse} {nees}"
-    )
+    shares = f"{100.0 * found.false():5.1f} % {100.0 * found.doubted():5.1f} %"
+    return f"{name:26s} {start_name:8s} {shares} {rmse} {nees}"
 
 
 def main() -> None:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
+    from hsloc.kernels.point_to_line import ScanArrays
     from hsloc.slam.keyscans import KeyScans
     from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_session import MapSession, Tie
@@ -74,7 +75,8 @@ def solve(gathered: MapSession, parameters: GraphMapperParameters, rng: Generato
     """Close the loops of a session and refine it, so that the log can go on from there: its keyscans as solved."""
     poses, loops, edges = _close_loops(gathered, parameters, rng, _silent)
     edges = Edges.concatenate([gathered.steps, edges])
-    refined, _ = _refine(poses, gathered.scans, edges, parameters, _silent)
+    arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
+    refined, _ = _refine(poses, arrays, edges, parameters, _silent)
     return replace(gathered, poses=refined.poses, known=tuple(loops))
 
 
@@ -94,15 +96,15 @@ def finish_session(
     if extended is not None and not any(loop.accepted and _connects(loop, gathered) for loop in loops):
         raise MapError(unconnected(extended))
     edges = Edges.concatenate([gathered.steps, loop_edges])
-    refined, passes = _refine(poses, gathered.scans, edges, parameters, lambda part: report(0.5 + 0.4 * part))
     arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
+    refined, passes = _refine(poses, arrays, edges, parameters, lambda part: report(0.5 + 0.4 * part))
     observed = observed_terms(refined, arrays)
     stretches = compare_with_odometry(refined, gathered.steps, arrays, observed)
     if parameters.use_odometry and stretches.contradicted.any():
         steps = without_slips(gathered.steps, stretches.slipped(len(gathered.steps)))
         gathered = replace(gathered, steps=steps)
         edges = Edges.concatenate([steps, loop_edges])
-        refined, more = _refine(refined.poses, gathered.scans, edges, _near_the_end(parameters), _silent, refined)
+        refined, more = _refine(refined.poses, arrays, edges, _near_the_end(parameters), _silent, refined)
         passes += more
         observed = observed_terms(refined, arrays)
     covariances = marginal_covariances(refined, observed, edges)
@@ -227,7 +229,7 @@ def _close_loops(
 
 def _refine(
     poses: F64,
-    scans: KeyScans,
+    scans: ScanArrays,
     edges: Edges,
     parameters: GraphMapperParameters,
     progress: Callable[[float], None],

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hsloc.slam.keyscans import KeyScans
+    from hsloc.kernels.point_to_line import ScanArrays
     from hsloc.slam.pose_graph import Edges
 
     F64 = NDArray[np.float64]
@@ -102,7 +102,7 @@ class Registration:
 
 def refine(
     poses: F64,
-    scans: KeyScans,
+    scans: ScanArrays,
     edges: Edges,
     parameters: JointRegistrationParameters,
     progress: Callable[[float], None] | None = None,
@@ -117,7 +117,6 @@ def refine(
     system = BlockSystem(
         len(poses), np.concatenate((pairs[:, 0], edges.pairs[:, 0])), np.concatenate((pairs[:, 1], edges.pairs[:, 1]))
     )
-    arrays = scans.arrays(p.points_per_scan)
     terms, evaluated = _known_terms(pairs, len(poses), previous)
     weight = 1.0 / (p.sigma**2 * p.correlated_points)
     before, gate, moved, rounds = poses, previous.gate if previous is not None else 0.0, 0.0, 0
@@ -125,7 +124,7 @@ def refine(
         last, gate = gate, p.gates[min(rounds, len(p.gates)) - 1]
         if gate != last:
             evaluated.at[:] = np.nan
-        evaluate_pairs(poses, pairs, arrays, gate, p.scale_of_gate * gate, terms, evaluated)
+        evaluate_pairs(poses, pairs, scans, gate, p.scale_of_gate * gate, terms, evaluated)
         diagonal, off_diagonal, right = normal_equations(poses, pairs, terms, weight, edges)
         step = solve_anchored(system, diagonal, off_diagonal, right)
         before, poses = poses, apply_increment(poses, step)

@@ -226,19 +226,11 @@ class LoopCloser:
         # Where two logs are connected the path may lead over submaps that are still to be visited.
         last = place if self._first == 0 else len(self._places) - 1
         chain = np.maximum(np.diff(self._places.path_length[: last + 1]), 1e-3)
-        lengths: list[float] = []
-        loops = []
-        for loop in self.accepted:
-            length = max(hypot(loop.T_first_second.x, loop.T_first_second.y), 0.1)
-            if loop.second == loop.first + 1 <= last:
-                # Across a gap of the path; two entries for one pair would be added up.
-                chain[loop.first] = min(chain[loop.first], length)
-            else:
-                loops.append(loop)
-                lengths.append(length)
-        links = np.array([(loop.first, loop.second) for loop in loops], dtype=np.int64).reshape(-1, 2)
+        accepted = self.accepted
+        links = np.array([(loop.first, loop.second) for loop in accepted], dtype=np.int64).reshape(-1, 2)
+        lengths = np.array([max(hypot(loop.T_first_second.x, loop.T_first_second.y), 0.1) for loop in accepted])
         found = np.empty(len(self._places))
-        path_lengths(chain, links, np.array(lengths), place, found)
+        path_lengths(chain, links, lengths, place, found)
         return found[:place]
 
     def _window(self, path_length: float) -> tuple[float, float]:

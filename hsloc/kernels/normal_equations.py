@@ -167,18 +167,17 @@ class Evaluated(NamedTuple):
 @njit(cache=True, nogil=True)
 def evaluate_pairs(
     poses: F64, pairs: I64, scans: ScanArrays, gate: float, scale: float, terms: PairTerms, before: Evaluated
-) -> int:
+) -> None:
     """Overwrite `terms` with those of all pairs (m, 2) of scans, either scan against the other, at `poses` (n, 3).
 
     A pair that has hardly moved since it was evaluated `before`, with the same gate, keeps its points: its gradient
-    changes by its information. Returns how many pairs were evaluated.
+    changes by its information.
     """
     one = Term(np.empty((3, 3)), np.empty(3))
     rel = np.empty(3)
     back = np.empty(3)
     tally = np.empty(5)
     step = np.empty(3)
-    evaluated = 0
     for m in range(len(pairs)):
         j = pairs[m, 0]
         i = pairs[m, 1]
@@ -192,7 +191,6 @@ def evaluate_pairs(
                     change += terms.information[m, a, b] * step[b]
                 terms.gradient[m, a] = before.gradient[m, a] + change
             continue
-        evaluated += 1
         pair_terms(i, j, rel, scans, gate, scale, one, tally)
         terms.information[m] = one.information
         terms.gradient[m] = one.gradient
@@ -203,7 +201,6 @@ def evaluate_pairs(
         terms.counts[m] += tally
         before.at[m] = rel
         before.gradient[m] = terms.gradient[m]
-    return evaluated
 
 
 @njit(cache=True, nogil=True)

@@ -113,6 +113,11 @@ class Recorded:
         np.add.at(change, pairs.max(axis=1) + 1, -weights)
         return np.asarray(np.cumsum(change, axis=0)[: len(self.poses)], dtype=np.float64)
 
+    def summed_at(self, pairs: I64, weights: F64) -> F64:
+        """For each keyscan (n,) the sum of the `weights` (m,) of the pairs (m, 2) that it is in."""
+        sums = np.bincount(pairs.reshape(-1), weights=np.repeat(weights, 2), minlength=len(self.poses))
+        return np.asarray(sums, dtype=np.float64)
+
 
 _SECOND_VISIT_M = 12.0
 """Metres of the way after which a place is visited again."""
@@ -220,10 +225,7 @@ def _second_visits(r: Recorded) -> Reason | None:
     """Second visits that look through the walls of the first."""
     way = np.cumsum(r.lengths())
     far = np.abs(way[r.pairs[:, 1]] - way[r.pairs[:, 0]]) > _SECOND_VISIT_M
-    n = len(r.poses)
-    paired, conflict = (
-        np.bincount(r.pairs[far].reshape(-1), weights=np.repeat(r.counts[far, k], 2), minlength=n) for k in (0, 1)
-    )
+    paired, conflict = (r.summed_at(r.pairs[far], r.counts[far, k]) for k in (0, 1))
     known = paired + conflict >= _VISIT_SEEN
     if not known.any():
         return None
@@ -238,9 +240,7 @@ def _second_visits(r: Recorded) -> Reason | None:
 
 def _strays(r: Recorded) -> tuple[tuple[float, float], ...]:
     """Refused keyscans that fit nowhere: single scans beside their place, as while wheels slip, draw walls twice."""
-    paired, conflict = (
-        np.bincount(r.pairs.reshape(-1), weights=np.repeat(r.counts[:, k], 2), minlength=len(r.poses)) for k in (0, 1)
-    )
+    paired, conflict = (r.summed_at(r.pairs, r.counts[:, k]) for k in (0, 1))
     stray = r.refused & (paired + conflict >= _VISIT_SEEN) & (paired < _STRAY * (paired + conflict))
     return _seconds(r, spans_of(stray))
 

@@ -38,7 +38,6 @@ class LocalMap:
             np.zeros(2, dtype=np.int64),
             resolution,
         )
-        self._corner = 0, 0
         self._packed: F32 | None = None
         self.added = 0
 
@@ -75,7 +74,8 @@ class LocalMap:
         return added
 
     def _origin(self) -> Pose2:
-        return Pose2(self._corner[0] * self._resolution, self._corner[1] * self._resolution, 0.0)
+        u, v = (int(n) for n in self._grown.corner)
+        return Pose2(u * self._resolution, v * self._resolution, 0.0)
 
     def _make_room(self, points: F64) -> None:
         low_x, low_y, high_x, high_y = (value / self._resolution for value in bounds(points))
@@ -87,7 +87,8 @@ class LocalMap:
 
     def _covers(self, low: tuple[int, int], high: tuple[int, int]) -> bool:
         # Python's own numbers: this is asked for each scan.
-        (u, v), (height, width) = self._corner, self._grown.scores.shape
+        u, v = (int(n) for n in self._grown.corner)
+        height, width = self._grown.scores.shape
         return height > 0 and low[0] >= u and low[1] >= v and high[0] <= u + width and high[1] <= v + height
 
     def _grow(self, low: I64, high: I64) -> None:
@@ -116,11 +117,3 @@ class LocalMap:
                 packed[dv : dv + height - 1, du : du + width - 1] = self._packed
                 self._packed = packed
         self._grown = GrowingField(scores, stale, new_low, self._resolution)
-        self._corner = int(new_low[0]), int(new_low[1])
-
-
-def field_of_points(points: F64, resolution: float, sigma: float, max_distance: float) -> LikelihoodField:
-    """The field of a set of points at once."""
-    local = LocalMap(resolution, sigma, max_distance)
-    local.add(points, saturation_score=2.0)
-    return local.field

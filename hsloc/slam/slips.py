@@ -115,10 +115,8 @@ def compare_with_odometry(refined: Registration, steps: Edges, scans: ScanArrays
     sigma = np.sqrt(np.maximum(variances[:, -1], 0.0))
     margin, visits_sigma = np.ones(len(ends)), np.full(len(ends), np.inf)
     weak = np.flatnonzero(sigma > _HARDLY_M)
-    across = observed.information[:, :2, :2] if len(weak) else np.zeros((0, 2, 2))
-    if len(weak):
-        h = observed.information
-        across = across - h[:, :2, 2:] * h[:, 2:, :2] / np.maximum(h[:, 2:, 2:], 1e-9)
+    h = observed.information
+    across = h[:, :2, :2] - h[:, :2, 2:] * h[:, 2:, :2] / np.maximum(h[:, 2:, 2:], 1e-9)
     for k in weak.tolist():
         heading = refined.poses[ends[k, 0], 2]
         c, s = np.cos(heading), np.sin(heading)

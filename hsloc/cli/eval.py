@@ -11,7 +11,7 @@ import argparse
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hsloc.errors import EvaluationError
 
@@ -159,20 +159,19 @@ def _evaluate(
     from hsloc.evaluation.relations import evaluate_relations
 
     try:
-        compared = None if reference is None else compare(estimate, reference, **_pairing(arguments))
+        compared = None
+        if reference is not None:
+            compared = compare(
+                estimate,
+                reference,
+                alignment=arguments.alignment,
+                max_difference_s=arguments.t_max_diff,
+                association=arguments.association,
+                offset_s=arguments.t_offset,
+            )
         return compared, None if relations is None else evaluate_relations(estimate, relations)
     except EvaluationError as error:
         raise EvaluationError(f"{path}: {error}") from error
-
-
-def _pairing(arguments: argparse.Namespace) -> dict[str, Any]:
-    """How poses are paired with the reference and moved onto it: arguments of `compare`."""
-    return {
-        "alignment": arguments.alignment,
-        "max_difference_s": arguments.t_max_diff,
-        "association": arguments.association,
-        "offset_s": arguments.t_offset,
-    }
 
 
 def _draw(arguments: argparse.Namespace, comparisons: Mapping[str, Comparison]) -> None:

@@ -40,8 +40,7 @@ class BlockSystem:
         key = self._rows[order] * size + self._columns[order]
         first = np.concatenate(([True], key[1:] != key[:-1])) if len(key) else np.zeros(0, dtype=bool)
         self._order = order
-        self._group = np.flatnonzero(first)
-        self._start = np.append(self._group, len(order))
+        self._start = np.append(np.flatnonzero(first), len(order))
         self._indices = self._columns[order][first]
         counts = np.bincount(self._rows[order][first], minlength=size)
         self._indptr = np.concatenate(([0], np.cumsum(counts)))
@@ -54,9 +53,7 @@ class BlockSystem:
         if self._elimination.blocks > MOST_BLOCKS_A_COLUMN * self._size:
             solution: F64 = self._factor(diagonal, off_diagonal).solve(np.ascontiguousarray(right.reshape(-1)))
             return solution.reshape(-1, 3)
-        sums = np.empty((len(self._group), 3, 3))
-        sum_blocks(self._order, self._start, diagonal, off_diagonal, sums)
-        return self._elimination.solve(sums, right)
+        return self._elimination.solve(self._summed(diagonal, off_diagonal), right)
 
     def inverse_blocks(self, diagonal: F64, off_diagonal: F64) -> F64:
         """The blocks (n, 3, 3) on the diagonal of the inverse: covariances, where the matrix is an information."""
@@ -73,8 +70,9 @@ class BlockSystem:
 
     def _summed(self, diagonal: F64, off_diagonal: F64) -> F64:
         """The blocks of the matrix, row by row."""
-        blocks = np.concatenate((diagonal, off_diagonal, off_diagonal.transpose(0, 2, 1)))
-        return np.asarray(np.add.reduceat(blocks[self._order], self._group, axis=0), dtype=np.float64)
+        sums = np.empty((len(self._indices), 3, 3))
+        sum_blocks(self._order, self._start, diagonal, off_diagonal, sums)
+        return sums
 
     def _factor(self, diagonal: F64, off_diagonal: F64) -> SuperLU:
         data = self._summed(diagonal, off_diagonal)

@@ -16,7 +16,7 @@ from hsloc.log.summary import Losses
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from hsloc.log.container import Channel, Container
     from hsloc.log.messages.decode import LinkMessage
@@ -123,8 +123,7 @@ def choose_transforms(
     `named` is a topic of transforms from which the user wants the odometry.
     """
     topics = sorted({c.topic for container in containers for c in container.channels.values() if is_transform_topic(c)})
-    read = {topic: _links(containers, topic) for topic in topics}
-    links = {topic: list(found) for topic, found in read.items()}
+    links = {topic: _links(containers, topic) for topic in topics}
     groups: dict[str, list[str]] = {}
     for topic in topics:
         groups.setdefault(namespace(topic), []).append(topic)
@@ -150,7 +149,7 @@ def choose_transforms(
     if found.odometry is None and named is not None:
         found.odometry = _topmost_link(moving, resting, lasers, base)
     for topic in sorted(found.dynamic):
-        found.stated.update({child: (parent, first) for (parent, child), first in read[topic].items()})
+        found.stated.update({child: (parent, first) for (parent, child), first in links[topic].items()})
     found.has_map_to_odometry = any(is_map_frame(parent) for parent, _ in moving) or any(
         is_map_frame(child) and is_odometry_frame(parent) for parent, child in moving
     )
@@ -167,7 +166,7 @@ def _links(containers: Sequence[Container], topic: str) -> dict[tuple[str, str],
 
 def _nearest(
     groups: dict[str, list[str]],
-    links: dict[str, list[tuple[str, str]]],
+    links: Mapping[str, Iterable[tuple[str, str]]],
     scans: Sequence[tuple[str, str]],
     warnings: list[RunWarning],
 ) -> list[str]:
@@ -209,15 +208,18 @@ def _topmost_link(
     dynamic = [link for link in moving if not is_map_frame(link[0])]
     if base is not None:
         return next((link for link in dynamic if base in (link[1], last_name(link[1]))), None)
-    parents = {child: parent for parent, child in [*moving, *resting]}
-    top = None
+    return next((link for link in reversed([*_ways_up([*moving, *resting], lasers)]) if link in dynamic), None)
+
+
+def _ways_up(links: Iterable[tuple[str, str]], lasers: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """(parent, child) of the links from each laser to the root, or to where they would close a loop."""
+    parents = {child: parent for parent, child in links}
     for frame in lasers:
         seen = {frame}
         while (above := parents.get(frame)) is not None and above not in seen:
-            top = (above, frame) if (above, frame) in dynamic else top
+            yield above, frame
             seen.add(above)
             frame = above
-    return top
 
 
 def odometry_link(
@@ -232,14 +234,9 @@ def odometry_link(
         return next(((parent, child) for parent, child in found if base in (child, last_name(child))), None) or (
             found[0] if len(found) == 1 else None
         )
-    parents = {child: parent for parent, child in [*moving, *resting]}
-    for frame in lasers:
-        seen = {frame}
-        while (above := parents.get(frame)) is not None and above not in seen:
-            if (above, frame) in found:
-                return above, frame
-            seen.add(above)
-            frame = above
+    for link in _ways_up([*moving, *resting], lasers):
+        if link in found:
+            return link
     for name in BASE_FRAMES:
         named = sorted(link for link in found if last_name(link[1]) == name)
         if named:

@@ -99,7 +99,7 @@ class FrameTree:
         """State (or restate) a frame's pose in its parent's."""
         transform = transform.normalised()
         known = self._links.get(child)
-        if known is not None and (known[0] != parent or _moved(known[1], transform)):
+        if known is not None and differ(known, (parent, transform)):
             self._changes[child] += 1
         self._links[child] = (parent, transform)
         statements = self._statements.setdefault(child, [])
@@ -191,8 +191,8 @@ class FrameTree:
 
 
 def differ(first: tuple[str, Transform3], second: tuple[str, Transform3]) -> bool:
-    """Whether two statements of a frame's parent and pose contradict each other."""
-    return first[0] != second[0] or _moved(first[1].normalised(), second[1].normalised())
+    """Whether two statements of a frame's parent and normalised pose contradict each other."""
+    return first[0] != second[0] or _moved(first[1], second[1])
 
 
 def _moved(first: Transform3, second: Transform3) -> bool:

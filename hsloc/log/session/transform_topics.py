@@ -157,10 +157,11 @@ def choose_transforms(
 
 
 def _links(containers: Sequence[Container], topic: str) -> dict[tuple[str, str], Transform3]:
-    """(parent, child) of the links on a topic, in their order, each with its first transform."""
+    """(parent, child) of the links on a topic, in their order, each with its first transform, normalised."""
     found: dict[tuple[str, str], Transform3] = {}
     for link in read_links(containers, (topic,), _LINKS_AT_OPENING):
-        found.setdefault((link.parent, link.child), link.transform)
+        if (link.parent, link.child) not in found:
+            found[link.parent, link.child] = link.transform.normalised()
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from itertools import islice, pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -350,14 +351,15 @@ class LogSession:
         """The first effective stamp."""
         firsts = [first for first in (*self.scans.values(), self.odom) if first is not None]
         stamps = [first.start_log_ns if in_log_time else first.origin_ns for first in firsts]
-        link = self._first_transform()
-        if link is not None:
-            stamps.append(link[0] if in_log_time or not link[1] else link[1])
+        if self._first_link is not None:
+            log_time, stamp = self._first_link
+            stamps.append(log_time if in_log_time or not stamp else stamp)
         if not stamps and self.truth is not None:
             stamps.append(self.truth.start_log_ns if in_log_time else self.truth.origin_ns)
         return min(stamps, default=0)
 
-    def _first_transform(self) -> tuple[int, int] | None:
+    @cached_property
+    def _first_link(self) -> tuple[int, int] | None:
         """(log time, stamp) of the first transform that is odometry, where transforms are."""
         for log_time, message in self.messages(TF, definitions.TF_MESSAGE) if self.choice.odom == TF else ():
             for link in message:
@@ -367,7 +369,7 @@ class LogSession:
 
     def _warn_of_clocks(self) -> None:
         self._clocks_apart_s = 0.0
-        odom = self._first_transform() if self.odom is None else (self.odom.log_time_ns, self.odom.stamp_ns)
+        odom = self._first_link if self.odom is None else (self.odom.log_time_ns, self.odom.stamp_ns)
         if odom is None or not odom[1]:
             return
         for topic, first in self.scans.items():

@@ -6,7 +6,6 @@ are read at random places. What a packed file may unpack to is bounded, so that 
 
 from __future__ import annotations
 
-import bz2
 import gzip
 import lzma
 import re
@@ -22,6 +21,7 @@ from typing import IO, TYPE_CHECKING, BinaryIO, NamedTuple, cast
 
 from hsloc.errors import LogError, LogFormatError, no_such
 from hsloc.log.mcap.records import MAGIC
+from hsloc.log.packing import GZIP, STREAMS, ZSTD, opened
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -183,10 +183,7 @@ def _why_no_log(path: Path, head: bytes) -> str:
     return NO_LOG
 
 
-GZIP, ZSTD, ZIP = b"\x1f\x8b", b"\x28\xb5\x2f\xfd", b"PK\x03\x04"
-_BZIP2, _XZ, _LZ4 = b"BZh", b"\xfd7zXZ\0", b"\x04\x22\x4d\x18"
-_STREAMS = (GZIP, ZSTD, _BZIP2, _XZ, _LZ4)
-"""How files begin that hold one packed file."""
+_ZIP = b"PK\x03\x04"
 _SKIPPED = b"\x2a\x4d\x18"
 """How a frame goes on that decompressors of zstd and lz4 skip; its first byte is 0x50 to 0x5f."""
 _MAX_LAYERS = 3
@@ -203,7 +200,7 @@ _BROKEN = (EOFError, gzip.BadGzipFile, zlib.error, lzma.LZMAError, zipfile.BadZi
 
 def is_packed(head: bytes) -> bool:
     """Whether a file that begins with `head` (the first 512 bytes or more) is packed."""
-    return head.startswith((*_STREAMS, ZIP)) or _is_tar(head) or _begins_with_zstd(head)
+    return head.startswith((*STREAMS, _ZIP)) or _is_tar(head) or _begins_with_zstd(head)
 
 
 def _begins_with_zstd(head: bytes) -> bool:
@@ -216,7 +213,7 @@ def _begins_with_zstd(head: bytes) -> bool:
 
 def unpacked_head(path: Path, head: bytes) -> bytes:
     """The first bytes of what a packed file holds; empty where that cannot be read, and for archives."""
-    if not (head.startswith(_STREAMS) or _begins_with_zstd(head)):
+    if not (head.startswith(STREAMS) or _begins_with_zstd(head)):
         return b""
     try:
         with _opened(path, head) as stream:
@@ -233,7 +230,7 @@ def unpack(path: Path, head: bytes, folder: Path) -> Path:
     allowed = max(FREE_UNPACKED_BYTES, MAX_TOTAL_RATIO * path.stat().st_size)
     target = Path(tempfile.mkdtemp(dir=folder)) / plain_name(path)
     try:
-        if head.startswith(ZIP):
+        if head.startswith(_ZIP):
             return _unpack_zip(path, target, allowed)
         with _opened(path, head) as stream, target.open("wb") as out:
             _copy(stream, out, path, allowed)
@@ -270,10 +267,7 @@ def _damaged(path: Path, reason: object) -> LogFormatError:
 @contextmanager
 def _opened(path: Path, head: bytes) -> Iterator[BinaryIO]:
     """What a packed file holds, as a stream; a tar file as it is."""
-    if head.startswith(GZIP):
-        with gzip.open(path, "rb") as stream:
-            yield cast("BinaryIO", stream)
-    elif _begins_with_zstd(head):
+    if _begins_with_zstd(head):
         import zstandard
 
         try:
@@ -284,20 +278,14 @@ def _opened(path: Path, head: bytes) -> Iterator[BinaryIO]:
                 yield cast("BinaryIO", s)
         except zstandard.ZstdError as error:
             raise _damaged(path, error) from error
-    elif head.startswith(_LZ4):
-        import lz4.frame
-
+    elif head.startswith(STREAMS):
         try:
-            with lz4.frame.open(path, "rb") as stream:
+            with opened(path, head) as stream:
                 yield cast("BinaryIO", stream)
-        except RuntimeError as error:
+        except RuntimeError as error:  # of lz4
             raise _damaged(path, error) from error
-    elif head.startswith((_BZIP2, _XZ)):
-        try:
-            with bz2.open(path, "rb") if head.startswith(_BZIP2) else lzma.open(path, "rb") as stream:
-                yield cast("BinaryIO", stream)
         except OSError as error:
-            if error.errno is not None:  # bz2 raises one without a number for data that are damaged
+            if error.errno is not None:  # gzip and bz2 raise one without a number for data that are damaged
                 raise
             raise _damaged(path, error) from error
     else:

@@ -5,11 +5,8 @@ Are they the definitions we know, and may they be handed to a parser?
 
 from __future__ import annotations
 
-import bz2
 import dataclasses
-import gzip
 import io
-import lzma
 import re
 from typing import IO, TYPE_CHECKING, Any, cast
 
@@ -17,6 +14,7 @@ from hsloc.errors import LogFormatError
 from hsloc.log.messages import cdr_batch_decode as columns
 from hsloc.log.messages import decode, definitions, foxglove, from_objects, odometry_kinds, point_cloud
 from hsloc.log.messages.definitions import long_name, short_name
+from hsloc.log.packing import STREAMS, ZSTD, opened
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -44,11 +42,9 @@ _ENCODINGS = {
     "ros1msg": "ros1",
 }
 """Encodings of messages that are read, by the names that recorders write in small letters."""
-_ZSTD = b"\x28\xb5\x2f\xfd"
-_PACKED = (_ZSTD, b"\x04\x22\x4d\x18", b"\x1f\x8b", b"BZh", b"\xfd7zXZ")
-"""How a payload begins that was compressed by itself (rosbag2's `--compression-mode message`): zstd, lz4, gzip, bzip2,
-xz. CDR begins with a zero, JSON with a brace."""
 _MAX_UNPACKED_BYTES = 256 << 20
+"""Largest size of a payload that was compressed by itself (rosbag2's `--compression-mode message`)."""
+_LONGEST_MAGIC = max(map(len, STREAMS))
 
 MAX_SCHEMA_BYTES = 64 << 10
 """Maximum size of a definition that is parsed. Internal: guards the time against a hostile file."""
@@ -99,7 +95,7 @@ def decoder_for(channel: Channel, warnings: list[RunWarning] | None = None) -> D
         try:
             return plain(data)
         except Undecodable:
-            if bytes(data[:5]).startswith(_PACKED):
+            if bytes(data[:_LONGEST_MAGIC]).startswith(STREAMS):  # CDR begins with a zero, JSON with a brace.
                 return plain(_unpacked(bytes(data)))
             if bytes(data[:1]) == b"{" and channel.message_encoding == "cdr":
                 return _guarded(from_objects.json_decoder(FROM_OBJECT[canonical_type(channel.typename)]))(data)
@@ -203,33 +199,26 @@ def _by_hand(channel: Channel, typename: str, other: Decoder | None = None) -> D
 
 
 def _unpacked(data: bytes) -> bytes:
-    """A payload that was compressed by itself, as one of `_PACKED`."""
+    """A payload that was compressed by itself, as `STREAMS` begin."""
     try:
         with _unpacking(data) as stream:
             found = stream.read(_MAX_UNPACKED_BYTES + 1)
     except Exception as error:  # Each library has errors of its own.
         raise Undecodable(f"its compression is damaged ({_short(error)})") from error
-    if len(found) > _MAX_UNPACKED_BYTES or found.startswith(_PACKED):
+    if len(found) > _MAX_UNPACKED_BYTES or found.startswith(STREAMS):
         raise Undecodable(f"unpacks to more than {_MAX_UNPACKED_BYTES >> 20} MB, or is packed twice")
     return found
 
 
 def _unpacking(data: bytes) -> IO[bytes]:
-    if data.startswith(_PACKED[0]):
-        import zstandard
+    if not data.startswith(ZSTD):
+        return opened(io.BytesIO(data), data)
+    import zstandard
 
-        whole = zstandard.frame_content_size(data)
-        if 0 <= whole <= _MAX_UNPACKED_BYTES:  # Unlike a stream's reader this one notices where the end is missing.
-            return io.BytesIO(zstandard.ZstdDecompressor().decompress(data))
-        return cast("IO[bytes]", zstandard.ZstdDecompressor().stream_reader(data))
-    if data.startswith(_PACKED[1]):
-        import lz4.frame
-
-        return cast("IO[bytes]", lz4.frame.open(io.BytesIO(data)))
-    packed = io.BytesIO(data)
-    if data.startswith(_PACKED[2]):
-        return cast("IO[bytes]", gzip.open(packed))
-    return cast("IO[bytes]", bz2.open(packed) if data.startswith(_PACKED[3]) else lzma.open(packed))
+    whole = zstandard.frame_content_size(data)
+    if 0 <= whole <= _MAX_UNPACKED_BYTES:  # Unlike a stream's reader this one notices where the end is missing.
+        return io.BytesIO(zstandard.ZstdDecompressor().decompress(data))
+    return cast("IO[bytes]", zstandard.ZstdDecompressor().stream_reader(data))
 
 
 def _guarded(read: Callable[[Payload], Any]) -> Decoder:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, BinaryIO, cast
 
 from hsloc.errors import LogFormatError, TopicError
 from hsloc.log.messages.decode import OdometryMessage, ScanMessage
+from hsloc.log.packing import GZIP
 from hsloc.log.range_codes import NO_RETURN_CM, RANGE_MIN, NoReturnCode, RangeRule
 from hsloc.log.source import Observation
 from hsloc.log.summary import LogSummary, Losses, ReadOptions, TopicStatistics, TopicSummary
@@ -37,7 +38,7 @@ _LINES_TO_KNOW = 200
 
 def _open(path: Path) -> BinaryIO:
     stream = path.open("rb")
-    if stream.read(2) == b"\x1f\x8b":
+    if stream.read(2) == GZIP:
         stream.close()
         # Lines of the compressed stream itself are cut in Python.
         return cast("BinaryIO", BufferedReader(cast("RawIOBase", gzip.open(path, "rb"))))

@@ -299,7 +299,7 @@ class Localiser:
             evaluations = refined.evaluations
         best = self._match_in(points, window)
         evaluations += best.evaluations
-        if usual is not None and not self._match_gate.fits_as_usual(best.fitness):
+        if not self._match_gate.fits_as_usual(best.fitness):
             wide = Window(
                 predicted,
                 max(window.half_x, p.wide_window),

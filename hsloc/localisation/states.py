@@ -35,7 +35,6 @@ _POOR_FIT = 0.92
 """Explained fitness by the usual one below which a doubted pose is taken for off the map."""
 _SETTLED = 5
 """Matches after which the covariance no longer knows how a track began."""
-
 _NAMED = 3
 """Places that are named where several fit."""
 USABLE_SHARE = 0.5
@@ -157,9 +156,13 @@ class StateLog:
     def ambiguities(self) -> tuple[Ambiguity, ...]:
         """The stretches of the scans that are ambiguous, with the places between which they do not decide."""
         rows, owners = self._tracks()
-        probabilities, states = smooth(rows), self.at_scans().state
+        probabilities = smooth(rows)
+        several = [
+            estimate.state is State.AMBIGUOUS if owner < 0 else _is_ambiguous(probabilities[owner])
+            for estimate, owner in zip(self._estimates, owners, strict=True)
+        ]
         found = []
-        for first, last in spans_of(np.array([state is State.AMBIGUOUS for state in states], dtype=np.bool_)):
+        for first, last in spans_of(np.array(several, dtype=np.bool_)):
             # A search and the track that follows it know of different places.
             is_guess = [owner < 0 for owner in owners[first : last + 1]]
             edges = [first, *(first + k for k in range(1, len(is_guess)) if is_guess[k] != is_guess[k - 1]), last + 1]
@@ -236,12 +239,17 @@ def _rank(scans: StateRows, index: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(ranks[index])
 
 
+def _is_ambiguous(probabilities: F64) -> bool:
+    """Whether it is another place that makes a row of a track unsure."""
+    right, alike, astray = probabilities
+    return bool(right < CONFIDENCE and alike > astray)
+
+
 def _judge(probabilities: F64, sigma: F64, usual: float, before: Sequence[TrackRow]) -> tuple[State, str]:
     """The state of a row of a track, and the reason where it is not localised."""
-    right, alike, astray = probabilities
-    if right < CONFIDENCE:
-        if alike > astray:
-            return State.AMBIGUOUS, _named_rival(before)
+    if _is_ambiguous(probabilities):
+        return State.AMBIGUOUS, _named_rival(before)
+    if probabilities[0] < CONFIDENCE:
         evidence = _last_explained(before)
         if evidence is not None and evidence.explained < _POOR_FIT * usual:
             return State.OFF_MAP, f"the map explains {evidence.explained:.2f} of the scan, usually {usual:.2f}"

@@ -241,40 +241,49 @@ def _pick(
         return candidates[0]
     what = {"scan": "scan", "odom": "odometry"}[kind]
     if candidates:
-        listing = ", ".join(candidates[:_LISTED])
-        remedy = f"choose with {flag} {candidates[0]}"
-        made = [(a, b) for a in candidates for b in candidates if b.startswith(f"{a}_")]
-        if kind == "scan" and made:
-            remedy += f"; {made[0][1]} may be made of {made[0][0]}, and no laser of its own"
-        elif kind == "scan":
-            remedy += f", or take all with {flag} {','.join(candidates[:_LISTED])}"
-        text = f"{where}: {len(candidates)} {what} topics ({listing})"
-        warning = RunWarning(WarningCode.TOPIC_AMBIGUOUS, text, remedy)
+        text = f"{where}: {len(candidates)} {what} topics ({', '.join(candidates[:_LISTED])})"
+        warning = RunWarning(WarningCode.TOPIC_AMBIGUOUS, text, _remedy_of_several(kind, flag, candidates))
     else:
-        remedy = "motion can be estimated from the scans alone: --no-odom" if kind == "odom" and required else ""
-        moving = sorted({c.topic for c in channels if is_transform_topic(c) and not is_static_topic(c.topic)})
-        if remedy and moving:
-            remedy += f"; or it is in the transforms: --odom-topic {moving[0]}"
-        for other in ODOMETRY_KINDS if remedy else ():
-            if other.missing(options) and (topics := of_type(channels, other.typename)):
-                remedy += f"; or it is made of {topics[0]} with {other.missing(options)}"
-        if kind == "scan" and of_type(channels, definitions.POINT_CLOUD2):
-            remedy = (
-                "point clouds are read as scans with --slice LOW,HIGH, the heights above the base [m] between which "
-                "walls are seen"
-            )
-        unread = sorted({c.message_encoding or "nothing" for c in channels if not is_decodable(c) and is_read(c)})
-        if unread:
-            remedy = f"messages encoded as {', '.join(unread)} are not read: record or convert them as cdr"
-        clouds = [c for c in channels if _CLOUDS.search(c.typename)]
-        if kind == "scan" and clouds and not remedy:
-            remedy = f"convert {clouds[0].topic} to PointCloud2, which is read with --slice LOW,HIGH"
         text = f"{where}: no {what} topic ({typename}); the log holds {listed(channels)}"
-        warning = RunWarning(WarningCode.TOPIC_MISSING, text, remedy)
+        warning = RunWarning(WarningCode.TOPIC_MISSING, text, _remedy_of_none(kind, channels, options))
     if required:
         raise TopicError(str(warning))
     warnings.append(warning)
     return None
+
+
+def _remedy_of_several(kind: str, flag: str, candidates: Sequence[str]) -> str:
+    remedy = f"choose with {flag} {candidates[0]}"
+    if kind == "odom":
+        return remedy
+    made = next(((a, b) for a in candidates for b in candidates if b.startswith(f"{a}_")), None)
+    if made is not None:
+        return f"{remedy}; {made[1]} may be made of {made[0]}, and no laser of its own"
+    return f"{remedy}, or take all with {flag} {','.join(candidates[:_LISTED])}"
+
+
+def _remedy_of_none(kind: str, channels: Sequence[Channel], options: ReadOptions) -> str:
+    unread = sorted({encoding for c in channels if (encoding := _unread_encoding(c))})
+    if unread:
+        return f"messages encoded as {', '.join(unread)} are not read: record or convert them as cdr"
+    if kind == "scan":
+        if of_type(channels, definitions.POINT_CLOUD2):
+            return (
+                "point clouds are read as scans with --slice LOW,HIGH, the heights above the base [m] between which "
+                "walls are seen"
+            )
+        cloud = next((c for c in channels if _CLOUDS.search(c.typename)), None)
+        return "" if cloud is None else f"convert {cloud.topic} to PointCloud2, which is read with --slice LOW,HIGH"
+    if not options.require_odometry:
+        return ""
+    remedy = "motion can be estimated from the scans alone: --no-odom"
+    moving = sorted({c.topic for c in channels if is_transform_topic(c) and not is_static_topic(c.topic)})
+    if moving:
+        remedy += f"; or it is in the transforms: --odom-topic {moving[0]}"
+    for other in ODOMETRY_KINDS:
+        if other.missing(options) and (topics := of_type(channels, other.typename)):
+            remedy += f"; or it is made of {topics[0]} with {other.missing(options)}"
+    return remedy
 
 
 def _not_there(
@@ -313,15 +322,20 @@ def _truth(where: str, channels: Sequence[Channel], options: ReadOptions) -> str
     raise TopicError(f"{where}: no topic {named} to take as truth; --truth-topic may be {remedy}")
 
 
-def _spelt(channel: Channel) -> list[str]:
+def _unread_encoding(channel: Channel) -> str:
+    """The encoding of messages whose type is read, where it is one that is not; else empty."""
+    return channel.message_encoding or "nothing" if is_read(channel) and not is_decodable(channel) else ""
+
+
+def _spelt(channel: Channel) -> str:
     """Type and encoding; the type alone where the encoding is one that is read."""
-    unread = is_read(channel) and not is_decodable(channel)
-    return [channel.typename or channel.message_encoding, *([channel.message_encoding or "nothing"] if unread else [])]
+    name, encoding = channel.typename or channel.message_encoding, _unread_encoding(channel)
+    return f"{name}, encoded as {encoding}" if encoding else name
 
 
 def listed(channels: Sequence[Channel]) -> str:
     """Topics with their types, for a message."""
-    names = sorted({f"{c.topic} ({', encoded as '.join(_spelt(c))})" for c in channels})
+    names = sorted({f"{c.topic} ({_spelt(c)})" for c in channels})
     if not names:
         return "no messages"
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""

@@ -220,13 +220,12 @@ def _run_with(
         for event, estimate in replay(_reported(log, events, history, progress), estimator, deskew=deskew, first=first):
             history.add(event, estimate)
     replayed = time.perf_counter()
-    lost = "".join(f": {line}" for line in ["; ".join([*log.losses.lines(), *log.losses.reasons])] if line)
     if history.scans == 0:
         where = "between --start and --end" if _cut(request) else f"on {log.summary.scan_topic} that could be read"
-        raise LogError(f"{request.logs[0]}: no scan {where}{lost}")
+        raise LogError(f"{request.logs[0]}: no scan {where}{_lost(log)}")
     if first is None and not lidar_only:
         where = "between --start and --end" if _cut(request) else f"on {log.summary.odom_topic} that could be read"
-        raise LogError(f"{request.logs[0]}: no odometry {where}{lost}; the scans alone can do: --no-odom")
+        raise LogError(f"{request.logs[0]}: no odometry {where}{_lost(log)}; the scans alone can do: --no-odom")
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
     mapping, true_grid = None, None if localise else grid
     if isinstance(estimator, Mapper):
@@ -266,6 +265,12 @@ def _run_with(
         deskewed=deskew,
         log=None if log.is_unpacked else log,
     )
+
+
+def _lost(log: Log) -> str:
+    """What could not be read, as the end of a message; empty where all could."""
+    lost = [*log.losses.lines(), *log.losses.reasons]
+    return f": {'; '.join(lost)}" if lost else ""
 
 
 def with_offset(request: RunRequest, log: Log) -> tuple[Log, tuple[RunWarning, ...]]:

@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 _MOST_NEIGHBOURS = 16
 """Maximum number of hits on each side of a hit. Internal: bounds the time where beams are dense."""
-_MOST_BEAMS = 4
+MOST_BEAMS = 4
 """Maximum number of beams on each side of a point's own beam. Internal: bounds the time where beams are dense."""
 _DIRECTIONS = 16
 """Sectors of the normals among which hits are chosen. Internal: walls of one direction in each, 22.5 degrees."""
-_SAME_FACE = 0.7
+SAME_FACE = 0.7
 """Minimum cosine between the normals of one wall in two scans. Internal: 45 degrees, faces differ by 90 or 180."""
-_THROUGH = 0.25
+THROUGH = 0.25
 """Distance (m) by which a beam that looked through a point ends behind it. Internal: above errors of range."""
 _CLEARED = 4.0
 """Depth (m) up to which a beam without a return has looked through. Internal: as where the map is built; beyond, a wall
@@ -216,6 +216,59 @@ def choose_hits(normals: F32, most: int, chosen: I32) -> int:
     return taken
 
 
+# Inlined: called, these three would make `pair_terms` a fifteenth slower.
+@njit(cache=True, nogil=True, inline="always")
+def beam_towards(x: float, y: float, zero_angle: float, increment: float) -> int:
+    """The beam on which a point lies as seen from the laser; a number beyond the last beam where none is."""
+    spacing = abs(increment)
+    angle = (1.0 if increment > 0.0 else -1.0) * (bearing(y, x) - zero_angle) + 0.5 * spacing
+    angle -= 2.0 * pi * np.floor(angle / (2.0 * pi))
+    return int(angle / spacing)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def nearest_hit(x: float, y: float, j: int, low: int, high: int, scans: ScanArrays) -> tuple[int, float]:
+    """The hit of the beams `low` to `high` of scan j that is nearest to a point in its frame, and the squared distance.
+
+    Without a hit -1, and an infinite distance.
+    """
+    first = scans.table_start[j]
+    hits = scans.start[j]
+    best = np.inf
+    chosen = -1
+    for k in range(max(low, 0), min(high + 1, scans.table_start[j + 1] - first)):
+        row = scans.hit_of_beam[first + k]
+        if row >= 0:
+            ex = x - np.float64(scans.points[hits + row, 0])
+            ey = y - np.float64(scans.points[hits + row, 1])
+            squared = ex * ex + ey * ey
+            if squared < best:
+                best = squared
+                chosen = hits + row
+    return chosen, best
+
+
+@njit(cache=True, nogil=True, inline="always")
+def ends_around(beam: int, j: int, scans: ScanArrays) -> tuple[int, float, float]:
+    """Of a beam of scan j and those next to it how many are known, and how near and how far these end (m).
+
+    A beam without a return ends at `_CLEARED`.
+    """
+    first = scans.table_start[j]
+    nearest = np.inf
+    farthest = 0.0
+    known = 0
+    for k in range(max(beam - 1, 0), min(beam + 2, scans.table_start[j + 1] - first)):
+        end = np.float64(scans.ranges[first + k])
+        if end == np.inf:
+            end = np.float64(_CLEARED)
+        if end == end:
+            known += 1
+            nearest = min(nearest, end)
+            farthest = max(farthest, end)
+    return known, nearest, farthest
+
+
 @njit(cache=True, nogil=True)
 def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: float, term: Term, counts: F64) -> None:
     """Equations of scan i against scan j, the pose of i in j being `rel` (x, y, theta).
@@ -229,8 +282,6 @@ def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: 
     normals = scans.normals
     centroids = scans.centroids
     start = scans.start
-    hit_of_beam = scans.hit_of_beam
-    ranges = scans.ranges
     table_start = scans.table_start
     geometry = scans.geometry
     chosen_hits = scans.chosen_hits
@@ -240,15 +291,12 @@ def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: 
     rt = rel[2]
     c = cos(rt)
     s = sin(rt)
-    first = table_start[j]
-    n_beams = table_start[j + 1] - first
-    hits_j = start[j]
+    n_beams = table_start[j + 1] - table_start[j]
     laser_x = geometry[j, 0]
     laser_y = geometry[j, 1]
     zero_angle = geometry[j, 2] + geometry[j, 3]
-    sense = 1.0 if geometry[j, 4] > 0.0 else -1.0
-    spacing = abs(geometry[j, 4])
-    turn = 2.0 * pi
+    increment = geometry[j, 4]
+    spacing = abs(increment)
     gate2 = gate * gate
     weaken = 1.0 / (scale * scale)
     paired = conflicts = seen = 0
@@ -268,38 +316,18 @@ def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: 
         y = ry + dy
         lx = x - laser_x
         ly = y - laser_y
-        angle = sense * (bearing(ly, lx) - zero_angle) + 0.5 * spacing
-        angle -= turn * np.floor(angle / turn)
-        middle = int(angle / spacing)
+        middle = beam_towards(lx, ly, zero_angle, increment)
         if middle >= n_beams:
             continue
         seen += 1
         depth = sqrt(lx * lx + ly * ly)
         # The hit nearest to the point, among the beams around its own.
-        reach = min(int(gate / (depth * spacing + 1e-9)) + 1, _MOST_BEAMS)
-        best = np.inf
-        chosen = -1
-        for k in range(max(middle - reach, 0), min(middle + reach + 1, n_beams)):
-            row = hit_of_beam[first + k]
-            if row >= 0:
-                ex = x - np.float64(points[hits_j + row, 0])
-                ey = y - np.float64(points[hits_j + row, 1])
-                squared = ex * ex + ey * ey
-                if squared < best:
-                    best = squared
-                    chosen = hits_j + row
+        reach = min(int(gate / (depth * spacing + 1e-9)) + 1, MOST_BEAMS)
+        chosen, best = nearest_hit(x, y, j, middle - reach, middle + reach, scans)
         if best > gate2:
             # Did j look through the point? Only where all three beams around it ended well behind it.
-            nearest = np.inf
-            known = 0
-            for k in range(max(middle - 1, 0), min(middle + 2, n_beams)):
-                end = np.float64(ranges[first + k])
-                if end == np.inf:
-                    end = np.float64(_CLEARED)
-                if end == end:
-                    known += 1
-                    nearest = min(nearest, end)
-            if known >= 2 and depth + _THROUGH < nearest:
+            known, nearest, _ = ends_around(middle, j, scans)
+            if known >= 2 and depth + THROUGH < nearest:
                 conflicts += 1
                 continue
             if chosen < 0 or best > gate2 + (2.0 * spacing * depth) ** 2:
@@ -307,7 +335,7 @@ def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: 
         nx = np.float64(normals[chosen, 0])
         ny = np.float64(normals[chosen, 1])
         # Both sides must have seen the same face of the wall; (0, 0), no surfel, fails here too.
-        if nx * (c * mx - s * my) + ny * (s * mx + c * my) < _SAME_FACE:
+        if nx * (c * mx - s * my) + ny * (s * mx + c * my) < SAME_FACE:
             continue
         ex = x - np.float64(centroids[chosen, 0])
         ey = y - np.float64(centroids[chosen, 1])

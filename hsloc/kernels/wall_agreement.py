@@ -5,14 +5,23 @@ Points are looked up in the other scan as in `hsloc.kernels.point_to_line.pair_t
 
 from __future__ import annotations
 
-from math import cos, pi, sin, sqrt
+from math import cos, sin, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 
 from hsloc.kernels.normal_equations import PairTerms, add_inverse_term, relative
-from hsloc.kernels.point_to_line import ScanArrays, Term, bearing
+from hsloc.kernels.point_to_line import (
+    MOST_BEAMS,
+    SAME_FACE,
+    THROUGH,
+    ScanArrays,
+    Term,
+    beam_towards,
+    ends_around,
+    nearest_hit,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,72 +29,55 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
-_MOST_BEAMS = 4
-_SAME_FACE = 0.7
-_THROUGH = 0.25
-_CLEARED = 4.0
-"""These four as in `point_to_line`."""
 _UNKNOWN = -1
 _ELSEWHERE = -2
 _LOOKED_THROUGH = -3
 
 
 @njit(cache=True, nogil=True)
-def wall_at(point: F64, normal: F64, j: int, scans: ScanArrays, gate: float) -> tuple[int, float]:
-    """The hit of scan j on whose wall a point with a normal lies, both (2,) in the frame of j, and the distance (m).
+def wall_at(
+    x: float, y: float, normal_x: float, normal_y: float, j: int, scans: ScanArrays, gate: float
+) -> tuple[int, float]:
+    """The hit of scan j on whose wall a point with a normal lies, both in the frame of j, and the distance (m).
 
     Instead of a hit: -1 where j does not know (out of its view, behind a wall, no return beyond 4 m), -2 where j saw a
     wall near the point that is not the point's, -3 where j looked through the point.
     """
-    first = scans.table_start[j]
-    n_beams = scans.table_start[j + 1] - first
     geometry = scans.geometry[j]
-    sense = 1.0 if geometry[4] > 0.0 else -1.0
     spacing = abs(geometry[4])
-    lx = point[0] - geometry[0]
-    ly = point[1] - geometry[1]
-    angle = sense * (bearing(ly, lx) - geometry[2] - geometry[3]) + 0.5 * spacing
-    angle -= 2.0 * pi * np.floor(angle / (2.0 * pi))
-    middle = int(angle / spacing)
-    if middle >= n_beams:
+    lx = x - geometry[0]
+    ly = y - geometry[1]
+    middle = beam_towards(lx, ly, geometry[2] + geometry[3], geometry[4])
+    if middle >= scans.table_start[j + 1] - scans.table_start[j]:
         return _UNKNOWN, 0.0
     depth = sqrt(lx * lx + ly * ly)
-    reach = min(int(gate / (depth * spacing + 1e-9)) + 1, _MOST_BEAMS)
-    best = np.inf
-    chosen = -1
-    for k in range(max(middle - reach, 0), min(middle + reach + 1, n_beams)):
-        row = scans.hit_of_beam[first + k]
-        if row >= 0:
-            hit = scans.start[j] + row
-            ex = point[0] - np.float64(scans.points[hit, 0])
-            ey = point[1] - np.float64(scans.points[hit, 1])
-            if ex * ex + ey * ey < best:
-                best = ex * ex + ey * ey
-                chosen = hit
-    nearest = np.inf
-    farthest = 0.0
-    known = 0
-    for k in range(max(middle - 1, 0), min(middle + 2, n_beams)):
-        end = np.float64(scans.ranges[first + k])
-        if end == np.inf:
-            end = np.float64(_CLEARED)
-        if end == end:
-            known += 1
-            nearest = min(nearest, end)
-            farthest = max(farthest, end)
-    if best > gate * gate and known >= 2 and depth + _THROUGH < nearest:
+    reach = min(int(gate / (depth * spacing + 1e-9)) + 1, MOST_BEAMS)
+    chosen, best = nearest_hit(x, y, j, middle - reach, middle + reach, scans)
+    known, nearest, farthest = ends_around(middle, j, scans)
+    if best > gate * gate and known >= 2 and depth + THROUGH < nearest:
         return _LOOKED_THROUGH, 0.0
     if chosen >= 0 and best <= gate * gate + (2.0 * spacing * depth) ** 2:
         nx = np.float64(scans.normals[chosen, 0])
         ny = np.float64(scans.normals[chosen, 1])
-        ex = point[0] - np.float64(scans.centroids[chosen, 0])
-        ey = point[1] - np.float64(scans.centroids[chosen, 1])
+        ex = x - np.float64(scans.centroids[chosen, 0])
+        ey = y - np.float64(scans.centroids[chosen, 1])
         distance = nx * ex + ny * ey
-        if nx * normal[0] + ny * normal[1] >= _SAME_FACE and abs(distance) <= gate:
+        if nx * normal_x + ny * normal_y >= SAME_FACE and abs(distance) <= gate:
             return chosen, distance
-    if chosen < 0 or known < 2 or depth > farthest + _THROUGH:
+    if chosen < 0 or known < 2 or depth > farthest + THROUGH:
         return _UNKNOWN, 0.0
     return _ELSEWHERE, 0.0
+
+
+@njit(cache=True, nogil=True)
+def turned_hit(q: int, i: int, c: float, s: float, scans: ScanArrays) -> tuple[float, float, float, float]:
+    """The chosen hit q of scan i and its normal, turned by the angle with cosine `c` and sine `s`."""
+    a = scans.start[i] + scans.chosen_hits[q]
+    px = np.float64(scans.points[a, 0])
+    py = np.float64(scans.points[a, 1])
+    mx = np.float64(scans.normals[a, 0])
+    my = np.float64(scans.normals[a, 1])
+    return c * px - s * py, s * px + c * py, c * mx - s * my, s * mx + c * my
 
 
 @njit(cache=True, nogil=True)
@@ -98,31 +90,21 @@ def add_information(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, sc
     """
     c = cos(rel[2])
     s = sin(rel[2])
-    point = np.empty(2)
-    normal = np.empty(2)
     information[:] = 0.0
     one = np.empty(3)
     other = np.empty(3)
     for q in range(scans.chosen_start[i], scans.chosen_start[i + 1]):
-        a = scans.start[i] + scans.chosen_hits[q]
-        mx = np.float64(scans.normals[a, 0])
-        my = np.float64(scans.normals[a, 1])
-        dx = c * np.float64(scans.points[a, 0]) - s * np.float64(scans.points[a, 1])
-        dy = s * np.float64(scans.points[a, 0]) + c * np.float64(scans.points[a, 1])
-        point[0] = rel[0] + dx
-        point[1] = rel[1] + dy
-        normal[0] = c * mx - s * my
-        normal[1] = s * mx + c * my
-        hit, distance = wall_at(point, normal, j, scans, gate)
+        dx, dy, nx, ny = turned_hit(q, i, c, s, scans)
+        hit, distance = wall_at(rel[0] + dx, rel[1] + dy, nx, ny, j, scans, gate)
         if hit < 0:
             continue
         w = 1.0 / (1.0 + (distance / scale) ** 2) ** 2
         one[0] = np.float64(scans.normals[hit, 0])
         one[1] = np.float64(scans.normals[hit, 1])
         one[2] = one[1] * dx - one[0] * dy
-        other[0] = normal[0]
-        other[1] = normal[1]
-        other[2] = normal[1] * dx - normal[0] * dy
+        other[0] = nx
+        other[1] = ny
+        other[2] = ny * dx - nx * dy
         for k in range(3):
             for m in range(3):
                 information[k, m] += 0.5 * w * (one[k] * other[m] + one[m] * other[k])
@@ -155,21 +137,14 @@ def add_agreement(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scal
     """
     c = cos(rel[2])
     s = sin(rel[2])
-    point = np.empty(2)
-    normal = np.empty(2)
     for q in range(scans.chosen_start[i], scans.chosen_start[i + 1]):
-        a = scans.start[i] + scans.chosen_hits[q]
-        px = np.float64(scans.points[a, 0])
-        py = np.float64(scans.points[a, 1])
-        point[0] = rel[0] + c * px - s * py
-        point[1] = rel[1] + s * px + c * py
-        normal[0] = c * np.float64(scans.normals[a, 0]) - s * np.float64(scans.normals[a, 1])
-        normal[1] = s * np.float64(scans.normals[a, 0]) + c * np.float64(scans.normals[a, 1])
+        dx, dy, nx, ny = turned_hit(q, i, c, s, scans)
+        x = rel[0] + dx
+        y = rel[1] + dy
         # From behind a wall j cannot have seen this face of it.
-        away = normal[0] * (point[0] - scans.geometry[j, 0]) + normal[1] * (point[1] - scans.geometry[j, 1])
-        if away >= 0.0:
+        if nx * (x - scans.geometry[j, 0]) + ny * (y - scans.geometry[j, 1]) >= 0.0:
             continue
-        hit, distance = wall_at(point, normal, j, scans, gate)
+        hit, distance = wall_at(x, y, nx, ny, j, scans, gate)
         if hit == _UNKNOWN:
             continue
         sums[1] += 1.0

@@ -165,11 +165,12 @@ class OdometryWatch:
         self._turns |= last is not None and pose.theta != self._heading
         self._heading = pose.theta
         self._had_heading |= event.has_heading
-        if self._start is None or event.has_heading:
+        if self._start is None:
             self._start = (pose.x, pose.y)
+        if event.has_heading:
+            return
         # Between others a few are left out when the log is read; those that come have none around them.
-        way = hypot(pose.x - self._start[0], pose.y - self._start[1])
-        if not event.has_heading and (self._had_heading or way > _UNSET_WAY):
+        if self._had_heading or hypot(pose.x - self._start[0], pose.y - self._start[1]) > _UNSET_WAY:
             raise UnusableOdometry("its orientations are not set (quaternions of zeros)")
 
     def _compare(self, scan: Scan) -> None:

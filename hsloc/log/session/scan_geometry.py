@@ -310,12 +310,11 @@ def _segments(scans: Sequence[ScanMessage]) -> tuple[int, float]:
         return 1, 0.0
     rising = first.angle_increment > 0.0
     begin = min(starts) if rising else max(starts)
-    places = [k for k, start in enumerate(starts) if abs(start - begin) <= _SPARE_BEAMS * abs(first.angle_increment)]
-    if len(places) < 2:
+    spare = _SPARE_BEAMS * abs(first.angle_increment)
+    if sum(abs(start - begin) <= spare for start in starts) < 2:
         return 1, 0.0
     # Segments may be missing; a turn has as many as there are different beginnings.
-    different = np.diff(np.sort(starts)) > _SPARE_BEAMS * abs(first.angle_increment)
-    return 1 + int(np.count_nonzero(different)), begin
+    return 1 + int(np.count_nonzero(np.diff(np.sort(starts)) > spare)), begin
 
 
 def _follows(first: ScanMessage, second: ScanMessage) -> bool:

@@ -136,17 +136,19 @@ def test_a_folder_of_packed_files_is_a_recording(tmp_path: Path, db3: Path, expe
 
 
 @pytest.mark.parametrize(
-    ("name", "data", "told"),
+    ("name", "data", "reason"),
     [
         ("x.7z", b"7z\xbc\xaf\x27\x1c\0", "packed by 7z, which is not read; unpack it first"),
         ("x.db3-wal", b"\x37\x7f\x06\x82\0", "name the database, x.db3"),
         ("x.db3", b"", "is empty; its write-ahead log beside it"),
     ],
 )
-def test_files_that_are_no_logs_are_told_by_what_they_are(tmp_path: Path, name: str, data: bytes, told: str) -> None:
+def test_files_that_are_no_logs_are_reported_as_what_they_are(
+    tmp_path: Path, name: str, data: bytes, reason: str
+) -> None:
     (tmp_path / "x.db3-wal").write_bytes(b"")
     (tmp_path / name).write_bytes(data)
-    with pytest.raises(LogFormatError, match=told):
+    with pytest.raises(LogFormatError, match=reason):
         open_log(tmp_path / name)
 
 
@@ -283,7 +285,7 @@ def test_types_and_encodings_are_known_by_any_usual_name(tmp_path: Path, name: s
     assert len(list(open_log(path, ReadOptions(require_odometry=False)).events())) == 5
 
 
-def test_the_number_of_a_header_of_ros_1_may_stand_in_the_definition_alone(tmp_path: Path) -> None:
+def test_the_number_of_a_header_of_ros_1_may_be_in_the_definition_alone(tmp_path: Path) -> None:
     text = definitions.definition_text(definitions.LASER_SCAN)
     text = text.replace("MSG: std_msgs/Header\n", "MSG: std_msgs/Header\nuint32 seq\n")
     path = write_raw(tmp_path / "a.mcap", scan_payloads(5), schema=(definitions.LASER_SCAN, "ros2msg", text.encode()))

@@ -132,7 +132,7 @@ def _ros_decoder(channel: Channel, warnings: list[RunWarning] | None) -> Decoder
         if _is_known(channel, typename):
             return _by_hand(channel, typename)
         if (without := _without_sequence(channel)) is not None and _is_known(without, typename):
-            return _by_hand(without, typename, _by_rosbags(channel, typename))
+            return _by_hand(channel, typename, is_sure=False)
     if _is_incomplete(channel, typename):
         if warnings is not None:
             text = (
@@ -179,16 +179,16 @@ def _is_incomplete(channel: Channel, typename: str) -> bool:
     return is_incomplete(text, typename, channel.message_encoding == "ros1")
 
 
-def _by_hand(channel: Channel, typename: str, other: Decoder | None = None) -> Decoder:
-    """The decoder made for the type; what it cannot read goes to the `other`, big endian in any case to rosbags."""
+def _by_hand(channel: Channel, typename: str, *, is_sure: bool = True) -> Decoder:
+    """The decoder made for the type; big endian goes to rosbags, and all that it cannot read unless it `is_sure`."""
     fast = BY_HAND[typename]
-    slow = [] if other is None else [other]
+    slow: list[Decoder] = []
 
     def decoder(data: Payload) -> Any:
         try:
             return fast(data)
         except decode.BAD_PAYLOAD as error:
-            if other is None and data[:2] != decode.BIG_ENDIAN:
+            if is_sure and data[:2] != decode.BIG_ENDIAN:
                 raise Undecodable(str(error)) from error
         # Rare enough for the slow way.
         if not slow:

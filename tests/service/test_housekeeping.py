@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import threading
 import time
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from fastapi.testclient import TestClient
+    from postgresql import Server
 
 
 def test_old_jobs_go_with_results_and_uploads_but_active_ones_stay(make_client: Callable[..., TestClient]) -> None:
@@ -41,6 +43,22 @@ def test_old_jobs_go_with_results_and_uploads_but_active_ones_stay(make_client: 
     assert len(list(context.storage.uploads.iterdir())) == 1  # the active job's
     client.post(f"/v1/jobs/{active}/cancel")
     wait(client, active)
+
+
+def test_a_server_whose_clock_is_wrong_says_what_that_of_the_database_does(
+    make_client: Callable[..., TestClient], postgresql: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = make_client(slots=0, database_url=postgresql.new_database())
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + 3600.0)
+    submit(client)
+    (waits,) = re.findall(r"^hsloc_oldest_queued_seconds (\S+)$", client.get("/metrics").text, re.MULTILINE)
+    assert 0.0 <= float(waits) < 60.0
+    tus = {"Tus-Resumable": "1.0.0"}
+    place = client.post("/v1/tus", headers={**tus, "Upload-Length": "9"}).headers["location"]
+    kind = {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"}
+    sent = client.patch(place, headers={**tus, **kind}, content=b"half")
+    assert sent.headers["upload-expires"] == client.head(place, headers=tus).headers["upload-expires"]
 
 
 def test_without_retention_nothing_goes(make_client: Callable[..., TestClient]) -> None:

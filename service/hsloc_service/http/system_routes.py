@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import time
 from typing import TYPE_CHECKING, Annotated, Any
 
 from fastapi import APIRouter, Query
@@ -16,6 +15,7 @@ from hsloc.options import describe
 from hsloc.version import __version__
 from hsloc_service import audit
 from hsloc_service import config_schema as job_options
+from hsloc_service.db.database import clock
 from hsloc_service.db.tables import DeliveryRow, JobRow
 from hsloc_service.errors import ServiceError, not_found
 from hsloc_service.http import metrics
@@ -200,6 +200,7 @@ def _measure(ctx: Context) -> None:
         counts = {row[0]: row[1] for row in rows}
         oldest = session.scalar(select(func.min(JobRow.created)).where(JobRow.state == "queued"))
         pending = session.scalar(select(func.count()).select_from(DeliveryRow).where(DeliveryRow.state == "pending"))
+        waits_s = 0.0 if oldest is None else clock(session) - oldest
         alive = alive_workers(session, ctx.database.now(session) - ctx.settings.lease_s)
     for state in ("queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"):
         metrics.JOBS.labels(state).set(counts.get(state, 0))
@@ -210,7 +211,7 @@ def _measure(ctx: Context) -> None:
     metrics.SLOTS.set(capacity.slots)
     metrics.BUSY.set(capacity.busy)
     metrics.FREE.set(ctx.storage.free_bytes())
-    metrics.OLDEST.set(0.0 if oldest is None else time.time() - oldest)
+    metrics.OLDEST.set(waits_s)
     metrics.DELIVERIES.set(pending or 0)
 
 

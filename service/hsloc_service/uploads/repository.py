@@ -113,13 +113,18 @@ class Files:
                 query = query.where(tuple_(FileRow.created, FileRow.id) < tuple_(last.created, last.id))
             return session.scalars(query.order_by(FileRow.created.desc(), FileRow.id.desc())).all()
 
-    def advance(self, file_id: str, received: int | None = None) -> None:
-        """Write the number of bytes that are on the disk, if it has changed, and put off the upload's expiry."""
+    def advance(self, file_id: str, received: int | None = None) -> float | None:
+        """Write the number of bytes that are on the disk, if it has changed, and put off the upload's expiry.
+
+        When it expires now; None if it was deleted meanwhile.
+        """
         with self.database.write() as session:
             row = session.get(FileRow, file_id, with_for_update=True)
-            if row is not None:
-                row.received = row.received if received is None else received
-                row.expires = clock(session) + self.settings.upload_ttl_s
+            if row is None:
+                return None
+            row.received = row.received if received is None else received
+            row.expires = clock(session) + self.settings.upload_ttl_s
+            return row.expires
 
     def complete(self, file_id: str, size: int, sha256: str) -> FileRow:
         """The file is whole. Raises ServiceError 404 if it was deleted meanwhile."""

@@ -79,7 +79,7 @@ class UploadReceiver:
                 raise
         finally:
             self._hashes[file_id] = (append.digest, append.safe)
-        row.received, row.expires = append.safe, time.time() + self._settings.upload_ttl_s
+        row.received = append.safe
         if append.safe == row.size:
             return await self.finish(file_id)
         return row
@@ -157,7 +157,7 @@ class _Append:
                 async for block in body:
                     buffer += block
                     if time.monotonic() > self._alive_until:
-                        await to_thread.run_sync(self._files.advance, self._row.id)
+                        self._row.expires = await to_thread.run_sync(self._files.advance, self._row.id)
                         self._alive_until = time.monotonic() + self._alive_s
                     if self._at + len(buffer) > self._limit:
                         raise ServiceError(413, "too_large", f"more than the {self._limit} bytes that are expected")
@@ -227,7 +227,7 @@ class _Append:
             return
         os.fdatasync(descriptor)
         if self._at != self._row.size:
-            self._files.advance(self._row.id, self._at)
+            self._row.expires = self._files.advance(self._row.id, self._at)
         self._set_safe()
 
     def _set_safe(self) -> None:

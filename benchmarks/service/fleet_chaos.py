@@ -233,7 +233,7 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=3)
     parser.add_argument("--lease-s", type=float, default=LEASE_S)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--minutes", type=float, default=60.0, help="Submit and mistreat for so long at most.")
+    parser.add_argument("--minutes", type=float, default=60.0, help="Time to submit and mistreat, at most.")
     parser.add_argument("--network", action="store_true", help="Network namespaces and S3; needs root and moto.")
     arguments = parser.parse_args()
     folder, rng = Path(tempfile.mkdtemp(prefix="hsloc-fleet-")), random.Random(arguments.seed)

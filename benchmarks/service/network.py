@@ -7,7 +7,6 @@ go on. (libfaketime 0.9.10 will not do: with it every `time.sleep` of Python 3.1
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -141,7 +140,7 @@ class Network:
 
 
 class S3:
-    """moto's server on a machine of its own, with one bucket. It keeps all in memory, so it is stopped, not killed."""
+    """moto's server on a machine of its own, with one bucket. It keeps all in memory, so it is cut off, not killed."""
 
     def __init__(self, machine: Machine, log: Path) -> None:
         self.machine, self.url = machine, f"http://{machine.address}:5000"
@@ -162,7 +161,6 @@ class S3:
         urllib.request.urlopen(request, timeout=30.0).close()
 
     def close(self) -> None:
-        self.process.send_signal(signal.SIGCONT)
         self.process.kill()
         self.process.wait()
 

@@ -58,7 +58,7 @@ def work(settings: Settings, drain_s: float, metrics_at: str | None = None) -> i
     for which in (signal.SIGTERM, signal.SIGINT):
         signal.signal(which, ask)
     dispatcher = parts.dispatcher
-    metrics.SLOTS.set_function(lambda: settings.slots)
+    metrics.SLOTS.set(settings.slots)
     metrics.BUSY.set_function(lambda: dispatcher.capacity().busy)
     metrics.FREE.set_function(parts.storage.free_bytes)
     presence = Presence(

@@ -153,7 +153,10 @@ class Database:
                 connection.invalidate()  # else the next one to use it would listen, too
 
     def now(self, session: Session) -> float:
-        """Seconds since 1970 by the clock of the database, which all its clients share."""
+        """Seconds since 1970 by the clock of the database, which all its clients share.
+
+        Of this moment, as leases need it after a wait for a lock; `clock` is of the begin of the transaction.
+        """
         if self.shared:
             return float(session.execute(text("SELECT extract(epoch FROM clock_timestamp())")).scalar_one())
         return float(session.execute(text("SELECT (julianday('now') - 2440587.5) * 86400.0")).scalar_one())
@@ -166,7 +169,7 @@ class Database:
 def clock(session: Session) -> float:
     """Seconds since 1970, for what servers compare that share a database: by its clock, asked once in a transaction.
 
-    The clock of one machine may be wrong by hours: its webhooks would wait so long, or uploads be deleted too early.
+    The clock of one machine may be wrong by hours: its webhooks would wait for hours, or uploads be deleted too early.
     """
     if session.get_bind().dialect.name != "postgresql":
         return time.time()

@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 import pytest
 from evaluation_paths import diagnostics_of, office
+from imports import need_no_import
 from PIL import Image
 from report_parts import NOTHING, parts
 
@@ -250,8 +251,4 @@ def test_the_table_shows_what_metrics_hold(run: Any) -> None:
 
 
 def test_pyplot_stays_out() -> None:
-    import subprocess
-    import sys
-
-    code = "import sys, hsloc.report.png; sys.exit('matplotlib.pyplot' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    need_no_import("import hsloc.report.png", {"matplotlib.pyplot"})

@@ -235,13 +235,9 @@ def find_drift(scans: Headings, odometry: Headings, offset_s: float) -> float:
 
 def _agreement(scans: Headings, odometry: Headings, offset_s: float) -> float:
     """The correlation (-1 to 1) of the rotations between scans with those of the odometry, an offset removed."""
-    thinned = _thinned(scans, _CORRELATED_S)
-    at = thinned.stamps_ns - round(offset_s * NANOSECONDS)
-    inside = (at >= odometry.stamps_ns[0]) & (at <= odometry.stamps_ns[-1])
-    if inside.sum() < 3:
+    seen, turned = _rotations(_thinned(scans, _CORRELATED_S), odometry, offset_s)
+    if len(seen) < 2:
         return 0.0
-    seen = np.diff(thinned.theta[inside])
-    turned = np.diff(np.interp(at[inside].astype(np.float64), odometry.stamps_ns.astype(np.float64), odometry.theta))
     return float(np.sum(seen * turned) / max(sqrt(float(np.sum(seen**2) * np.sum(turned**2))), 1e-12))
 
 
@@ -266,12 +262,18 @@ def _thinned(headings: Headings, step_s: float = 0.2) -> Headings:
 
 def _misfit(scans: Headings, odometry: Headings, offset_s: float) -> float:
     """Mean difference of the steps (rad), large ones bounded."""
+    seen, turned = _rotations(scans, odometry, offset_s)
+    if len(seen) + 1 < _MIN_STEPS:
+        return float("inf")
+    return float(np.mean(np.minimum(np.abs(seen - turned), 0.5)))
+
+
+def _rotations(scans: Headings, odometry: Headings, offset_s: float) -> tuple[F64, F64]:
+    """Turns (rad) from scan to scan, by the scans and by the odometry, within its time; an offset is removed."""
     at = scans.stamps_ns - round(offset_s * NANOSECONDS)
     inside = (at >= odometry.stamps_ns[0]) & (at <= odometry.stamps_ns[-1])
-    if inside.sum() < _MIN_STEPS:
-        return float("inf")
-    interpolated = np.interp(at[inside].astype(np.float64), odometry.stamps_ns.astype(np.float64), odometry.theta)
-    return float(np.mean(np.minimum(np.abs(np.diff(scans.theta[inside]) - np.diff(interpolated)), 0.5)))
+    turned = np.interp(at[inside].astype(np.float64), odometry.stamps_ns.astype(np.float64), odometry.theta)
+    return np.diff(scans.theta[inside]), np.diff(turned)
 
 
 def offsets_of_log(paths: Sequence[Path], options: ReadOptions, parameters: FrontEndParameters) -> dict[str, Offset]:

@@ -135,7 +135,7 @@ def classify_beams(
 def look_up(values: F32, points: F64, pose: F64, cell: float, outside: float, found: F32) -> None:
     """Write the value of the cell that each of the points (n, 2), seen from `pose` (3,), lies in to `found` (n,).
 
-    `values` (h, w) are those of cells of side `cell` (m) from the origin on; `outside` stands for those beyond.
+    `values` (h, w) are those of cells of side `cell` (m) from the origin on; points beyond them get `outside`.
     """
     height, width = values.shape
     c = cos(pose[2])

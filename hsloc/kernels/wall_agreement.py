@@ -131,7 +131,7 @@ def evaluate_information(
 
 @njit(cache=True, nogil=True)
 def add_agreement(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: float, sums: F64) -> None:
-    """Add to `sums` (2,) the agreement of scan i with scan j, and the number of points on which j has a say.
+    """Add to `sums` (2,) the agreement of scan i with scan j, and the number of points that j can judge.
 
     The agreement is the weight of points on walls of j, less the number of points that j looked through.
     """
@@ -160,7 +160,7 @@ def displaced_agreement(
 ) -> None:
     """Write to `out` (m,) the agreement of two groups of scans with the second displaced by (m, 2) in the map (m).
 
-    It is a part of the points on which the other side has a say: near 1 where all lie on walls.
+    It is a part of the points that the other side can judge: near 1 where all lie on walls.
     """
     rel = np.empty(3)
     moved = np.empty(3)

@@ -73,7 +73,7 @@ def test_clocks_that_are_seconds_apart_are_found_over_the_whole_range() -> None:
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.3, -0.5])
-def test_clocks_that_drift_are_told_from_an_offset(drift: float) -> None:
+def test_clocks_that_drift_are_distinguished_from_an_offset(drift: float) -> None:
     scans, odometry = headings(3, 0.1, 0.001)
     first, last = scans.stamps_ns[[0, -1]]
     share = (scans.stamps_ns - first) / (last - first)

@@ -7,9 +7,7 @@ import pytest
 
 from hsloc.errors import LogFormatError, OutputError
 from hsloc.model.pose2 import compose_poses, relative_poses
-from hsloc.slam import sparse_solver
 from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
-from hsloc.slam.sparse_solver import BlockSystem
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,26 +33,6 @@ def dead_reckoned(true: NDArray[np.float64], edges: Edges) -> NDArray[np.float64
     for step in edges.measured:
         poses.append(compose_poses(poses[-1], step)[0])
     return np.array(poses)
-
-
-def test_a_sparse_system_is_that_of_its_dense_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
-    random = np.random.default_rng(0)
-    rows, columns = np.array([0, 1, 3, 0, 0]), np.array([1, 2, 0, 3, 1])
-    off = random.normal(size=(5, 3, 3))
-    diagonal = np.broadcast_to(30.0 * np.eye(3), (4, 3, 3)).copy()
-    right = random.normal(size=(4, 3))
-    dense = np.zeros((12, 12))
-    for k in range(4):
-        dense[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += diagonal[k]
-    for i, j, block in zip(rows, columns, off, strict=True):
-        dense[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] += block
-        dense[3 * j : 3 * j + 3, 3 * i : 3 * i + 3] += block.T
-    wanted = np.linalg.solve(dense, right.reshape(-1)).reshape(4, 3)
-    system = BlockSystem(4, rows, columns)
-    np.testing.assert_allclose(system.solve(diagonal, off, right), wanted, rtol=1e-9)
-    np.testing.assert_allclose(system.solve(2.0 * diagonal, 2.0 * off, right), 0.5 * wanted, rtol=1e-9)
-    monkeypatch.setattr(sparse_solver, "MOST_BLOCKS_A_COLUMN", 0)  # as with much fill: by SuperLU
-    np.testing.assert_allclose(system.solve(diagonal, off, right), wanted, rtol=1e-9)
 
 
 def test_a_loop_takes_the_drift_out() -> None:

@@ -1,0 +1,48 @@
+"""Sparse systems of 3 x 3 blocks against dense ones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hsloc.slam import sparse_solver
+from hsloc.slam.sparse_solver import BlockSystem
+
+
+def test_a_sparse_system_is_that_of_its_dense_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(0)
+    rows, columns = np.array([0, 1, 3, 0, 0]), np.array([1, 2, 0, 3, 1])
+    off = random.normal(size=(5, 3, 3))
+    diagonal = np.broadcast_to(30.0 * np.eye(3), (4, 3, 3)).copy()
+    right = random.normal(size=(4, 3))
+    dense = np.zeros((12, 12))
+    for k in range(4):
+        dense[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += diagonal[k]
+    for i, j, block in zip(rows, columns, off, strict=True):
+        dense[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] += block
+        dense[3 * j : 3 * j + 3, 3 * i : 3 * i + 3] += block.T
+    wanted = np.linalg.solve(dense, right.reshape(-1)).reshape(4, 3)
+    system = BlockSystem(4, rows, columns)
+    np.testing.assert_allclose(system.solve(diagonal, off, right), wanted, rtol=1e-9)
+    np.testing.assert_allclose(system.solve(2.0 * diagonal, 2.0 * off, right), 0.5 * wanted, rtol=1e-9)
+    monkeypatch.setattr(sparse_solver, "MOST_BLOCKS_A_COLUMN", 0)  # as with much fill: by SuperLU
+    np.testing.assert_allclose(system.solve(diagonal, off, right), wanted, rtol=1e-9)
+
+
+@pytest.mark.parametrize("chords", [0, 3, 20])
+def test_a_ring_with_chords_that_fill_the_factor_in(rng: Any, chords: int) -> None:
+    n = 14
+    rows = np.concatenate((np.arange(n), rng.integers(0, n, chords)))
+    columns = np.concatenate(((np.arange(n) + 1) % n, (rows[n:] + rng.integers(1, n, chords)) % n))
+    off, right = rng.normal(size=(len(rows), 3, 3)), rng.normal(size=(n, 3))
+    diagonal = np.broadcast_to(100.0 * np.eye(3), (n, 3, 3)) + 0.1
+    dense = np.zeros((n, 3, n, 3))
+    for k in range(n):
+        dense[k, :, k] = diagonal[k]
+    for i, j, block in zip(rows, columns, off, strict=True):
+        dense[i, :, j] += block
+        dense[j, :, i] += block.T
+    wanted = np.linalg.solve(dense.reshape(3 * n, 3 * n), right.reshape(-1)).reshape(n, 3)
+    np.testing.assert_allclose(BlockSystem(n, rows, columns).solve(diagonal, off, right), wanted, rtol=1e-9, atol=1e-12)

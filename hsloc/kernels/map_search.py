@@ -39,17 +39,26 @@ class Clusters(NamedTuple):
     starts: I64
 
 
+class OpenSquares(NamedTuple):
+    """Which squares hold a place that counts: (x, y) of level k in `cells[starts[k] + y * widths[k] + x]`."""
+
+    cells: B
+    starts: I64
+    widths: I64
+
+
+class LookUps(NamedTuple):
+    """Room for the look-ups of one bound."""
+
+    entries: I64
+    weights: I64
+    rest: I64
+    offsets: I32
+
+
 @njit(cache=True, nogil=True)
 def _turned(
-    rows: F64,
-    theta: float,
-    half_theta: float,
-    extent: float,
-    pyramid: Pyramid,
-    entries: I64,
-    weights: I64,
-    rest: I64,
-    offsets: I32,
+    rows: F64, theta: float, half_theta: float, extent: float, pyramid: Pyramid, look_ups: LookUps
 ) -> tuple[int, int, int, int, int]:
     """Look-ups for boxes of places of side `extent` (cells), by their first entry (y, x).
 
@@ -57,6 +66,7 @@ def _turned(
     look-up on. A cluster that no table is large enough for needs none: it always counts in full.
     Returns the number of look-ups, and the range y_low, y_high, x_low, x_high for which all lie in the tables.
     """
+    entries, weights, rest, offsets = look_ups
     height = pyramid.tables.shape[1]
     width = pyramid.tables.shape[2]
     step = 1 << pyramid.shift
@@ -175,9 +185,7 @@ def fit_boxes(
     pyramid: Pyramid,
     by_phase: U8,
     clusters: Clusters,
-    is_open: B,
-    open_starts: I64,
-    open_widths: I64,
+    open_squares: OpenSquares,
     half_thetas: F64,
     needed: float,
     max_boxes: int,
@@ -185,11 +193,11 @@ def fit_boxes(
 ) -> tuple[F64, int, bool]:
     """The boxes of the finest level whose bound exceeds `needed` (a sum of scores).
 
-    `is_open[open_starts[k] + y * open_widths[k] + x]` is whether the square (x, y) of level k holds a place that
-    counts. `half_thetas[k]` is half the interval of headings at level k, that of the coarsest level divides the turn.
+    `half_thetas[k]` is half the interval of headings at level k, that of the coarsest level divides the turn.
     Returns rows (x, y, theta, half, half, half_theta, bound) in cells, the boxes bounded, and whether it came to its
     end within `max_boxes` and `max_results`.
     """
+    is_open, open_starts, open_widths = open_squares
     coarsest = len(half_thetas) - 1
     step = 1 << pyramid.shift
     limit = floor(255.0 * needed)
@@ -200,6 +208,7 @@ def fit_boxes(
     weights = np.empty(largest, dtype=np.int64)
     rest = np.empty(largest + 1, dtype=np.int64)
     offsets = np.empty((largest, 3), dtype=np.int32)
+    look_ups = LookUps(entries, weights, rest, offsets)
     flat = pyramid.tables.reshape(-1)
     table_width = pyramid.tables.shape[2]
     results = np.empty((256, 7), dtype=np.float64)
@@ -222,9 +231,7 @@ def fit_boxes(
             theta = -pi + (2.0 * turn[level] + 1.0) * half_thetas[level]
             rows = clusters.rows[clusters.starts[level] : clusters.starts[level + 1]]
             extent = float(step << level)
-            n, y_low, y_high, x_low, x_high = _turned(
-                rows, theta, half_thetas[level], extent, pyramid, entries, weights, rest, offsets
-            )
+            n, y_low, y_high, x_low, x_high = _turned(rows, theta, half_thetas[level], extent, pyramid, look_ups)
             width = open_widths[level]
             end = open_starts[level - 1] if level > 0 else len(is_open)
             count = first[level]
@@ -307,14 +314,13 @@ def expected_loss(pyramid: Pyramid, rows: F64, places: I64, level: int, half_the
     weights = np.empty(n, dtype=np.int64)
     rest = np.empty(n + 1, dtype=np.int64)
     offsets = np.empty((n, 3), dtype=np.int32)
+    look_ups = LookUps(entries, weights, rest, offsets)
     for k in range(len(places)):
         theta = 2.0 * pi * ((k * 0.6180339887498949) % 1.0)
         y = places[k, 0] >> level << level
         x = places[k, 1] >> level << level
         for i in range(n):
-            kept, _, _, _, _ = _turned(
-                rows[i : i + 1], theta, half_theta, extent, pyramid, entries, weights, rest, offsets
-            )
+            kept, _, _, _, _ = _turned(rows[i : i + 1], theta, half_theta, extent, pyramid, look_ups)
             if kept == 1:
                 top = _steps_at_border(pyramid.tables, offsets, weights, rest, 1, y, x, -1)
                 loss[i] += 255 * weights[0] - top

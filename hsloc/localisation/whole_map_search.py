@@ -15,7 +15,7 @@ import numpy as np
 
 from hsloc.kernels.branch_and_bound import BoxSearch, maximise
 from hsloc.kernels.fitness import fitness_many
-from hsloc.kernels.map_search import Clusters, expected_loss, fit_boxes
+from hsloc.kernels.map_search import Clusters, OpenSquares, expected_loss, fit_boxes
 from hsloc.matching.certificate import lever
 from hsloc.matching.harmony_search import low_discrepancy_order
 from hsloc.matching.score_pyramid import score_pyramid
@@ -129,7 +129,7 @@ class WholeMapSearch:
         self._coarsest = max(round(log2(_SQUARE / field.resolution)) - self._pyramid.shift, 1)
         self._by_phase = _by_phase(self._pyramid.tables, 1 << self._coarsest)
         is_open = _open_entries(grid, field, self._pyramid.shift)
-        self._is_open, self._open_starts, self._open_widths = _open_squares(is_open, self._coarsest)
+        self._open_squares = _open_squares(is_open, self._coarsest)
         self._sample = _places(is_open, _SAMPLE)
 
     def search(self, points: F64) -> WholeMapResult:
@@ -191,9 +191,7 @@ class WholeMapSearch:
             self._pyramid,
             self._by_phase,
             self._clusters(scaled.astype(np.float64), half_thetas),
-            self._is_open,
-            self._open_starts,
-            self._open_widths,
+            self._open_squares,
             half_thetas,
             (needed - _ROUNDING) * len(scaled),
             p.max_boxes if max_boxes is None else max_boxes,
@@ -325,8 +323,8 @@ def _places(is_open: NDArray[np.bool_], count: int) -> I64:
     return np.column_stack((rows, columns)).astype(np.int64)
 
 
-def _open_squares(is_open: NDArray[np.bool_], coarsest: int) -> tuple[NDArray[np.bool_], I64, I64]:
-    """For each level which squares hold open ground, the coarsest first: flat, where each begins, and their widths."""
+def _open_squares(is_open: NDArray[np.bool_], coarsest: int) -> OpenSquares:
+    """For each level which squares hold open ground, the coarsest first."""
     levels = [is_open]
     for _ in range(coarsest):
         levels.append(_halved(levels[-1], 2))
@@ -336,7 +334,7 @@ def _open_squares(is_open: NDArray[np.bool_], coarsest: int) -> tuple[NDArray[np
         starts[level] = position
         position += levels[level].size
     flat = np.concatenate([level.ravel() for level in reversed(levels)])
-    return flat, starts, np.array([level.shape[1] for level in levels], dtype=np.int64)
+    return OpenSquares(flat, starts, np.array([level.shape[1] for level in levels], dtype=np.int64))
 
 
 def _halved(values: NDArray[np.bool_], step: int) -> NDArray[np.bool_]:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hsloc.log.session.extrinsics import read_calibration
     from hsloc.log.session.topic_selection import TF, TF_NAMES
     from hsloc.log.session.transform_topics import is_static_topic
-    from hsloc.log.summary import LaserSummary, LogSummary, Losses, ReadOptions
+    from hsloc.log.summary import LONGEST_OFFSET_S, LaserSummary, LogSummary, Losses, ReadOptions
     from hsloc.log.transforms import FrameTree, Transform3
     from hsloc.log.writer import LogWriter
 

@@ -67,3 +67,10 @@ def test_the_lock_pins_what_the_extras_ask_for() -> None:
     wanted = [*PYPROJECT["project"]["dependencies"], *extras["serve"], *extras["dev"], *extras["docs"]]
     names = {re.split(r"[\[>=<]", each)[0].lower().replace("_", "-").replace(".", "-") for each in wanted} - {"hsloc"}
     assert names - pinned == set()
+
+
+def test_no_file_of_code_is_longer_than_400_lines() -> None:
+    files = [path for folder in ("hsloc", "service", "tests", "benchmarks") for path in (ROOT / folder).rglob("*")]
+    code = [path for path in files if path.suffix in (".py", ".js", ".css", ".html") and path.is_file()]
+    assert len(code) > 500
+    assert [path for path in code if path.read_bytes().count(b"\n") > 400] == []

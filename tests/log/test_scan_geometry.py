@@ -19,6 +19,7 @@ SECOND = 1_000_000_000
 
 def scans(
     count: int = 30,
+    *,
     beams: int = 360,
     low: float = -pi,
     increment: float = TURN / 360,

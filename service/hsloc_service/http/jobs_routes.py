@@ -74,6 +74,7 @@ def submit(ctx: Ctx, who: Writer, response: Response, request: JobRequest, idemp
 def list_jobs(
     ctx: Ctx,
     who: Reader,
+    *,
     state: Annotated[State | None, Query()] = None,
     before: Annotated[int | None, Query(ge=1, le=2**62, description="`next` of the page before")] = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,

@@ -28,6 +28,7 @@ _MAX_WITHOUT_PLACE = 0.5
 _VERDICTS = {
     WarningCode.LASER_MISFIT: Verdict.CHECK,
     WarningCode.EXTRINSICS_DISAGREE: Verdict.CHECK,
+    WarningCode.EXTRINSICS_UNDECIDED: Verdict.CHECK,
     WarningCode.ODOMETRY_JUMPS: Verdict.CHECK,
     WarningCode.CLOCK_OFFSET_LARGE: Verdict.CHECK,
     WarningCode.MAP_SCALE: Verdict.CHECK,
@@ -125,7 +126,8 @@ def offset_warnings(result: Result) -> list[RunWarning]:
         return [drift_warning(result.summary.scan_topic or "the scans", drift)] if drift else []
     # Poses are weighed with the odometry, which hides a part of the offset: the scans alone show the whole of it.
     request = result.request
-    found = offsets_of_log(request.logs, request.reading(), request.config.graph_mapper.front_end)
+    reading = result.reading or request.reading()
+    found = offsets_of_log(request.logs, reading, request.config.graph_mapper.front_end)
     given = request.read.offsets_s()
     return [warning for _, warning in clock_warnings(found, given)]
 

@@ -34,7 +34,7 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
     odometry since the last message: within one message the correction hardly changes. `progress` is called with the
     part that is done.
     """
-    log = result.log or open_log(result.request.logs, result.request.reading())
+    log = result.log or open_log(result.request.logs, result.reading or result.request.reading())
     poses, odometry = result.trajectory.poses, result.odometry.poses
     localised = result.localised if result.tracked is None else result.tracked
     first = None if result.follows_scans else Pose2.from_array(odometry[0])

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Mapping
 
-    from hsloc.log import CheckReport, Finding, Log
+    from hsloc.log import CheckReport, Finding, Log, ReadOptions
     from hsloc.slam.time_offset import Offset
 
 HELP = "check a log for what spoils results"
@@ -51,8 +51,9 @@ def run(arguments: argparse.Namespace) -> int:
     start, span = log.summary.start_ns, max(log.summary.end_ns - log.summary.start_ns, 1)
     with ProgressLine(arguments.quiet or arguments.json or arguments.no_progress) as line:
         report = check_log(log, lambda log_time: line.show("check", (log_time - start) / span))
-    offsets = _offsets(arguments, log)
-    report = replace(report, findings=(*report.findings, *_of_clocks(offsets)))
+    options, findings = _with_choices(read_options(arguments), log, report.findings)
+    offsets = _offsets(options, log)
+    report = replace(report, findings=(*findings, *_of_clocks(offsets)))
     seconds = {topic: offset.seconds for topic, offset in offsets.items()}
     unkept = [] if profile is None else violations(profile, log.summary, report, seconds)
     if arguments.json:
@@ -72,7 +73,25 @@ def run(arguments: argparse.Namespace) -> int:
     return EXIT_BELOW_LIMIT if unkept else 0
 
 
-def _offsets(arguments: argparse.Namespace, log: Log) -> dict[str, Offset]:
+def _with_choices(
+    options: ReadOptions, log: Log, findings: tuple[Finding, ...]
+) -> tuple[ReadOptions, tuple[Finding, ...]]:
+    """Options and findings; of mountings that are stated twice the one that scans and odometry agree with."""
+    from hsloc.errors import HslocError
+    from hsloc.log import Finding, Severity
+    from hsloc.slam.front_end import FrontEndParameters
+    from hsloc.slam.mounting_choice import with_chosen_mountings
+    from hsloc.warnings import WarningCode
+
+    try:
+        options, warnings = with_chosen_mountings(log, log.summary.paths, options, FrontEndParameters())
+    except HslocError:  # The reason is among the findings.
+        return options, findings
+    kept = [f for f in findings if not warnings or f.code != WarningCode.EXTRINSICS_RESTATED]
+    return options, (*kept, *(Finding(w.code, Severity.WARNING, "", w.text, w.remedy, 1) for w in warnings))
+
+
+def _offsets(options: ReadOptions, log: Log) -> dict[str, Offset]:
     """The offset between the stamps of scans and odometry, where the motion determines it."""
     from hsloc.errors import HslocError
     from hsloc.slam.front_end import FrontEndParameters
@@ -81,7 +100,7 @@ def _offsets(arguments: argparse.Namespace, log: Log) -> dict[str, Offset]:
     if log.summary.scan_topic is None or not (log.summary.odom_topic or log.summary.heading_topic):
         return {}
     try:
-        return offsets_of_log(log.summary.paths, read_options(arguments), FrontEndParameters())
+        return offsets_of_log(log.summary.paths, options, FrontEndParameters())
     except HslocError:  # The reason is among the findings.
         return {}
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hsloc.log.session.topic_selection import TF, TF_NAMES
     from hsloc.log.session.transform_topics import is_static_topic
     from hsloc.log.summary import LONGEST_OFFSET_S, LaserSummary, LogSummary, Losses, ReadOptions
-    from hsloc.log.transforms import FrameTree, Transform3
+    from hsloc.log.transforms import FrameTree, Transform3, laser_mounting
     from hsloc.log.writer import LogWriter
 
 __all__ = [
@@ -50,6 +50,7 @@ __all__ = [
     "convert_log",
     "is_log",
     "is_static_topic",
+    "laser_mounting",
     "open_log",
     "read_calibration",
     "read_profile",
@@ -68,7 +69,7 @@ _MODULES = {
     "session.topic_selection": ("TF", "TF_NAMES"),
     "session.transform_topics": ("is_static_topic",),
     "summary": ("LONGEST_OFFSET_S", "LaserSummary", "LogSummary", "Losses", "ReadOptions"),
-    "transforms": ("FrameTree", "Transform3"),
+    "transforms": ("FrameTree", "Transform3", "laser_mounting"),
     "writer": ("LogWriter",),
 }
 __getattr__, __dir__ = lazy_names(

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from hsloc.log.transforms import Transform3
     from hsloc.model.calibration import Calibration
     from hsloc.warnings import RunWarning
 
@@ -40,7 +41,8 @@ class ReadOptions:
     `time_offset` (`TOPIC=SECONDS`, several with commas, or `auto`) is added to the stamps of a topic. With `stamps`
     "log" the log's times are used in place of the header stamps. `wheels` are radius and track [m], `RADIUS,TRACK`:
     odometry is then made of joint states. `calibration` corrects the odometry, and mounting and stamps of the lidars
-    that it names; a `laser_pose` is used instead of its mounting, a `time_offset` in addition.
+    that it names; a `laser_pose` is used instead of its mounting, a `time_offset` in addition. `mountings` are those of
+    laser frames that the log states several times, by frame: T_base_laser of each as it is to be used.
     """
 
     scan_topic: str | None = None
@@ -59,6 +61,7 @@ class ReadOptions:
     stamps: str = "header"
     wheels: str | None = None
     calibration: Calibration | None = None
+    mountings: tuple[tuple[str, Transform3], ...] = ()
 
     def __post_init__(self) -> None:
         if self.stamps not in STAMPS:
@@ -158,13 +161,17 @@ class TopicSummary:
 
 @dataclass(frozen=True, slots=True)
 class LaserSummary:
-    """A laser: its scan topic, its frame, how it is mounted, and where that is stated (as in `LogSummary`)."""
+    """A laser: its scan topic, its frame, how it is mounted, and where that is stated (as in `LogSummary`).
+
+    `alternatives` are the different T_base_laser that the log states, in their order, where it states several.
+    """
 
     topic: str
     frame: str
     T_base_laser: Pose2
     flipped: bool
     extrinsics: str
+    alternatives: tuple[Transform3, ...] = ()
 
     def to_dict(self) -> dict[str, object]:
         """The same for JSON: x, y in metres, yaw in radians."""

@@ -170,16 +170,24 @@ class FrameTree:
         from_target, from_source = (self._climb(frames) for frames in path)
         return from_target.inverse() @ from_source
 
+    def lookup_if(self, frame: str, statement: tuple[str, Transform3], target: str, source: str) -> Transform3 | None:
+        """T_target_source if `statement` were the parent and the pose of a frame that has others, too."""
+        last = self._links.get(frame)
+        self._links[frame] = statement
+        path = self.path(target, source)
+        found = None if path is None else [self._climb(frames) for frames in path]
+        if last is None:
+            del self._links[frame]
+        else:
+            self._links[frame] = last
+        return None if found is None else found[0].inverse() @ found[1]
+
     def _lookup_by_earlier_parents(self, target: str, source: str) -> Transform3 | None:
         for child, statements in self._statements.items():
-            last = self._links[child]
             for statement in reversed(statements[:-1]):
-                self._links[child] = statement
-                path = self.path(target, source)
-                found = None if path is None else [self._climb(frames) for frames in path]
-                self._links[child] = last
+                found = self.lookup_if(child, statement, target, source)
                 if found is not None:
-                    return found[0].inverse() @ found[1]
+                    return found
         return None
 
     def _climb(self, frames: list[str]) -> Transform3:

@@ -27,6 +27,7 @@ from hsloc.replay.run_history import RunHistory, pose_covariances
 from hsloc.request import RunRequest
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
+from hsloc.slam.mounting_choice import with_chosen_mountings
 from hsloc.slam.point_mapper import PointMapper
 from hsloc.slam.stated_loops import StatedLoops
 from hsloc.slam.time_offset import HINT_S, as_option, clock_warnings, offsets_of_log
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from hsloc.localisation.localiser import Localiser
     from hsloc.localisation.map_scale import MapScale
     from hsloc.localisation.states import StateRows
-    from hsloc.log import Log
+    from hsloc.log import Log, ReadOptions
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
     from hsloc.model.estimate import Ambiguity, ScanDiagnostics
@@ -101,6 +102,8 @@ class Result:
     ambiguities: tuple[Ambiguity, ...] = ()
     lidar_only: bool = False
     deskewed: bool = False
+    reading: ReadOptions | None = None
+    """How the log was read, with what was found on the way; None is what the request says."""
     log: Log | None = field(default=None, repr=False)
     """The log as it was opened, to be read once more; None where that would keep unpacked files on the disk."""
 
@@ -183,10 +186,8 @@ def _run_with(
     warnings: tuple[RunWarning, ...] = (),
 ) -> Result:
     begin = time.perf_counter()
-    log = open_log(request.logs, request.reading())
-    if not lidar_only:
-        log, of_clocks = with_offset(request, log)
-        warnings = (*warnings, *of_clocks)
+    log, reading, of_log = open_as_meant(request, lidar_only)
+    warnings = (*warnings, *of_log)
     lidar_only = lidar_only or log.summary.heading_topic is not None
     of_reference: list[RunWarning] = []
     reference = None if request.reference is None else read_reference(request.reference, request.logs, of_reference)
@@ -263,6 +264,7 @@ def _run_with(
         ambiguities=history.ambiguities(states),
         lidar_only=lidar_only,
         deskewed=deskew,
+        reading=reading,
         log=None if log.is_unpacked else log,
     )
 
@@ -273,21 +275,23 @@ def _lost(log: Log) -> str:
     return f": {'; '.join(lost)}" if lost else ""
 
 
-def with_offset(request: RunRequest, log: Log) -> tuple[Log, tuple[RunWarning, ...]]:
-    """The log with the estimated offset of its scans, if that is asked for; a warning where there is one.
+def open_as_meant(request: RunRequest, lidar_only: bool) -> tuple[Log, ReadOptions, tuple[RunWarning, ...]]:
+    """The log, and how it is read: with the right one of several mountings, and the offset of its scans if asked for.
 
-    Otherwise it is estimated only where log times hint at it: `hsloc.analysis` finds smaller ones in the result.
+    Otherwise that is estimated only where log times hint at it: `hsloc.analysis` finds smaller ones in the result.
     """
-    automatic = request.read.time_offset == AUTO
-    apart = abs(log.summary.clocks_apart_s) > HINT_S and request.read.time_offset is None
-    if not (automatic or apart):
-        return log, ()
-    found = offsets_of_log(request.logs, request.reading(), request.config.graph_mapper.front_end)
-    option = as_option(found)
-    warnings = tuple(warning for _, warning in clock_warnings(found, removed=automatic))
-    if option is None or not automatic:
-        return log, warnings
-    return open_log(request.logs, replace(request.reading(), time_offset=option)), warnings
+    front_end = request.config.graph_mapper.front_end
+    log = open_log(request.logs, request.reading())
+    reading, warnings = with_chosen_mountings(log, request.logs, request.reading(), front_end)
+    option, automatic = None, request.read.time_offset == AUTO and not lidar_only
+    apart = abs(log.summary.clocks_apart_s) > HINT_S and request.read.time_offset is None and not lidar_only
+    if automatic or apart:
+        found = offsets_of_log(request.logs, reading, front_end)
+        option = as_option(found) if automatic else None
+        warnings = (*warnings, *(warning for _, warning in clock_warnings(found, removed=automatic)))
+    if option is not None:
+        reading = replace(reading, time_offset=option)
+    return (log if reading == request.reading() else open_log(request.logs, reading)), reading, warnings
 
 
 def _mapped(history: RunHistory, mapping: MappingResult) -> tuple[Trajectory, NDArray[np.bool_]]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import degrees, radians
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hsloc.errors import ConfigError
 from hsloc.log.session.transform_topics import BASE_FRAMES, last_name, read_links
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from hsloc.log.container import Container
     from hsloc.log.session.transform_topics import TransformTopics
+    from hsloc.log.summary import ReadOptions
 
 TILT_WARNING = radians(3.0)
 
@@ -39,10 +40,22 @@ _LIDAR = {"x": (-100.0, 100.0), "y": (-100.0, 100.0), "yaw": (-7.0, 7.0), "time_
 _REMEDY = "; write it with `hsloc calibrate`"
 
 
-def calibrated_mountings(calibration: Calibration | None, frames: Iterable[tuple[str, str]]) -> dict[str, Pose2]:
-    """Mountings by frame, of the lidars that a calibration names; `frames` are pairs of topic and frame."""
-    lidars = {} if calibration is None else {frame: calibration.lidar(topic) for topic, frame in frames}
-    return {frame: each.T_base_laser for frame, each in lidars.items() if each and each.T_base_laser}
+class KnownMountings(NamedTuple):
+    """Mountings by the laser's frame that are better known than by the log: in the plane, and in space."""
+
+    calibrated: Mapping[str, Pose2]
+    chosen: Mapping[str, Transform3]
+
+    @staticmethod
+    def of(options: ReadOptions, frames: Iterable[tuple[str, str]]) -> KnownMountings:
+        """Those of a calibration, and those chosen among several; `frames` are pairs of topic and frame."""
+        calibration = options.calibration
+        lidars = {} if calibration is None else {frame: calibration.lidar(topic) for topic, frame in frames}
+        calibrated = {frame: each.T_base_laser for frame, each in lidars.items() if each and each.T_base_laser}
+        return KnownMountings(calibrated, dict(options.mountings))
+
+
+NOTHING_KNOWN = KnownMountings({}, {})
 
 
 class Extrinsics:
@@ -55,15 +68,14 @@ class Extrinsics:
         base_frame: str | None,
         override: Pose2 | None,
         assumed: Collection[str] = (),
-        calibrated: Mapping[str, Pose2] | None = None,
+        known: KnownMountings = NOTHING_KNOWN,
     ) -> None:
-        """`assumed` are laser frames whose mounting was assumed when the log was written; `calibrated` are mountings by
-        frame that are known better."""
+        """`assumed` are laser frames whose mounting was assumed when the log was written."""
         self._containers = containers
         self._topics = topics
         self._override = override
         self._assumed = assumed
-        self._calibrated = {} if calibrated is None else calibrated
+        self._calibrated, self._chosen = known
         self._static = FrameTree()
         self.warnings: list[RunWarning] = []
         for link in read_links(containers, topics.static, warnings=self.warnings):
@@ -71,6 +83,7 @@ class Extrinsics:
         self._all: FrameTree | None = None
         self._known: dict[str, tuple[Mounting, str]] = {}
         self._spatial: dict[str, Transform3] = {}
+        self._alternatives: dict[str, list[Transform3]] = {}
         self.base_frame = base_frame if base_frame is not None else self._guessed_base()
 
     def of(self, laser_frame: str, T_frame_laser: Transform3 | None = None) -> Mounting:
@@ -98,6 +111,11 @@ class Extrinsics:
         if known is None:
             known = self._known[laser_frame] = self._find(laser_frame)
         return known
+
+    def alternatives(self, laser: str) -> tuple[Transform3, ...]:
+        """The T_base_laser that differ in the plane, where the log states several and none was chosen."""
+        self.found(laser)
+        return tuple(self._alternatives.get(laser, ()))
 
     def between(self, target: str, source: str) -> Transform3 | None:
         """T_target_source from all that the log knows, or None."""
@@ -132,10 +150,13 @@ class Extrinsics:
             return Mounting(IDENTITY), "same frame"
         if base is not None:
             transform, tree = self._lookup(base, laser)
-            if tree is not self._static:
+            transform = self._chosen.get(laser, transform)
+            is_given = laser in self._chosen or laser in self._calibrated
+            if tree is not self._static and not is_given:
                 self._warn_if_moving(tree, base, laser)
             if transform is not None:
-                self._warn_if_restated(tree, base, laser)
+                if not is_given:
+                    self._warn_if_restated(tree, base, laser)
                 self._spatial[laser] = transform
                 mounting = laser_mounting(transform)
                 if mounting.tilt > TILT_WARNING:
@@ -185,6 +206,7 @@ class Extrinsics:
         few = [frame for frame in moving if tree.alternates(frame)]
         for frame in few:
             self._warn_of_places(sorted(self._topics.dynamic), frame, tree.statements(frame), "the last is used")
+            self._add_alternatives(tree, base, laser, frame, tree.statements(frame))
         if len(few) < len(moving):
             self.warnings.append(
                 RunWarning(
@@ -203,11 +225,30 @@ class Extrinsics:
                 statements, topics = [dynamic, *statements], [*topics, *sorted(self._topics.dynamic)]
             if len(statements) > 1:
                 self._warn_of_places(topics, frame, statements, f"the last that leads to {base} is used")
+                self._add_alternatives(tree, base, laser, frame, statements)
+
+    def _add_alternatives(
+        self, tree: FrameTree, base: str, laser: str, frame: str, statements: Sequence[tuple[str, Transform3]]
+    ) -> None:
+        """Note the mountings that follow from the statements of a frame on the way to a laser."""
+        target, source = tree.resolve(base, laser) or base, tree.resolve(laser, base) or laser
+        kept = self._alternatives.setdefault(laser, [])
+        for statement in statements:
+            found = tree.lookup_if(frame, statement, target, source)
+            if found is not None and all(_differ_in_plane(found, each) for each in kept):
+                kept.append(found)
 
     def _warn_of_places(
         self, topics: Sequence[str], frame: str, statements: Sequence[tuple[str, Transform3]], taken: str
     ) -> None:
-        listed = " and ".join(f"{parent} -> {frame} at {_in_plane(transform)}" for parent, transform in statements)
+        places = [_in_plane(transform) for _, transform in statements]
+        if len({*places}) < len(places):
+            places = [
+                f"{text}, {each.translation[2]:.3f} m high" for text, (_, each) in zip(places, statements, strict=True)
+            ]
+        listed = " and ".join(
+            f"{parent} -> {frame} at {text}" for text, (parent, _) in zip(places, statements, strict=True)
+        )
         self.warnings.append(
             RunWarning(
                 WarningCode.EXTRINSICS_RESTATED,
@@ -223,6 +264,14 @@ class Extrinsics:
                 if found:
                     return name if name in found else found[0]
         return None
+
+
+def _differ_in_plane(first: Transform3, second: Transform3) -> bool:
+    """Whether two mountings differ in what counts in the plane."""
+    a, b = laser_mounting(first), laser_mounting(second)
+    return a.flipped != b.flipped or differ(
+        ("", Transform3.from_pose2(a.T_base_laser)), ("", Transform3.from_pose2(b.T_base_laser))
+    )
 
 
 def _in_plane(transform: Transform3) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from hsloc.log.messages import definitions, foxglove
 from hsloc.log.messages.decoders import Undecodable, canonical_type, decoder_for, is_decodable
 from hsloc.log.messages.odometry_kinds import POSE_TYPES, kind_among
-from hsloc.log.session.extrinsics import Extrinsics, calibrated_mountings
+from hsloc.log.session.extrinsics import Extrinsics, KnownMountings
 from hsloc.log.session.scan_geometry import ScanFixes, ScanSurvey, survey
 from hsloc.log.session.split_recordings import check_parts
 from hsloc.log.session.topic_selection import (
@@ -113,8 +113,8 @@ class LogSession:
         assumed = {
             frame for c in containers for frame in c.metadata.get(CONVERTED, {}).get("assumed_mountings", "").split(",")
         }
-        base, known = self._base_frame(), calibrated_mountings(options.calibration, frames)
-        self.mountings = Extrinsics(containers, self.transforms, base, options.laser_pose, assumed, known)
+        known = KnownMountings.of(options, frames)
+        self.mountings = Extrinsics(containers, self.transforms, self._base_frame(), options.laser_pose, assumed, known)
         self.T_child_base = self._child_to_base()
         # A truth that speaks of the same frame as the odometry moves with it.
         truth_child = getattr(self.truth.message, "child_frame_id", None) if self.truth is not None else None
@@ -272,7 +272,8 @@ class LogSession:
         frame = first.message.frame_id
         extrinsics = self.mountings.found(frame)[1]
         mounting = self.mountings.of(frame, getattr(first.message, "T_frame_laser", None))
-        return LaserSummary(topic, frame, mounting.T_base_laser, mounting.flipped, extrinsics)
+        others = self.mountings.alternatives(frame)
+        return LaserSummary(topic, frame, mounting.T_base_laser, mounting.flipped, extrinsics, others)
 
     def _topics(self) -> list[TopicSummary]:
         """Statistics by topic and type, over all files."""

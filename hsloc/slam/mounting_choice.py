@@ -1,0 +1,215 @@
+"""Which of several mountings is right that a log states for one laser: the one under which scans and odometry agree.
+
+Scans are matched one to the next without odometry. What the base did then follows from the mounting: a laser that
+stands elsewhere moves otherwise in each turn, one that looks elsewhere drives in another direction. Steps of the scans
+are compared with those of the odometry under each mounting, step by step, so that what the odometry itself gets wrong
+counts for all of them alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.errors import HslocError
+from hsloc.log import laser_mounting, open_log
+from hsloc.model.events import Odometry, Scan
+from hsloc.model.pose2 import relative_poses, wrap_angles
+from hsloc.options import AUTO
+from hsloc.preprocessing.odometry import ContinuousOdometry
+from hsloc.slam.laser_odometry import with_laser_odometry
+from hsloc.slam.time_offset import Headings, find_offset, half_sweep_ns
+from hsloc.warnings import RunWarning, WarningCode
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from hsloc.log import LaserSummary, Log, ReadOptions, Transform3
+    from hsloc.model.events import Event
+    from hsloc.slam.front_end import FrontEndParameters
+
+    F64 = NDArray[np.float64]
+    I64 = NDArray[np.int64]
+
+_MOST_SCANS = 3000
+"""Scans that are matched: minutes, in which a robot turns."""
+_STEP_M, _STEP_RAD, _LONGEST_S = 0.2, 0.2, 5.0
+"""Steps that are compared (m, rad), as in the calibration, and the time (s) beyond which one holds a gap."""
+_FEWEST = 10
+"""Minimum number of steps."""
+_BLOCKS = 30
+"""Parts of the log whose errors count as independent of each other, as in the calibration."""
+_SCALES = (0.9, 1.1)
+"""Scale of the odometry that is allowed for: worn or wrongly measured wheels."""
+_LEVER_M = 0.3
+"""Distance (m) at which a rotation counts as its displacement, that of the wheels from the middle of a small robot."""
+_LEAST_M = 1e-3
+"""Smallest scale of the misfits (m): less is not measured."""
+_HUBER = 1.345
+_LEAST_T = 3.0
+"""Minimum t of the difference of two mountings: were both equally wrong, one would be chosen in one of 200 logs."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Motion:
+    """Steps (n, 3) of the base by the scans and by the odometry, and its path by the odometry at the scans (m, 3)."""
+
+    stamps_ns: I64
+    by_scans: F64
+    by_odometry: F64
+
+
+def with_chosen_mountings(
+    log: Log, paths: Sequence[Path], options: ReadOptions, parameters: FrontEndParameters
+) -> tuple[ReadOptions, tuple[RunWarning, ...]]:
+    """The options with a mounting for each laser that the log states several of, and a warning for each of these.
+
+    `log` is the opened log of these `paths` and `options`, which are returned as they are where nothing is to be
+    chosen. Raises LogError as `open_log` does.
+    """
+    chosen, warnings = list(options.mountings), []
+    for laser in log.summary.lasers:
+        if len(laser.alternatives) > 1:
+            best, warning = _choice(laser, paths, options, parameters)
+            chosen.append((laser.frame, laser.alternatives[best]))
+            warnings.append(warning)
+    return (replace(options, mountings=tuple(chosen)) if warnings else options), tuple(warnings)
+
+
+def _choice(
+    laser: LaserSummary, paths: Sequence[Path], options: ReadOptions, parameters: FrontEndParameters
+) -> tuple[int, RunWarning]:
+    """The number of the mounting that is to be used, the last one where the data do not say."""
+    names = [_in_words(each) for each in laser.alternatives]
+    stated = f"{len(names)} mountings of {laser.frame} are stated ({' and '.join(names)})"
+    last = len(names) - 1
+    reading = replace(
+        options, scan_topic=laser.topic, deskew=False, start_s=None, end_s=None,
+        time_offset=None if options.time_offset == AUTO else options.time_offset,
+    )  # fmt: skip
+    try:
+        misfits = [
+            _misfits(replace(reading, mountings=((laser.frame, each),)), paths, parameters)
+            for each in laser.alternatives
+        ]
+    except HslocError as error:  # No odometry, for example.
+        return last, _undecided(stated, names[last], str(error).rpartition(": ")[2])
+    length = min(map(len, misfits))
+    if length < _FEWEST:
+        return last, _undecided(stated, names[last], "the robot moves too little to tell which is right")
+    table = np.array([each[:length] for each in misfits])
+    best = int(np.argmin(_bounded(table).mean(axis=1)))
+    if not all(_is_better(table[best], other) for k, other in enumerate(table) if k != best):
+        return last, _undecided(stated, names[last], "scans and odometry agree about as well under each")
+    medians = np.median(table, axis=1)
+    others = " and ".join(f"{100 * medians[k]:.1f} cm" for k in range(len(names)) if k != best)
+    return best, RunWarning(
+        WarningCode.EXTRINSICS_CHOSEN,
+        f"{stated}; {names[best]} is used, under which scans and odometry agree: their steps differ by "
+        f"{100 * medians[best]:.1f} cm, against {others}",
+        "remove the wrong one from the robot's description or launch files, or give --laser-pose x,y,yaw",
+    )
+
+
+def _undecided(stated: str, used: str, reason: str) -> RunWarning:
+    return RunWarning(
+        WarningCode.EXTRINSICS_UNDECIDED, f"{stated}; {used}, the last, is used: {reason}",
+        "choose with --laser-pose x,y,yaw",
+    )  # fmt: skip
+
+
+def _in_words(transform: Transform3) -> str:
+    mounting = laser_mounting(transform)
+    pose = mounting.T_base_laser
+    turned = " upside down" if mounting.flipped else ""
+    return f"{pose.x:.3f},{pose.y:.3f},{pose.theta:.3f}{turned}"
+
+
+def _misfits(options: ReadOptions, paths: Sequence[Path], parameters: FrontEndParameters) -> F64:
+    """What the steps of scans and odometry differ in (m), a scale of the odometry allowed for; rotations by a lever."""
+    motion = _motion(open_log(paths, options).events(), parameters)
+    seen, driven = motion.by_scans[:, :2], motion.by_odometry[:, :2]
+    scale = np.clip(np.sum(seen * driven) / max(float(np.sum(driven**2)), 1e-12), *_SCALES)
+    apart = seen - scale * driven
+    turned = _LEVER_M * wrap_angles(motion.by_scans[:, 2] - motion.by_odometry[:, 2])
+    return np.asarray(np.sqrt(np.sum(apart**2, axis=1) + turned**2))
+
+
+def _motion(events: Iterable[Event], parameters: FrontEndParameters) -> _Motion:
+    """The motion of the base by scans and odometry, their clocks put together."""
+    odometry: list[tuple[int, float, float, float]] = []
+    middles: dict[int, int] = {}
+
+    def kept() -> Iterator[Event]:
+        for event in ContinuousOdometry(events):
+            if isinstance(event, Odometry):
+                odometry.append((event.stamp_ns, *event.T_odom_base.to_array().tolist()))
+                if len(middles) >= _MOST_SCANS:
+                    return
+            elif isinstance(event, Scan) and len(middles) < _MOST_SCANS:
+                middles[event.stamp_ns] = event.stamp_ns + half_sweep_ns(event)
+                yield event
+
+    scans = [
+        (middles[event.stamp_ns], *event.T_odom_base.to_array().tolist())
+        for event in with_laser_odometry(kept(), parameters, np.random.default_rng(0))
+        if isinstance(event, Odometry)
+    ]
+    nothing = np.zeros((0, 3))
+    if len(scans) < 2 or len(odometry) < 2:
+        return _Motion(np.zeros(0, dtype=np.int64), nothing, nothing)
+    at, seen = _sorted(scans)
+    stamps, driven = _sorted(odometry)
+    offset = find_offset(Headings(at, seen[:, 2]), Headings(stamps, driven[:, 2]))
+    if offset.is_significant:
+        at = at - round(offset.seconds * 1e9)
+    inside = (at >= stamps[0]) & (at <= stamps[-1])
+    at, seen = at[inside], seen[inside]
+    origin = int(stamps[0])
+    there = np.column_stack([np.interp(at - origin, stamps - origin, driven[:, k]) for k in range(3)])
+    first, second = _steps(at, there)
+    return _Motion(at, relative_poses(seen[first], seen[second]), relative_poses(there[first], there[second]))
+
+
+def _sorted(rows: list[tuple[int, float, float, float]]) -> tuple[I64, F64]:
+    """Stamps (n,), each once, and poses (n, 3) with unwrapped headings."""
+    stamps, first = np.unique(np.array([row[0] for row in rows], dtype=np.int64), return_index=True)
+    poses = np.array([row[1:] for row in rows])[first]
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    return stamps, poses
+
+
+def _steps(stamps_ns: I64, poses: F64) -> tuple[list[int], list[int]]:
+    """First and last scans of steps one after the other, by the odometry."""
+    first, second, begin = [], [], 0
+    for k in range(1, len(poses)):
+        if (stamps_ns[k] - stamps_ns[begin]) / 1e9 > _LONGEST_S:
+            begin = k
+            continue
+        x, y, turn = poses[k] - poses[begin]
+        if np.hypot(x, y) >= _STEP_M or abs(turn) >= _STEP_RAD:
+            first.append(begin)
+            second.append(k)
+            begin = k
+    return first, second
+
+
+def _bounded(misfits: F64) -> F64:
+    """Huber's cost of misfits, scaled by the smallest usual one of all rows: matches that slipped count little."""
+    scale = _HUBER * max(float(np.median(misfits, axis=-1).min()), _LEAST_M)
+    small = np.minimum(misfits, scale)
+    return np.asarray(small**2 + 2.0 * scale * (misfits - small))
+
+
+def _is_better(best: F64, other: F64) -> bool:
+    """Whether misfits (n,) are smaller than others, step by step, beyond chance: t of the means of parts of the log."""
+    apart = np.diff(_bounded(np.array((best, other))), axis=0)[0]
+    means = np.array([part.mean() for part in np.array_split(apart, min(_BLOCKS, len(apart) // 2))])
+    deviation = float(np.std(means, ddof=1)) / sqrt(len(means))
+    return float(means.mean()) > _LEAST_T * deviation

@@ -1,0 +1,82 @@
+"""Of mountings that a log states twice the one is used under which scans and odometry agree."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from hsloc.log import LogWriter, ReadOptions, Transform3, open_log
+from hsloc.model import Odometry, Pose2, Scan
+from hsloc.simulation.scenario import Scenario
+from hsloc.simulation.sensors import Lidar
+from hsloc.simulation.simulator import events
+from hsloc.simulation.world_files import load_world
+from hsloc.slam.front_end import FrontEndParameters
+from hsloc.slam.mounting_choice import with_chosen_mountings
+from hsloc.warnings import WarningCode
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hsloc.model import Event
+
+RIGHT = Pose2(0.2, 0.05, 0.4)
+UPSIDE_DOWN = Transform3.from_pose2(RIGHT) @ Transform3((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def recorded() -> list[Event]:
+    scenario = Scenario("office", seed=4, sensor=Lidar(beams=180, mounting=RIGHT), duration_s=20.0, scan_rate_hz=5.0)
+    return list(events(scenario, load_world("office")))
+
+
+def write(path: Path, recorded: list[Event], mountings: list[Transform3], odometry: bool = True) -> Path:
+    """The log with a message on /tf_static for each of the mountings."""
+    with LogWriter(path) as log:
+        for mounting in mountings:
+            log.transforms(recorded[0].stamp_ns, [("base_link", "laser", mounting)], static=True)
+        for event in recorded:
+            if isinstance(event, Scan):
+                log.scan(event)
+            elif isinstance(event, Odometry) and odometry:
+                log.odometry(event.stamp_ns, event.T_odom_base)
+    return path
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        Transform3.from_pose2(Pose2(0.05, 0.05, 0.4)),
+        UPSIDE_DOWN,
+    ],
+    ids=["elsewhere", "upside down"],
+)
+def test_the_mounting_under_which_scans_and_odometry_agree_is_used(
+    tmp_path: Path, recorded: list[Event], wrong: Transform3
+) -> None:
+    right = Transform3.from_pose2(RIGHT)
+    path = write(tmp_path / "a.mcap", recorded, [right, wrong])
+    options, (warning,) = with_chosen_mountings(open_log(path), [path], ReadOptions(), FrontEndParameters())
+    assert warning.code == WarningCode.EXTRINSICS_CHOSEN
+    assert "0.200,0.050,0.400 is used" in warning.text
+    summary = open_log(path, options).summary
+    assert summary.T_base_laser.to_array() == pytest.approx(RIGHT.to_array(), abs=1e-9)
+    assert (summary.laser_flipped, summary.warnings) == (False, ())
+
+
+def test_without_odometry_the_last_mounting_is_used_and_the_result_is_doubted(
+    tmp_path: Path, recorded: list[Event]
+) -> None:
+    path = write(tmp_path / "a.mcap", recorded[:200], [UPSIDE_DOWN, Transform3.from_pose2(RIGHT)], odometry=False)
+    reading = ReadOptions(require_odometry=False)
+    options, (warning,) = with_chosen_mountings(open_log(path, reading), [path], reading, FrontEndParameters())
+    assert warning.code == WarningCode.EXTRINSICS_UNDECIDED
+    assert "--laser-pose" in warning.remedy
+    assert not open_log(path, options).summary.laser_flipped
+
+
+def test_a_mounting_that_the_user_gives_is_not_chosen_again(tmp_path: Path, recorded: list[Event]) -> None:
+    path = write(tmp_path / "a.mcap", recorded[:20], [UPSIDE_DOWN, Transform3.from_pose2(RIGHT)])
+    given = ReadOptions(laser_pose=Pose2(0.1, 0.0, 0.0))
+    assert with_chosen_mountings(open_log(path, given), [path], given, FrontEndParameters()) == (given, ())

@@ -19,7 +19,7 @@ os.environ.setdefault("MPLCONFIGDIR", str(ROOT / "build" / "matplotlib"))
 
 from hsloc.trajectory_io.tum import write_tum
 
-# How long an example takes says how busy the machine is.
+# How long an example takes depends on how busy the machine is.
 settings.register_profile("hsloc", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("hsloc")
 

@@ -1,4 +1,4 @@
-"""A run that is doubtful as a whole says so: most scans without a place, odometry that jumps and is mended."""
+"""A run that is doubtful as a whole has a warning: most scans without a place, odometry that jumps and is mended."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_log_too_short_to_be_sure_is_all_guesses() -> None:
     assert {reason.verdict for reason in reasons} == {"failed"}
 
 
-def test_odometry_that_is_told_in_millimetres_is_not_mended(tmp_path: Path) -> None:
+def test_odometry_in_millimetres_is_not_mended(tmp_path: Path) -> None:
     def in_millimetres(event: Any) -> Any:
         if isinstance(event, Odometry):
             pose = event.T_odom_base
@@ -79,14 +79,16 @@ def test_odometry_that_is_told_in_millimetres_is_not_mended(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("mode", ["localise", "slam"])
 @pytest.mark.parametrize("reset", [Pose2(5.0, 0.0, 0.0), Pose2(0.1, 0.0, 3.0), Pose2(-40.0, 7.0, -2.0)])
-def test_odometry_that_begins_anew_goes_on_where_it_was_and_is_told(tmp_path: Path, mode: Any, reset: Any) -> None:
-    def begun_anew(event: Any) -> Any:
+def test_odometry_that_is_reset_goes_on_where_it_was_with_a_warning(tmp_path: Path, mode: Any, reset: Any) -> None:
+    def reset_odometry(event: Any) -> Any:
         if isinstance(event, Odometry) and event.stamp_ns >= 1_700_000_010_000_000_000:
             return replace(event, T_odom_base=reset @ event.T_odom_base)
         return event
 
     start = Pose2(2.6, 8.1, 1.5708)
-    request = RunRequest(logs=(rewritten(tmp_path / "run.mcap", begun_anew, end=14.0),), mode=mode, initial_pose=start)
+    request = RunRequest(
+        logs=(rewritten(tmp_path / "run.mcap", reset_odometry, end=14.0),), mode=mode, initial_pose=start
+    )
     found = run(request)
     whole = run(replace(request, logs=(rewritten(tmp_path / "whole.mcap", lambda event: event, end=14.0),)))
     (warning,) = (each for each in found.warnings if each.code == WarningCode.ODOMETRY_RESET)
@@ -102,7 +104,7 @@ def test_odometry_that_begins_anew_goes_on_where_it_was_and_is_told(tmp_path: Pa
 
 
 def test_the_way_is_retraced_as_far_as_the_scans_fit_and_no_farther(tmp_path: Path) -> None:
-    """For eight seconds the lidar sees nothing of the map, so that nobody can say where the robot was at first."""
+    """For eight seconds the lidar sees nothing of the map, so that the first poses of the robot cannot be found."""
     rng = np.random.default_rng(0)
 
     def blind(event: Any) -> Any:

@@ -188,7 +188,7 @@ def test_every_figure_is_the_same_in_metrics_on_the_terminal_in_the_reports_and_
         assert f"{label} [{unit}] {values.rmse:.4f} {values.mean:.4f}" in report
 
 
-def test_the_headline_says_what_was_found() -> None:
+def test_the_headline_of_what_was_found() -> None:
     lost = VerdictReason(Verdict.CHECK, "poses_lost", "x", times=((1.0, 2.0), (5.0, 7.5)))
     scans = replace(sample_metrics().scans, by_status={"relocalised": 2})
     metrics = sample_metrics(

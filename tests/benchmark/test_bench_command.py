@@ -31,7 +31,7 @@ def test_quick_json(capsys: pytest.CaptureFixture[str]) -> None:
     ] * 4
 
 
-def test_text_says_what_it_was_measured_on_and_what_was_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+def test_text_names_the_machine_and_what_was_left_out(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "match", "--quick"]) == 0
     out = capsys.readouterr().out
     assert "Load average before" in out
@@ -41,7 +41,7 @@ def test_text_says_what_it_was_measured_on_and_what_was_left_out(capsys: pytest.
     assert "Replay of" not in out
 
 
-def test_wrong_cases_are_told_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_cases_are_refused_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "--cases", str(tmp_path / "nowhere.npz")]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "no such file" in line

@@ -103,7 +103,7 @@ def test_peers_that_are_installed_find_near_poses(cases: Cases) -> None:
         assert max(errors) < 0.03, method.name
 
 
-def test_missing_peers_are_told(cases: Cases, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_peers_are_reported(cases: Cases, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(name: str) -> object:
         raise ImportError(name)
 

@@ -27,7 +27,7 @@ def test_measure_warms_up_and_counts_every_repeat() -> None:
     assert 0.0 <= timing.best <= timing.median
 
 
-def test_timing_tells_best_and_median() -> None:
+def test_timing_has_best_and_median() -> None:
     assert Timing.of([3.0, 1.0, 2.0]).to_dict(10.0) == {"best": 10.0, "median": 20.0, "repeats": 3}
 
 
@@ -43,7 +43,7 @@ def test_scene_has_360_hits_that_lie_on_the_map() -> None:
     assert scene.field.fitness(scene.points, scene.truth) > 0.8
 
 
-def test_kernel_and_match_are_timed_on_what_they_say() -> None:
+def test_kernel_and_match_are_timed_on_the_case_they_name() -> None:
     scene = office_scene()
     kernel = time_kernel(scene, 2)
     assert kernel.points * kernel.poses == 360 * 2000
@@ -62,7 +62,7 @@ def test_no_bias_of_half_a_cell() -> None:
     assert turned.mean_m < 0.005
 
 
-def test_memory_of_two_replays_is_told_apart(tmp_path: Path) -> None:
+def test_memory_of_two_replays_is_measured_separately(tmp_path: Path) -> None:
     # Long enough for the first comparison with the whole map, which needs 30 MB once.
     memory = measure_memory(tmp_path, 8.0)
     assert memory.long_seconds == pytest.approx(10 * memory.seconds, rel=0.02)
@@ -85,7 +85,7 @@ def test_a_replay_that_fails_is_one_line(tmp_path: Path, monkeypatch: pytest.Mon
         measure_memory(tmp_path, 1.0)
 
 
-def test_targets_know_their_side() -> None:
+def test_targets_have_a_side() -> None:
     assert Target("a time", 3.0, 4.0, "ns").met
     assert not Target("a time", 5.0, 4.0, "ns").met
     assert Target("a speed", 301.0, 300.0, "x", at_least=True).met

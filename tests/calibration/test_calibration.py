@@ -93,7 +93,7 @@ def test_outliers_are_weighed_down() -> None:
     assert abs(found.values[0] - 1.02) < 1e-3
 
 
-def test_a_robot_at_rest_says_nothing() -> None:
+def test_a_robot_at_rest_gives_no_calibration() -> None:
     laser, odometry = tracks(np.zeros(3000), speed=0.0)
     with pytest.raises(Undetermined, match="are needed"):
         estimate(laser, odometry, Pose2())
@@ -102,9 +102,9 @@ def test_a_robot_at_rest_says_nothing() -> None:
 def test_a_correction_and_its_inverse() -> None:
     poses = np.array(((1.0, 2.0, 0.5), (1.5, 2.2, 0.9), (1.6, 2.9, 2.0)))
     np.testing.assert_allclose(TRUTH.inverse()(TRUTH(poses)), poses, atol=1e-12)
-    told = [Odometry(k, Pose2.from_array(pose)) for k, pose in enumerate(poses)]
+    uncorrected = [Odometry(k, Pose2.from_array(pose)) for k, pose in enumerate(poses)]
     streamed = [
-        event.T_odom_base.to_array() for event in corrected_odometry(told, TRUTH) if isinstance(event, Odometry)
+        event.T_odom_base.to_array() for event in corrected_odometry(uncorrected, TRUTH) if isinstance(event, Odometry)
     ]
     np.testing.assert_allclose(streamed, TRUTH(poses), atol=1e-12)
 
@@ -180,7 +180,7 @@ def test_a_calibration_is_applied_when_a_log_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("a: 1\n", "neither odometry nor lidars"),
         ("odometry: {scale: 5}\n", "from 0.5 to 2"),
@@ -196,10 +196,10 @@ def test_a_calibration_is_applied_when_a_log_is_read(tmp_path: Path) -> None:
         ("#" * 70_000, "too large"),
     ],
 )
-def test_files_that_are_no_calibration(tmp_path: Path, text: str, said: str) -> None:
+def test_files_that_are_no_calibration(tmp_path: Path, text: str, expected: str) -> None:
     path = tmp_path / "robot.yaml"
     path.write_text(text)
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=expected):
         read_calibration(path)
     with pytest.raises(ConfigError, match="no such calibration"):
         read_calibration(tmp_path / "missing.yaml")

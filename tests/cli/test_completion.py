@@ -1,4 +1,4 @@
-"""Completion: generated from the parser, so nothing is forgotten; bash is asked for real."""
+"""Completion: generated from the parser, so it is complete; the real bash completes."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def middle(data: bytes) -> tuple[int, int]:
 
 
 def renamed(data: bytes, chunks: list[tuple[int, int]]) -> bytes:
-    """Chunks whose compression has a name that nobody knows."""
+    """Chunks whose compression has an unknown name."""
     changed = bytearray(data)
     for at, _ in chunks:
         changed[at + 9 + 28 : at + 9 + 36] = b"\x04\x00\x00\x00qbit"
@@ -114,7 +114,7 @@ def test_of_a_damaged_log_what_is_whole_is_used_and_the_loss_is_named(
     assert metrics["losses"]["data_lost"]
     assert words in err
     if name.startswith("cut "):
-        # The start is told at the end of the file. What the scans tell without it is right, and less sure.
+        # The start is at the end of the file. Without it the scans give the right pose, with less certainty.
         assert metrics["verdict"] != "good"
         assert metrics["ape"]["trans_part"]["rmse"] < 0.05
         start = f"2.6,8.1,{math.pi / 2}"
@@ -137,7 +137,7 @@ def test_a_flipped_byte_without_compression_is_found_by_the_checksum(
     assert "1 damaged chunks were skipped" in report["losses"]
 
 
-def test_a_log_all_of_whose_chunks_are_unreadable_is_an_error_that_says_why(
+def test_a_log_all_of_whose_chunks_are_unreadable_is_an_error_with_its_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], source: Path
 ) -> None:
     data = source.read_bytes()

@@ -121,7 +121,9 @@ def write_log(path: Path, scans: tuple[Any, ...] = ("/scan",), odometry: bool = 
                 writer.scan(Scan(stamp, np.ones(10, dtype=np.float32), 0.0, 0.1, 0.1, 10.0), topic=topic)
 
 
-def test_topics_missing_or_ambiguous_are_told_with_their_remedy(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_topics_missing_or_ambiguous_are_reported_with_their_remedy(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_log(here / "two.mcap", scans=("/front", "/rear"))
     line = fails(capsys, "replay", "two.mcap")
     assert "/front" in line
@@ -134,7 +136,7 @@ def test_topics_missing_or_ambiguous_are_told_with_their_remedy(here: Path, caps
     assert empty(here)
 
 
-def test_localising_without_a_map_asks_for_one(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_localising_without_a_map_is_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_log(here / "bare.mcap")
     assert "--map" in fails(capsys, "replay", "bare.mcap", "--mode", "localise", "--out", "out")
     line = fails(capsys, "replay", OFFICE, "--mapper", "point", "--mode", "slam", "--no-odom", "--out", "out")
@@ -218,7 +220,7 @@ def test_interrupted_runs_leave_nothing_behind(here: Path) -> None:
     _, stderr = process.communicate(timeout=120)
     if process.returncode == 0:
         pytest.skip("the run was over before it could be interrupted")
-    assert process.returncode in (130, -signal.SIGINT)  # a shell says 130 to both
+    assert process.returncode in (130, -signal.SIGINT)  # a shell reports 130 for both
     assert b"Traceback" not in stderr
     assert stderr.decode().strip().endswith("hsloc: interrupted")
     assert list(here.iterdir()) == []

@@ -44,7 +44,7 @@ def test_the_help_of_every_option_is_a_sentence() -> None:
             assert text.endswith("."), text
 
 
-def test_submit_sends_what_was_asked_for(tmp_path: Path) -> None:
+def test_submit_sends_the_options(tmp_path: Path) -> None:
     """--duration, --reference, hs and --set were accepted and ignored, or not accepted (B3)."""
     (tmp_path / "truth.tum").write_text("0 0 0 0 0 0 0 1\n")
     given = {
@@ -69,7 +69,7 @@ def test_submit_sends_what_was_asked_for(tmp_path: Path) -> None:
     assert request_of(given, str) == {"read": {"start_s": 2.0, "truth_topic": "/vicon"}}
 
 
-def test_submit_has_no_bar_if_none_is_wanted() -> None:
+def test_submit_has_no_bar_with_no_progress() -> None:
     assert build_parser().parse(["submit", "run.mcap", "--no-progress"]).no_progress
 
 

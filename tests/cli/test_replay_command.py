@@ -28,15 +28,13 @@ def test_replay_prints_a_table_and_links_the_latest(
     assert (latest / "metrics.json").is_file()
 
 
-def test_json_is_alone_on_stdout_and_says_what_the_file_says(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_json_is_alone_on_stdout_and_equals_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert main(["replay", SLIP, "--end", "8", "--json", "--out", str(out)]) == 0
-    told = json.loads(capsys.readouterr().out)
+    shown = json.loads(capsys.readouterr().out)
     written = json.loads((out / "metrics.json").read_text())
-    assert {key: told[key] for key in written} == written
-    assert told["timings"]["seconds"]["replay"] > 0.0
+    assert {key: shown[key] for key in written} == written
+    assert shown["timings"]["seconds"]["replay"] > 0.0
     assert written["run"]["seed"] == 0
 
 
@@ -54,9 +52,9 @@ def test_other_matchers_follow_the_robot_too(tmp_path: Path, capsys: pytest.Capt
     out = tmp_path / "out"
     argv = ["replay", str(RECORDINGS / "office.mcap"), "--end", "20", "--matcher", matcher, "--json", "--out", str(out)]
     assert main(argv) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["ape"]["trans_part"]["rmse"] < 0.05
-    assert told["run"]["matcher"] == ("harmony_search" if matcher == "hs" else matcher)
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["ape"]["trans_part"]["rmse"] < 0.05
+    assert shown["run"]["matcher"] == ("harmony_search" if matcher == "hs" else matcher)
 
 
 def test_config_prints_what_config_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -75,11 +73,11 @@ def test_flags_stand_above_the_file_and_the_file_above_the_preset(
     path = tmp_path / "mine.yaml"
     path.write_text("matcher: icp\nhide: {budget: 77}\nlocaliser: {update_min_d: 1e-1}\n")
     assert main(["config", "--preset", "paper", "--config", str(path), "--matcher", "hide", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["matcher"] == "hide"
-    assert told["hide"]["budget"] == 77
-    assert told["localiser"]["update_min_d"] == 0.1
-    assert told["likelihood_field"]["sigma"] == 1.0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["matcher"] == "hide"
+    assert shown["hide"]["budget"] == 77
+    assert shown["localiser"]["update_min_d"] == 0.1
+    assert shown["likelihood_field"]["sigma"] == 1.0
 
 
 def test_the_configuration_of_a_run_runs_again(tmp_path: Path) -> None:

@@ -48,9 +48,9 @@ from hsloc.model.occupancy_grid import OccupancyGrid
     ],
 )
 def test_a_number_out_of_all_range_is_refused(values: dict[str, Any], expected: str) -> None:
-    with pytest.raises(ConfigError) as told:
+    with pytest.raises(ConfigError) as caught:
         from_dict(Config, values)
-    assert expected in str(told.value)
+    assert expected in str(caught.value)
 
 
 def test_the_defaults_are_within_the_ranges() -> None:

@@ -1,4 +1,4 @@
-"""The guides tell the truth: every command and every example in them is run, and every link leads somewhere."""
+"""The guides are correct: every command and every example in them is run, and every link leads somewhere."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recordings: Path) -> P
 
 
 def run_line(line: str, capsys: pytest.CaptureFixture[str]) -> int:
-    """A line of a shell; commands of ours in this process, as starting it anew takes most of the time."""
+    """A line of a shell; commands of ours in this process, as starting it again takes most of the time."""
     words = shlex.split(line, comments=True)
     if words[0] != "hsloc":
         return subprocess.run(["bash", "-c", line], check=False, timeout=60).returncode
@@ -60,12 +60,14 @@ def run_line(line: str, capsys: pytest.CaptureFixture[str]) -> int:
 
 @pytest.mark.no_cover  # what they run has tests of its own; tracing it takes half as long again
 @pytest.mark.parametrize("path", [path for path in GUIDES if commands(path)], ids=lambda path: path.name)
-def test_every_command_of_a_guide_does_what_it_says(path: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_of_a_guide_works_as_described(
+    path: Path, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for line in commands(path):
-        wanted = _EXIT.search(line)
+        expected = _EXIT.search(line)
         status = run_line(line, capsys)
         printed = capsys.readouterr()
-        assert status == (int(wanted.group(1)) if wanted else 0), f"{line}\n{printed.err}"
+        assert status == (int(expected.group(1)) if expected else 0), f"{line}\n{printed.err}"
         assert "Traceback" not in printed.err
 
 

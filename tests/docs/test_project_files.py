@@ -64,8 +64,8 @@ def test_every_page_is_in_the_navigation_of_the_site(folder: str) -> None:
 def test_the_lock_pins_what_the_extras_ask_for() -> None:
     pinned = set(re.findall(r"^([a-z0-9-]+)==", (ROOT / "requirements.lock").read_text(encoding="utf-8"), re.MULTILINE))
     extras = PYPROJECT["project"]["optional-dependencies"]
-    wanted = [*PYPROJECT["project"]["dependencies"], *extras["serve"], *extras["dev"], *extras["docs"]]
-    names = {re.split(r"[\[>=<]", each)[0].lower().replace("_", "-").replace(".", "-") for each in wanted} - {"hsloc"}
+    expected = [*PYPROJECT["project"]["dependencies"], *extras["serve"], *extras["dev"], *extras["docs"]]
+    names = {re.split(r"[\[>=<]", each)[0].lower().replace("_", "-").replace(".", "-") for each in expected} - {"hsloc"}
     assert names - pinned == set()
 
 

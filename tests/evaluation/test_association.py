@@ -20,7 +20,7 @@ MS = 1_000_000
 
 
 def at(*milliseconds: int) -> Trajectory:
-    """Poses at stamps in ms whose x tells which row they are."""
+    """Poses at stamps in ms whose x is the number of their row."""
     stamps = np.array(milliseconds, dtype=np.int64) * MS
     poses = np.zeros((len(stamps), 3))
     poses[:, 0] = np.arange(len(stamps))
@@ -151,7 +151,7 @@ def test_backward_stamps_find_their_nearest() -> None:
     assert rows(pairs) == ([2, 0, 3], [0, 1, 2])
 
 
-def test_nothing_matches_and_the_message_says_why() -> None:
+def test_nothing_matches_and_the_message_has_the_reason() -> None:
     with pytest.raises(EvaluationError) as caught:
         associate(at(0, 1000), at(100, 500))
     message = str(caught.value)

@@ -115,7 +115,7 @@ def test_mistakes(files: tuple[Trajectory, list[Trajectory]], capsys: pytest.Cap
     assert capsys.readouterr().out == ""
 
 
-def test_folders_of_results_bring_their_own_reference(
+def test_folders_of_results_have_their_own_reference(
     files: tuple[Trajectory, list[Trajectory]], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     reference, estimates = files

@@ -29,7 +29,7 @@ def relation(first_s: float, second_s: float, x: float, y: float, theta: float) 
 
 
 def test_by_hand() -> None:
-    # One metre ahead and a quarter turn left, where the checked relation says 1.03 m, 0.04 m and 80 degrees.
+    # One metre ahead and a quarter turn left, where the checked relation has 1.03 m, 0.04 m and 80 degrees.
     path = trajectory((0, 5, 5, np.pi / 2), (1, 5, 6, np.pi))
     errors = relation_errors(path, relation(0, 1, 1.03, 0.04, np.radians(80)))
     assert errors.trans_part == pytest.approx([0.05])

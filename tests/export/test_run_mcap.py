@@ -92,7 +92,7 @@ def test_evo_reads_the_poses(results: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(theirs.poses, ours.poses, atol=1e-6)
 
 
-def test_the_page_tells_what_was_read_how_it_converged_and_where_the_origin_is(results: Path) -> None:
+def test_the_page_has_what_was_read_the_convergence_and_the_origin(results: Path) -> None:
     page = (results / "report.html").read_text()
     assert "localised on the map of the log" in page
     assert "2023-11-14 22:13:20 UTC" in page
@@ -102,7 +102,7 @@ def test_the_page_tells_what_was_read_how_it_converged_and_where_the_origin_is(r
     assert "<h2>Warnings</h2>" not in page
 
 
-def test_the_page_tells_warnings_and_the_checksums_of_a_map_that_was_given(results: Path, tmp_path: Path) -> None:
+def test_the_page_has_warnings_and_the_checksums_of_a_map_that_was_given(results: Path, tmp_path: Path) -> None:
     save_map(open_log(HALL).map(), tmp_path)  # type: ignore[arg-type]
     text = (tmp_path / "map.yaml").read_text().replace("free_thresh: 0.196", "free_thresh: 0.25")
     (tmp_path / "map.yaml").write_text(text)

@@ -181,7 +181,7 @@ def test_points_of_one_wall_lie_in_one_row_of_cells() -> None:
     assert len(set(turned)) > 10
 
 
-def test_an_oblique_wall_is_trusted_as_one_along_the_cells() -> None:
+def test_an_oblique_wall_counts_as_one_along_the_cells() -> None:
     cell, variances = 0.05, np.array((4e-4, 0.0))
     points = np.column_stack((np.linspace(-3.0, 3.0, 121), np.full(121, 2.0)))
     normals, weights = np.tile((0.0, 1.0), (121, 1)), np.ones(121)

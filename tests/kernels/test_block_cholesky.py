@@ -23,12 +23,12 @@ def test_a_sparse_system_is_that_of_its_dense_matrix(monkeypatch: pytest.MonkeyP
     for i, j, block in zip(rows, columns, off, strict=True):
         dense[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] += block
         dense[3 * j : 3 * j + 3, 3 * i : 3 * i + 3] += block.T
-    wanted = np.linalg.solve(dense, right.reshape(-1)).reshape(4, 3)
+    expected = np.linalg.solve(dense, right.reshape(-1)).reshape(4, 3)
     system = BlockSystem(4, rows, columns)
-    np.testing.assert_allclose(system.solve(diagonal, off, right), wanted, rtol=1e-9)
-    np.testing.assert_allclose(system.solve(2.0 * diagonal, 2.0 * off, right), 0.5 * wanted, rtol=1e-9)
+    np.testing.assert_allclose(system.solve(diagonal, off, right), expected, rtol=1e-9)
+    np.testing.assert_allclose(system.solve(2.0 * diagonal, 2.0 * off, right), 0.5 * expected, rtol=1e-9)
     monkeypatch.setattr(sparse_solver, "MOST_BLOCKS_A_COLUMN", 0)  # as with much fill: by SuperLU
-    np.testing.assert_allclose(system.solve(diagonal, off, right), wanted, rtol=1e-9)
+    np.testing.assert_allclose(system.solve(diagonal, off, right), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("chords", [0, 3, 20])
@@ -44,5 +44,7 @@ def test_a_ring_with_chords_that_fill_the_factor_in(rng: Any, chords: int) -> No
     for i, j, block in zip(rows, columns, off, strict=True):
         dense[i, :, j] += block
         dense[j, :, i] += block.T
-    wanted = np.linalg.solve(dense.reshape(3 * n, 3 * n), right.reshape(-1)).reshape(n, 3)
-    np.testing.assert_allclose(BlockSystem(n, rows, columns).solve(diagonal, off, right), wanted, rtol=1e-9, atol=1e-12)
+    expected = np.linalg.solve(dense.reshape(3 * n, 3 * n), right.reshape(-1)).reshape(n, 3)
+    np.testing.assert_allclose(
+        BlockSystem(n, rows, columns).solve(diagonal, off, right), expected, rtol=1e-9, atol=1e-12
+    )

@@ -81,7 +81,7 @@ def test_the_answer_is_that_of_trying_them_all(
 ) -> None:
     scores, points, centre, half = case
     excluded = np.array(naive_best(scores, points, centre, half, 0.1, NOWHERE, NOWHERE)[1])
-    want, where = naive_best(scores, points, centre, half, 0.1, excluded, np.array(exclusion))
+    expected, where = naive_best(scores, points, centre, half, 0.1, excluded, np.array(exclusion))
     pose = np.empty(3)
     found, visits = best_on_lattice(
         pool(scores, levels),
@@ -92,12 +92,12 @@ def test_the_answer_is_that_of_trying_them_all(
         10**7,
         pose,
     )
-    assert found == pytest.approx(want, abs=1e-6)
+    assert found == pytest.approx(expected, abs=1e-6)
     np.testing.assert_allclose(pose, where, atol=1e-9)
     assert visits > 0
 
 
-def test_nothing_better_than_what_is_needed_is_said_so(
+def test_nothing_better_than_what_is_needed_is_reported(
     case: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]],
 ) -> None:
     scores, points, centre, half = case

@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept: a writable place is found, or one warning says that there is none."""
+"""Where compiled kernels are kept: a writable place is found, or one warning reports that there is none."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_the_cache_falls_back_to_a_private_folder(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.usefixtures("nowhere")
-def test_a_folder_that_others_may_write_to_is_not_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_others_may_write_to_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is loaded from the cache is executed."""
     monkeypatch.setattr(cache, "_PARENTS", (str(tmp_path),))
     monkeypatch.setattr(cache.tempfile, "gettempdir", lambda: str(tmp_path))  # type: ignore[attr-defined]

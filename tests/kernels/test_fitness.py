@@ -1,4 +1,4 @@
-"""The kernels against their slow twins; the same tests run without the compiler (NUMBA_DISABLE_JIT=1)."""
+"""The kernels against their slow versions; the same tests run without the compiler (NUMBA_DISABLE_JIT=1)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def scene() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float3
 
 
 @pytest.mark.parametrize("pose", [(20.0, 15.0, 0.3), (2.0, 27.5, -2.0), (-5.0, 3.0, 1.0), (500.0, 500.0, 0.0)])
-def test_the_sum_is_that_of_the_naive_twin_points_outside_count_nothing(
+def test_the_sum_is_that_of_the_naive_version_points_outside_count_nothing(
     scene: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], pose: tuple[float, float, float]
 ) -> None:
     scores, packed, points = scene

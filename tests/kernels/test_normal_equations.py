@@ -46,8 +46,8 @@ def test_terms_of_poses_are_those_of_the_chain_rule() -> None:
     hjj, hji, hii = np.zeros((3, 3, 3))
     gj, gi = np.zeros((2, 3))
     add_relative_term(pose_j, rel, Term(information, gradient), Blocks(hjj, hji, hii, gj, gi), np.empty((3, 3)))
-    for got, want in ((hjj, b.T @ information @ b), (hji, b.T @ information @ a), (hii, a.T @ information @ a)):
-        np.testing.assert_allclose(got, want, atol=1e-6)
+    for got, expected in ((hjj, b.T @ information @ b), (hji, b.T @ information @ a), (hii, a.T @ information @ a)):
+        np.testing.assert_allclose(got, expected, atol=1e-6)
     np.testing.assert_allclose(gj, b.T @ gradient, atol=1e-6)
     np.testing.assert_allclose(gi, a.T @ gradient, atol=1e-6)
 
@@ -95,8 +95,8 @@ def test_an_edge_that_contradicts_the_graph_weighs_less_by_cauchy(rng: Any) -> N
     weighted = add_edges(poses, edges, measured, information, np.array([2.0]), robust)
     weight = 4.0 / (4.0 + chi2)
     np.testing.assert_allclose(weighted, weight * chi2)
-    for got, want in zip(robust, plain, strict=True):
-        np.testing.assert_allclose(got, weight * want)
+    for got, expected in zip(robust, plain, strict=True):
+        np.testing.assert_allclose(got, weight * expected)
 
 
 def test_a_term_in_the_inverse_pose_is_one_in_the_pose(rng: Any) -> None:
@@ -132,10 +132,10 @@ def test_blocks_on_the_diagonal_are_those_of_the_dense_inverse() -> None:
     for k in range(n):
         diagonal[k] = 20.0 * np.eye(3) + 0.1 * np.ones((3, 3))
         dense[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += diagonal[k]
-    want = np.linalg.inv(dense)
+    expected = np.linalg.inv(dense)
     got = BlockSystem(n, rows, columns).inverse_blocks(diagonal, off)
     for k in range(n):
-        np.testing.assert_allclose(got[k], want[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(got[k], expected[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rtol=1e-9, atol=1e-12)
 
 
 def test_path_lengths_are_those_of_dijkstra_over_chain_and_links(rng: Any) -> None:

@@ -1,4 +1,4 @@
-"""Rays against closed forms, and against the naive twin."""
+"""Rays against closed forms, and against the naive version."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 NOTHING = np.empty((0, 4))
-NOBODY = np.empty((0, 3))
+NO_PEOPLE = np.empty((0, 3))
 
 
 def cast(
     direction: NDArray[np.float64] | tuple[Any, ...],
     segments: NDArray[np.float64] | list[tuple[float, float, float, float]] = NOTHING,
-    circles: NDArray[np.float64] | list[tuple[float, float, float]] = NOBODY,
+    circles: NDArray[np.float64] | list[tuple[float, float, float]] = NO_PEOPLE,
     origin: Any = (0.0, 0.0),
 ) -> float:
     unit = np.array([direction]) / np.linalg.norm(direction)
@@ -71,7 +71,7 @@ def test_wall_before_a_circle_hides_it() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_equals_the_naive_twin(seed: int) -> None:
+def test_equals_the_naive_version(seed: int) -> None:
     rng = np.random.default_rng(seed)
     angles = rng.uniform(-4, 4, 40)
     directions = np.column_stack((np.cos(angles), np.sin(angles)))

@@ -66,10 +66,10 @@ def test_equations_are_those_of_the_pairs(room: Room) -> None:
     pose = base.to_array() + np.array((0.04, -0.03, 0.01))
     information, gradient, counts = np.zeros((3, 3)), np.zeros(3), np.zeros(5)
     add_pairs(pose, scene(2, poses, scans), 0.3, PARAMETERS, Term(information, gradient), counts)
-    wanted = naive_pairs(pose, 2, poses, scans, 0.3)
-    np.testing.assert_allclose(information, wanted[0], rtol=1e-5, atol=1e-3)
-    np.testing.assert_allclose(gradient, wanted[1], rtol=1e-5, atol=1e-3)
-    np.testing.assert_allclose(counts, wanted[2], rtol=1e-9)
+    expected = naive_pairs(pose, 2, poses, scans, 0.3)
+    np.testing.assert_allclose(information, expected[0], rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(gradient, expected[1], rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(counts, expected[2], rtol=1e-9)
 
 
 def test_a_scan_finds_its_pose(room: Room) -> None:

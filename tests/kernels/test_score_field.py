@@ -43,8 +43,8 @@ def test_distances_are_those_to_the_nearest_occupied_cell(height: Any, width: An
     found = squared_distances(columns_of(occupied, np.uint16))
     for row in range(height):
         for column in range(width):
-            wanted = naive.distance_to_nearest(occupied, row, column)
-            assert found[row, column] == round(wanted**2)
+            expected = naive.distance_to_nearest(occupied, row, column)
+            assert found[row, column] == round(expected**2)
 
 
 @pytest.mark.parametrize("kind", [np.uint16, np.int32])
@@ -53,10 +53,10 @@ def test_a_map_gets_the_bits_of_scipy_whether_in_one_go_or_in_rows(rng: Any, sha
     occupied = rng.random((200, 313)) < share
     occupied[17, 5] = True
     columns = columns_of(occupied, kind)
-    wanted = distance_transform_edt(~occupied)
+    expected = distance_transform_edt(~occupied)
     parts = [squared_distances(columns[row : row + 64]) for row in range(0, 200, 64)]
-    assert np.array_equal(np.sqrt(np.concatenate(parts)), wanted)
-    assert np.array_equal(np.sqrt(squared_distances(columns)), wanted)
+    assert np.array_equal(np.sqrt(np.concatenate(parts)), expected)
+    assert np.array_equal(np.sqrt(squared_distances(columns)), expected)
 
 
 def drawn(
@@ -110,8 +110,8 @@ def test_the_packed_field_is_that_of_all_scores_however_the_points_came() -> Non
     scaled = np.random.default_rng(5).normal(0.0, 6.0, (40, 2))
     for pose in np.array([(14.0, 11.0, 0.3), (2.0, 20.0, -2.0)]):
         field = GrowingField(scores, np.zeros((5, 5), np.uint8), np.zeros(2, np.int64), 0.5)
-        wanted = fitness_many(packed, scaled.astype(np.float32), pose[None])[0]
-        assert mean_score(field, 0.5 * scaled, pose) == wanted > 0.0
+        expected = fitness_many(packed, scaled.astype(np.float32), pose[None])[0]
+        assert mean_score(field, 0.5 * scaled, pose) == expected > 0.0
 
 
 def test_a_point_that_the_map_has_is_spared() -> None:
@@ -133,13 +133,13 @@ def test_points_at_the_border_or_outside_are_left_out(point: tuple[float, float]
 def test_a_cloud_has_the_first_point_of_each_cell_that_is_near_enough(rng: Any) -> None:
     points = rng.normal(0.0, 2.0, (60, 2)).astype(np.float32)
     start, poses = np.array([0, 25, 25, 60]), rng.normal(size=(3, 3))
-    wanted: dict[tuple[int, int], list[float]] = {}
+    expected: dict[tuple[int, int], list[float]] = {}
     for k in range(3):
         for x, y in points[start[k] : start[k + 1]].astype(np.float64):
             if np.hypot(x, y) < 3.0:
                 moved = Pose2.from_array(poses[k]) @ np.array((x, y))
-                wanted.setdefault((int(moved[0] // 0.5), int(moved[1] // 0.5)), moved.tolist())
+                expected.setdefault((int(moved[0] // 0.5), int(moved[1] // 0.5)), moved.tolist())
     cloud = np.empty((60, 2))
     count = thinned_cloud(points, start, poses, 3.0, 0.5, cloud)
     assert 10 < count < 60
-    np.testing.assert_allclose(cloud[:count], list(wanted.values()))
+    np.testing.assert_allclose(cloud[:count], list(expected.values()))

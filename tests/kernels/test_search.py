@@ -57,7 +57,7 @@ def naive_hide(
     p: SearchParameters,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
-    """HS and HIDE as the papers tell them; draws from `rng` in the same order as the kernel."""
+    """HS and HIDE as in the papers; draws from `rng` in the same order as the kernel."""
     low, high = centre - half, centre + half
     memory = np.empty((p.memory_size, 3))
     for i in range(p.memory_size):
@@ -155,7 +155,7 @@ def test_the_memory_stays_in_the_box_and_never_gets_worse(
     assert sums[best] == pytest.approx(naive.score_sum(scores, points, *memory[best]), abs=1e-3)
 
 
-def test_search_is_repeatable_and_tells_why_it_stopped(
+def test_search_is_repeatable_and_returns_why_it_stopped(
     scene: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
 ) -> None:
     _, packed, points = scene
@@ -163,7 +163,7 @@ def test_search_is_repeatable_and_tells_why_it_stopped(
 
     def run(seed: Any, **changes: Any) -> Any:
         pose, information = np.empty(3), np.zeros((3, 3))
-        told = search(
+        result = search(
             packed,
             points,
             points[:10],
@@ -172,7 +172,7 @@ def test_search_is_repeatable_and_tells_why_it_stopped(
             np.random.default_rng(seed),
             Found(pose, information, NONE),
         )
-        return pose, told
+        return pose, result
 
     many = {"restarts": 10, "agreement": 2, "polish_iterations": 10}
     first, second = run(1, **many), run(1, **many)

@@ -50,8 +50,8 @@ def test_steps_are_composed_with_their_covariances(rng: Any) -> None:
     for (first, last), motion, covariance in zip(windows.tolist(), motions, found, strict=True):
         np.testing.assert_allclose(motion, along(steps[first:last]), atol=1e-12)
         jacobian = derivative(along, steps[first:last]).reshape(3, last - first, 3)
-        wanted = np.einsum("akb,kbc,dkc->ad", jacobian, covariances[first:last], jacobian)
-        np.testing.assert_allclose(covariance, wanted, rtol=1e-6, atol=1e-7)
+        expected = np.einsum("akb,kbc,dkc->ad", jacobian, covariances[first:last], jacobian)
+        np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-7)
 
 
 def test_pairs_in_a_window_give_its_motion(rng: Any) -> None:
@@ -83,5 +83,5 @@ def test_pairs_in_a_window_give_its_motion(rng: Any) -> None:
         np.testing.assert_allclose(motion, relative_poses(poses[first][None], moved[None])[0], atol=1e-5)
         c, s = np.cos(poses[first, 2]), np.sin(poses[first, 2])
         turn = np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)))
-        wanted = turn @ np.linalg.inv(matrix)[-3:, -3:] @ turn.T
-        np.testing.assert_allclose(covariance, wanted, rtol=1e-6, atol=1e-10)
+        expected = turn @ np.linalg.inv(matrix)[-3:, -3:] @ turn.T
+        np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-10)

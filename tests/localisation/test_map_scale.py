@@ -51,7 +51,7 @@ def test_walls_that_are_drawn_where_they_are_become_surer() -> None:
     assert estimator(1.0).wall_variance < cell
 
 
-def test_a_few_scans_say_nothing() -> None:
+def test_a_few_scans_give_no_scale() -> None:
     assert estimator(1.02, PLACES[:5]).estimate() is None
 
 

@@ -83,7 +83,7 @@ def test_of_two_rooms_that_look_alike_neither_is_claimed() -> None:
     assert pose is not None
     x = pose.x
     assert min(abs(x - truth[-1].x), abs(x - 20.0 - truth[-1].x)) < 0.1
-    assert verdicts[0].places == ()  # too few scans to say so
+    assert verdicts[0].places == ()  # too few scans for that
     places = verdicts[-1].places
     assert sorted(round(place.pose.x - truth[-1].x) for place in places[:2]) == [0, 20]
     assert places[0].probability == pytest.approx(places[1].probability) == pytest.approx(0.5, abs=0.1)
@@ -110,7 +110,7 @@ def test_a_scan_without_motion_adds_no_evidence() -> None:
         assert verdict.evaluations == 0
 
 
-def test_start_forgets_all_hypotheses() -> None:
+def test_start_removes_all_hypotheses() -> None:
     subject, _, _ = search(L_SHAPE, ONE, 3)
     subject.start()
     verdict = subject.update(seen(L_SHAPE, START, Pose2(), 0.0, beams=10), 0)

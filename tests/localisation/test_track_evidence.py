@@ -110,7 +110,7 @@ def test_a_poor_map_on_which_comparisons_vouch_for_the_place_is_no_evidence_agai
     assert smooth(track(*[0.8] * 100))[:, 0].max() < 0.3
 
 
-def test_a_new_track_does_not_know_of_the_one_before() -> None:
+def test_a_new_track_is_independent_of_the_one_before() -> None:
     first, second = track(*[POOR] * 30), track(*[GOOD] * 30)
     right = smooth([*first, *second])[:, 0]
     assert right[:30].max() < 0.3

@@ -80,14 +80,14 @@ def test_coarser_tables_give_the_same_places(building: Any, monkeypatch: Any, sh
     world, grid, field, search = building
     rng = np.random.default_rng(5)
     points = scan_at(world, random_pose(grid, rng), rng)
-    wanted = search.search(points)
+    expected = search.search(points)
     monkeypatch.setattr(
         "hsloc.localisation.whole_map_search.score_pyramid", lambda field: make_pyramid(field.packed, shift)
     )
     found = WholeMapSearch(grid, field).search(points)
     assert found.is_complete
-    assert len(found.modes) == len(wanted.modes)
-    for one, other in zip(found.modes, wanted.modes, strict=True):
+    assert len(found.modes) == len(expected.modes)
+    for one, other in zip(found.modes, expected.modes, strict=True):
         assert one.pose.distance(other.pose) < 0.03
         assert one.fitness == pytest.approx(other.fitness, abs=0.006)
 
@@ -114,8 +114,8 @@ def test_rooms_that_look_alike_are_both_named() -> None:
     assert result.is_complete
     assert not result.is_unique
     assert len(result.modes) == 2
-    twin = Pose2(true.x + 6.0, true.y, true.theta)
-    for pose in (true, twin):
+    shifted = Pose2(true.x + 6.0, true.y, true.theta)
+    for pose in (true, shifted):
         assert any(is_near(mode, pose) for mode in result.modes)
 
 
@@ -152,16 +152,16 @@ def test_a_map_that_is_turned_is_searched_alike(building: Any) -> None:
     world, grid, field, search = building
     rng = np.random.default_rng(1)
     points = scan_at(world, random_pose(grid, rng), rng)
-    wanted = search.search(points)
+    expected = search.search(points)
     turned = OccupancyGrid(grid.cells, grid.resolution, Pose2(3.0, -2.0, 0.7))
     # The field in the frame of the map and not along the cells, as that of a set of points is.
     again = LikelihoodField(
         field.packed, field.resolution, turned.origin @ grid.origin.inverse() @ field.T_map_field, 0.2
     )
     found = WholeMapSearch(turned, again).search(points)
-    assert len(found.modes) == len(wanted.modes)
+    assert len(found.modes) == len(expected.modes)
     move = turned.origin @ grid.origin.inverse()
-    for one, other in zip(found.modes, wanted.modes, strict=True):
+    for one, other in zip(found.modes, expected.modes, strict=True):
         assert one.pose.distance(move @ other.pose) < 0.02
 
 

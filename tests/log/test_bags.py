@@ -40,16 +40,16 @@ def test_a_bag_gives_the_same_events_as_its_mcap(request: pytest.FixtureRequest,
     path: Path = request.getfixturevalue("bag2" if which == "bare" else which)
     if which == "bare":
         (path,) = path.glob("*.db3")
-    log, twin = open_log(path), open_log(mcap)
-    assert [describe(event) for event in log.events()] == [describe(event) for event in twin.events()]
+    log, converted = open_log(path), open_log(mcap)
+    assert [describe(event) for event in log.events()] == [describe(event) for event in converted.events()]
     assert log.losses == Losses()
     assert log.verify() == Losses()
     assert log.summary.extrinsics == "/tf_static"
     assert log.summary.laser_frame == "laser"
-    assert log.summary.T_base_laser == twin.summary.T_base_laser
-    assert (log.summary.start_ns, log.summary.end_ns) == (twin.summary.start_ns, twin.summary.end_ns)
+    assert log.summary.T_base_laser == converted.summary.T_base_laser
+    assert (log.summary.start_ns, log.summary.end_ns) == (converted.summary.start_ns, converted.summary.end_ns)
     assert [(t.topic, t.typename, t.count) for t in log.summary.topics] == [
-        (t.topic, t.typename, t.count) for t in twin.summary.topics
+        (t.topic, t.typename, t.count) for t in converted.summary.topics
     ]
     assert len(log.sha256()) == 64
 

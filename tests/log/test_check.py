@@ -208,7 +208,7 @@ def test_transforms_with_two_parents_backwards_and_from_a_localiser(run: Run) ->
     assert result["map_to_odom"][0] == "info"
 
 
-def test_odometry_and_transforms_that_speak_of_different_frames(run: Run) -> None:
+def test_odometry_and_transforms_with_different_frames(run: Run) -> None:
     run.links = [(START + 5, "odom", "base_footprint", Pose2())]
     assert found(run.write())["odometry_frames"][:2] == ("warning", "/odom")
 

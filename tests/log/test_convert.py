@@ -44,8 +44,8 @@ def test_the_same_events_from_text_and_from_its_mcap(tmp_path: Path, carmen: Pat
     assert (conversion.scans, conversion.odometry, conversion.truths) == (6, 9, 0)
     assert conversion.stamps_backwards == 2
     assert not conversion.losses.data_lost
-    twin = open_log(tmp_path / "log.mcap")
-    first, second = list(log.events()), list(twin.events())
+    converted = open_log(tmp_path / "log.mcap")
+    first, second = list(log.events()), list(converted.events())
     assert [describe(event) for event in first] == [describe(event) for event in second]
     for a, b in zip(first, second, strict=True):
         if isinstance(a, Scan):
@@ -58,9 +58,9 @@ def test_the_same_events_from_text_and_from_its_mcap(tmp_path: Path, carmen: Pat
         elif isinstance(a, Odometry):
             assert isinstance(b, Odometry)
             np.testing.assert_allclose(a.T_odom_base.to_array(), b.T_odom_base.to_array(), atol=1e-12)
-    assert twin.summary.order == "log"
-    assert twin.summary.extrinsics == "/tf_static"
-    assert twin.losses.stamps_backwards == {"/odom": 1, "/scan": 1}
+    assert converted.summary.order == "log"
+    assert converted.summary.extrinsics == "/tf_static"
+    assert converted.losses.stamps_backwards == {"/odom": 1, "/scan": 1}
     for window in ((0.5, None), (None, 1.0), (0.3, 1.35)):
         options = ReadOptions(start_s=window[0], end_s=window[1])
         expected = [describe(event) for event in open_log(carmen, options).events()]
@@ -97,18 +97,18 @@ def test_map_truth_start_and_an_upside_down_laser_come_along(tmp_path: Path) -> 
     source = open_log(tmp_path / "in.mcap")
     conversion = convert_log(source, tmp_path / "out.mcap")
     assert (conversion.truths, conversion.has_map) == (5, True)
-    twin = open_log(tmp_path / "out.mcap")
-    assert [describe(event) for event in twin.events()] == [describe(event) for event in source.events()]
-    a, b = (next(e for e in log.events() if isinstance(e, Scan)) for log in (source, twin))
+    converted = open_log(tmp_path / "out.mcap")
+    assert [describe(event) for event in converted.events()] == [describe(event) for event in source.events()]
+    a, b = (next(e for e in log.events() if isinstance(e, Scan)) for log in (source, converted))
     np.testing.assert_allclose(a.points_base(), b.points_base(), atol=1e-6)
     assert b.angle_increment < 0.0
-    assert twin.initial_pose() == source.initial_pose()
-    grid = twin.map()
+    assert converted.initial_pose() == source.initial_pose()
+    grid = converted.map()
     assert grid is not None
     np.testing.assert_array_equal(grid.cells, [[0, 100]])
-    odometry = next(e for e in twin.events() if isinstance(e, Odometry))
+    odometry = next(e for e in converted.events() if isinstance(e, Odometry))
     assert odometry.covariance is not None
-    assert twin.summary.truth_topic == "/ground_truth"
+    assert converted.summary.truth_topic == "/ground_truth"
 
 
 def test_a_log_without_events_leaves_nothing(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_a_log_without_events_leaves_nothing(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["in.mcap"]
 
 
-def test_losses_of_the_input_are_told(tmp_path: Path) -> None:
+def test_losses_of_the_input_are_reported(tmp_path: Path) -> None:
     path = write_run(tmp_path / "in.mcap", scans=200)
     data = path.read_bytes()
     path.write_bytes(flipped(data, chunk_data_at(data, chunks_of(data)[9]) + 30))
@@ -137,6 +137,6 @@ def test_the_intel_log(tmp_path: Path) -> None:
     log = open_log(source)
     conversion = convert_log(log, tmp_path / "intel.mcap")
     assert (conversion.scans, conversion.odometry, conversion.stamps_backwards) == (5437, 13631, 1294 + 425)
-    twin = open_log(tmp_path / "intel.mcap")
-    assert [describe(event) for event in twin.events()] == [describe(event) for event in log.events()]
-    assert twin.losses == Losses(stamps_backwards=twin.losses.stamps_backwards)
+    converted = open_log(tmp_path / "intel.mcap")
+    assert [describe(event) for event in converted.events()] == [describe(event) for event in log.events()]
+    assert converted.losses == Losses(stamps_backwards=converted.losses.stamps_backwards)

@@ -126,7 +126,7 @@ def test_damaged_payloads_raise_bad_payload_or_give_a_value(data: st.DataObject)
     assert time.perf_counter() - begin < 1.0
 
 
-def test_every_cut_of_a_payload_is_noticed() -> None:
+def test_every_cut_of_a_payload_is_detected() -> None:
     for name, data in payloads("laser", "base_link").items():
         decoder = decoder_for(channel(name))
         needed = {definitions.ODOMETRY: 48 + 288 + 48 + 8, definitions.POSE_WITH_COVARIANCE_STAMPED: 288}
@@ -196,7 +196,7 @@ def test_a_definition_that_differs_in_a_field_is_not_known(old: str, new: str) -
     assert not is_known(COMMENTED.replace(old, new), definitions.LASER_SCAN)
 
 
-def test_a_drifted_definition_is_decoded_by_what_the_log_says() -> None:
+def test_a_changed_definition_is_decoded_by_that_of_the_log() -> None:
     text = COMMENTED.replace("float32 scan_time", "float64 scan_time\nuint8[3] flags").replace(
         "float32[] intensities", "float32[] intensities\nstring note"
     )

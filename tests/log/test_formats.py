@@ -74,13 +74,13 @@ def values(event: Event) -> tuple[object, ...]:
 def test_every_format_gives_the_same_trajectory(source: Path, name: str) -> None:
     file, convert = FORMATS[name]
     path = source.parent / file
-    twin = path if path.exists() else convert(source, path)
-    log = open_log(twin)
+    converted = path if path.exists() else convert(source, path)
+    log = open_log(converted)
     assert [values(event) for event in log.events()] == [values(event) for event in open_log(source).events()]
     assert log.losses == Losses()
     assert log.summary.laser_flipped
     assert log.summary.extrinsics == "/tf_static"
-    found, expected = localised(twin), localised(source)
+    found, expected = localised(converted), localised(source)
     assert len(expected.trajectory) > 140
     assert expected.diagnostics.status.count("matched") > 10
     np.testing.assert_array_equal(found.trajectory.stamps_ns, expected.trajectory.stamps_ns)

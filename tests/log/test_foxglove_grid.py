@@ -1,4 +1,4 @@
-"""Maps as foxglove.Grid: taken where the values are occupancies, told where they may be anything else."""
+"""Maps as foxglove.Grid: taken where the values are occupancies, reported where they may be anything else."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_log_with_such_a_map_is_localised_in(tmp_path: Path, capsys: pytest.Ca
     assert metrics["ape"]["trans_part"]["rmse"] < 0.02
 
 
-def test_a_map_that_cannot_be_used_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_map_that_cannot_be_used_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fields = [{"name": "value", "offset": 0, "type": 7}]
     logs = [str(without_map(tmp_path / "hall.mcap")), str(grid_log(tmp_path / "grid.mcap", fields=fields))]
     assert main(["replay", *logs, "--end", "2", "--out", str(tmp_path / "out")]) == 0
@@ -119,7 +119,7 @@ def test_a_map_that_cannot_be_used_is_told(tmp_path: Path, capsys: pytest.Captur
     assert "cannot use /map (foxglove.Grid); give one with --map map.yaml" in capsys.readouterr().err
 
 
-def test_a_map_beside_the_log_is_told_but_not_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_map_beside_the_log_is_reported_but_not_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = str(without_map(tmp_path / "hall.mcap"))
     options = ["--end", "2", "--overwrite", "--out", str(tmp_path / "out" / "run")]
     (tmp_path / "config.yaml").write_text("resolution: 1\n")
@@ -130,6 +130,6 @@ def test_a_map_beside_the_log_is_told_but_not_taken(tmp_path: Path, capsys: pyte
     captured = capsys.readouterr()
     assert f"so a map is built; to localise on a map give it with --map {tmp_path / 'floor.yaml'}" in captured.err
     assert "Built a map from" in captured.out
-    # Asked for, or with the map of the log, there is nothing to tell.
+    # With the option, or with the map of the log, there is nothing to report.
     assert main(["replay", log, *options, "--mode", "slam"]) == 0
     assert "built" not in capsys.readouterr().err

@@ -49,7 +49,7 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
 
 
 def read_all(path: Path) -> int:
-    """Everything that a log can be asked for; only errors of ours may come out."""
+    """Every method of a log; only errors of ours may come out."""
     begin = time.process_time()
     count = 0
     try:

@@ -25,7 +25,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
     return code, out, err
 
 
-def test_info_says_what_is_there_and_what_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_lists_what_is_there_and_what_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, err = run(capsys, "info", write_run(tmp_path / "run.mcap", truth=True))
     assert (code, err) == (0, "")
     lines = [" ".join(line.split()) for line in out.splitlines()]
@@ -117,7 +117,7 @@ def test_convert_reports_counts(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert (report["scans"], report["odometry"], report["stamps_backwards"], report["data_lost"]) == (1, 2, 1, False)
 
 
-def test_convert_overwrites_only_when_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_convert_overwrites_only_with_the_flag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, target = carmen(tmp_path / "log.clf"), tmp_path / "log.mcap"
     target.write_bytes(b"precious")
     code, _, err = run(capsys, "convert", source, target)

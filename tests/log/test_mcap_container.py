@@ -165,7 +165,7 @@ def test_a_broken_message_index_costs_nothing(tmp_path: Path) -> None:
     at = sum(chunks_of(data)[0])
     assert data[at] == 0x07
     (length,) = struct.unpack_from("<Q", data, at + 1)
-    # One entry less than it says: an odd size.
+    # One entry less than its count: an odd size.
     broken = (
         data[: at + 1] + struct.pack("<Q", length - 8) + data[at + 9 : at + 9 + length - 8] + data[at + 9 + length :]
     )
@@ -215,12 +215,12 @@ def test_a_chunk_that_lies_about_its_times_gives_late_messages(whole: Path) -> N
     assert 0 < losses.late_messages < 20
 
 
-def test_only_chunks_with_wanted_channels_are_unpacked(tmp_path: Path) -> None:
+def test_only_chunks_with_selected_channels_are_unpacked(tmp_path: Path) -> None:
     path = write_run(tmp_path / "log.mcap", scans=400)
     data = path.read_bytes()
     container = McapContainer(path)
     static = next(c.id for c in container.channels.values() if c.topic == "/tf_static")
-    # Everything but the first chunk is garbage now, and nobody who wants /tf_static minds.
+    # Everything but the first chunk is garbage now, which does not matter to a reader of /tf_static.
     for chunk in chunks_of(data)[1:]:
         data = flipped(data, chunk_data_at(data, chunk) + 20)
     path.write_bytes(data)
@@ -320,7 +320,7 @@ def test_what_is_no_mcap_is_refused(tmp_path: Path, content: bytes) -> None:
 
 
 @pytest.mark.data
-def test_all_conformance_files_hold_what_their_json_says() -> None:
+def test_all_conformance_files_hold_what_is_in_their_json() -> None:
     files = sorted((DATA / "mcap-conformance").glob("*/*.mcap"))
     if not files:
         pytest.skip(f"no conformance files in {DATA / 'mcap-conformance'}; set HSLOC_DATA")

@@ -62,7 +62,7 @@ duration: 3600
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("topic: {}", "no key 'topic'"),
         ("topics: [1]", "table by topic"),
@@ -77,8 +77,8 @@ duration: 3600
         ("[]", "is not a profile"),
     ],
 )
-def test_files_that_are_no_profile(tmp_path: Path, text: str, said: str) -> None:
+def test_files_that_are_no_profile(tmp_path: Path, text: str, expected: str) -> None:
     path = tmp_path / "fleet.yaml"
     path.write_text(text)
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=expected):
         read_profile(path)

@@ -1,4 +1,4 @@
-"""`open_log`: what users bring, what they get, and what they are told when it is not enough."""
+"""`open_log`: what users bring, what they get, and the message when it is not enough."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_events_come_in_the_order_of_their_stamps(run: Path) -> None:
     assert events == [describe(event) for event in log.events()]
 
 
-def test_the_summary_says_what_is_there_and_what_is_taken(run: Path) -> None:
+def test_the_summary_lists_what_is_there_and_what_is_taken(run: Path) -> None:
     summary = open_log(run).summary
     assert (summary.scan_topic, summary.odom_topic, summary.truth_topic) == ("/scan", "/odom", "/ground_truth")
     assert (summary.odom_frame, summary.base_frame, summary.laser_frame) == ("odom", "base_link", "laser")

@@ -82,7 +82,7 @@ def test_a_mounting_that_moves_is_warned_of(tmp_path: Path) -> None:
     assert summary.warnings[0].code == WarningCode.LASER_MOVES
 
 
-def test_without_a_transform_the_laser_is_in_the_base_and_a_warning_says_so(tmp_path: Path) -> None:
+def test_without_a_transform_the_laser_is_in_the_base_with_a_warning(tmp_path: Path) -> None:
     path = write_with_links(tmp_path / "log.mcap", [("somewhere", "else", MOUNTING)])
     summary = open_log(path).summary
     assert (summary.extrinsics, summary.T_base_laser) == ("identity", IDENTITY)
@@ -225,7 +225,7 @@ def test_truth_is_never_taken_for_odometry(tmp_path: Path) -> None:
         log.scan(make_scan(START))
     with pytest.raises(TopicError, match="no odometry topic"):
         open_log(path)
-    # Unless the user says so: then it is odometry, and not truth as well.
+    # Unless it is chosen: then it is odometry, and not truth as well.
     log_read = open_log(path, ReadOptions(odom_topic="/odometry/ground_truth"))
     assert [type(event) for event in log_read.events()] == [Odometry, Scan]
     with pytest.raises(TopicError, match="cannot be both"):

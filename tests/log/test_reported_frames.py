@@ -115,7 +115,7 @@ def test_places_that_are_stated_on_tf_again_and_again_are_named(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("name", ["/robot1/tf", "tf"])
-def test_a_user_may_say_that_transforms_of_any_name_are_the_odometry(tmp_path: Path, name: str) -> None:
+def test_transforms_of_any_name_may_be_chosen_as_the_odometry(tmp_path: Path, name: str) -> None:
     path = write_robot(tmp_path / "a.mcap", "/robot1", odom="world", topic=False)
     with pytest.raises(TopicError, match="--odom-topic /robot1/tf"):
         open_log(path)

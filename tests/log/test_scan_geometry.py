@@ -65,7 +65,7 @@ def codes(found: list[ScanMessage]) -> list[str]:
         {},
         {"high": pi},  # the last beam counted as if it closed the turn
         {"beams": 181, "low": -pi / 2, "increment": pi / 180},
-        {"beams": 270, "low": 0.75 * pi, "increment": -1.5 * pi / 269},  # clockwise, as angle_max says too
+        {"beams": 270, "low": 0.75 * pi, "increment": -1.5 * pi / 269},  # clockwise, as by angle_max
         {"low": 0.0},
         {"step": 0.0},
         {"far": 0.01},
@@ -150,7 +150,7 @@ def test_a_wrong_flag_is_named(item: str) -> None:
 
 
 def in_segments(whole: list[ScanMessage], count: int) -> list[ScanMessage]:
-    """Each scan as so many messages, stamped when their first beam was measured."""
+    """Each scan as several messages, stamped when their first beam was measured."""
     found = []
     for scan in whole:
         size = len(scan.ranges) // count

@@ -1,4 +1,4 @@
-"""Scans whose beams all point the same way say nothing of a place, and are counted as unusable."""
+"""Scans whose beams all point the same way do not locate the robot, and are counted as unusable."""
 
 from __future__ import annotations
 

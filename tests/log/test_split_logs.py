@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def copy(
     source: Path, target: Path, keep: Callable[[str, int], bool] = lambda topic, seconds: True, later_s: int = 0
 ) -> Path:
-    """The messages that `keep(topic, seconds of the log)` wants, recorded `later_s` later; header stamps stay."""
+    """Messages for which `keep(topic, seconds of the log)` is true, recorded `later_s` later; header stamps stay."""
     with source.open("rb") as stream, target.open("wb") as out:
         reader = make_reader(stream)
         messages = list(reader.iter_messages())
@@ -102,7 +102,7 @@ def test_a_last_part_that_is_hardly_more_than_an_edge_is_one(tmp_path: Path) -> 
     assert open_log([last, early]).summary.warnings == ()
 
 
-def test_without_odometry_the_scans_tell(tmp_path: Path) -> None:
+def test_without_odometry_the_scans_decide(tmp_path: Path) -> None:
     only_scans = [
         copy(RECORDINGS / f"{name}.mcap", tmp_path / f"{name}.mcap", lambda topic, seconds: topic == "/scan")
         for name in ("hall", "office")
@@ -111,7 +111,7 @@ def test_without_odometry_the_scans_tell(tmp_path: Path) -> None:
         open_log(only_scans, ReadOptions(require_odometry=False))
 
 
-def test_a_gap_of_hours_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_gap_of_hours_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = RECORDINGS / "hall.mcap"
     early = copy(source, tmp_path / "early.mcap", lambda topic, seconds: seconds < 20.0)
     late = copy(source, tmp_path / "late.mcap", lambda topic, seconds: 20.0 <= seconds < 40.0, later_s=7500)
@@ -127,7 +127,7 @@ def test_a_gap_of_hours_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 @pytest.mark.parametrize("odometry", ["topic", "tf"])
 @pytest.mark.parametrize(
-    ("x", "gap_s", "told"),
+    ("x", "gap_s", "expected"),
     [
         (3.0, 0.1, None),
         (100.0, 0.1, "refused"),
@@ -137,7 +137,9 @@ def test_a_gap_of_hours_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[st
         (8.0, 10.0, None),
     ],
 )
-def test_odometry_that_is_elsewhere(tmp_path: Path, odometry: str, x: float, gap_s: float, told: str | None) -> None:
+def test_odometry_that_is_elsewhere(
+    tmp_path: Path, odometry: str, x: float, gap_s: float, expected: str | None
+) -> None:
     """A drive of 3 s at 1 m/s from x = 0, and one that begins at `x`, `gap_s` later."""
 
     def write(path: Path, start: int, x: float) -> Path:
@@ -154,19 +156,19 @@ def test_odometry_that_is_elsewhere(tmp_path: Path, odometry: str, x: float, gap
 
     early = write(tmp_path / "early.mcap", START, 0.0)
     late = write(tmp_path / "late.mcap", START + round((2.9 + gap_s) * SECOND), x)
-    if told == "refused":
+    if expected == "refused":
         with pytest.raises(LogError, match=r"the odometry is 97\.1 m away .* so they are not parts of one run"):
             open_log([early, late])
         return
     warnings = [str(each) for each in open_log([early, late]).summary.warnings if "odometry" in each.code]
-    if told is None:
+    if expected is None:
         assert warnings == []
     else:
         (line,) = warnings
-        assert re.search(told, line)
+        assert re.search(expected, line)
 
 
-def test_latched_topics_that_are_repeated_in_each_part_say_nothing_of_its_time(tmp_path: Path) -> None:
+def test_latched_topics_that_are_repeated_in_each_part_do_not_give_its_time(tmp_path: Path) -> None:
     early = write_run(tmp_path / "early.mcap")
     late = write_run(tmp_path / "late.mcap", first=40)  # its /tf_static has the stamp of the beginning
     log = open_log([late, early])
@@ -174,7 +176,7 @@ def test_latched_topics_that_are_repeated_in_each_part_say_nothing_of_its_time(t
     assert [part.path for part in log.summary.parts] == [early, late]
 
 
-def test_odometry_that_begins_anew_far_away_is_a_driver_that_was_started_again(tmp_path: Path) -> None:
+def test_odometry_that_is_reset_far_away_is_a_driver_that_was_restarted(tmp_path: Path) -> None:
     parts = []
     for number, begin in enumerate((50.0, 0.0)):
         parts.append(tmp_path / f"{number}.mcap")

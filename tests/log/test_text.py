@@ -171,7 +171,7 @@ def test_a_gzip_that_ends_too_early(tmp_path: Path) -> None:
     assert log.losses.data_lost
 
 
-def test_what_is_missing_is_told(tmp_path: Path) -> None:
+def test_what_is_missing_is_reported(tmp_path: Path) -> None:
     path = write(tmp_path / "log.clf", [odom("1")])
     with pytest.raises(TopicError, match="no laser lines in this CARMEN log"):
         open_log(path)
@@ -232,7 +232,7 @@ def test_wean_lines_in_centimetres(tmp_path: Path) -> None:
         "L 1 2 3",
     ]
     log = open_log(write(tmp_path / "robot.log", lines))
-    # The O line tells the same way again: it is not read beside L lines.
+    # The O line has the same path: it is not read beside L lines.
     odometry, scan = log.events()
     assert isinstance(odometry, Odometry)
     assert isinstance(scan, Scan)
@@ -298,7 +298,7 @@ def test_the_classic_logs(name: str, odometry: int, scans: int, backwards: dict[
     if name.startswith("wean"):
         assert log.summary.T_base_laser == Pose2(0.25, 0.0, 0.0)
     if name.startswith("intel"):
-        # Each scan follows the odometry that was read with it, whatever the stamps say.
+        # Each scan follows the odometry that was read with it, whatever its stamp is.
         last = None
         for event in events:
             if isinstance(event, Scan):

@@ -26,7 +26,7 @@ def transforms(draw: st.DrawFn) -> Transform3:
 
 
 def matrix(t: Transform3) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """The textbook's matrix of a quaternion: a twin of `rotate`."""
+    """The textbook's matrix of a quaternion: the same as `rotate`."""
     x, y, z, w = t.rotation
     result = np.eye(4)
     result[:3, :3] = [
@@ -77,7 +77,7 @@ def test_a_loop_in_the_tree_ends() -> None:
     assert tree.lookup("a", "b") is not None
 
 
-def test_what_comes_later_overrides_and_moving_is_told_from_noise() -> None:
+def test_what_comes_later_overrides_and_motion_is_distinguished_from_noise() -> None:
     tree = FrameTree()
     tree.add("base", "laser", Transform3((1, 0, 0)))
     tree.add("base", "laser", Transform3((1.0001, 0, 0)))

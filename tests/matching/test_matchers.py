@@ -162,7 +162,7 @@ def test_a_map_without_walls_is_refused() -> None:
         LikelihoodField.from_points(np.empty((0, 2)), 1.0, 0.1, 1.0)
 
 
-def test_the_field_tells_the_distance_to_the_nearest_wall() -> None:
+def test_the_field_holds_the_distance_to_the_nearest_wall() -> None:
     rng = np.random.default_rng(2)
     cells = np.where(rng.random((20, 30)) < 0.05, 100, 0).astype(np.int8)
     cells[10, 10] = 100

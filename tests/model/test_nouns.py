@@ -54,7 +54,7 @@ def test_a_trajectory_of_unequal_parts_is_refused() -> None:
         Trajectory(np.array([1, 2]), np.zeros((3, 3)))
 
 
-def test_cells_lie_where_the_origin_says_turned_ones_too() -> None:
+def test_cells_lie_where_the_origin_puts_them_turned_ones_too() -> None:
     cells = np.array([[0, 100, -1], [0, 0, 0]], dtype=np.int8)
     grid = OccupancyGrid(cells, 0.5, Pose2(10.0, 20.0, pi / 2))
     np.testing.assert_allclose(grid.centres(grid.occupied()), [[9.75, 20.75]])

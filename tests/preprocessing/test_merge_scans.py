@@ -17,7 +17,7 @@ def scan(frame: str, ms: float, at: Pose2 | None = None) -> PairedScan:
     return PairedScan(Scan(round(ms * MS), ranges, 0.0, 0.1, 0.1, 10.0, frame_id=frame), at or Pose2())
 
 
-def told(*scans: PairedScan) -> list[tuple[str, float, tuple[str, ...] | str]]:
+def merged(*scans: PairedScan) -> list[tuple[str, float, tuple[str, ...] | str]]:
     """(frame, ms, companions or "held") after an odometry message."""
     first = Odometry(0, Pose2())
     passed = list(merged_scans([first, *scans]))
@@ -42,7 +42,7 @@ def test_one_laser_is_left_alone() -> None:
 def test_the_last_of_each_pair_carries_the_other(offset: int) -> None:
     scans = [scan(frame, ms + (offset if frame == "b" else 0)) for ms in (0, 100, 200) for frame in "ab"]
     # Before b is known a leads alone; b's first scan then waits for a's second where that is near, as all do.
-    found = told(*scans)
+    found = merged(*scans)
     assert found[0] == ("a", 0, ())
     carried = [entry for entry in found[1:] if entry[2] != "held"]  # type: ignore[unreachable]
     assert len(carried) == 2
@@ -53,22 +53,24 @@ def test_the_last_of_each_pair_carries_the_other(offset: int) -> None:
 
 @pytest.mark.parametrize("frames", ["abc", "abcd"])
 def test_lasers_that_take_turns_are_one_cloud_each_period(frames: str) -> None:
-    found = told(*(scan(frame, 100 * k + 100 / len(frames) * at) for k in range(20) for at, frame in enumerate(frames)))
+    found = merged(
+        *(scan(frame, 100 * k + 100 / len(frames) * at) for k in range(20) for at, frame in enumerate(frames))
+    )
     carried = [entry for entry in found[2 * len(frames) :] if entry[2] != "held"]
     assert all({frame, *companions} == {*frames} for frame, _, companions in carried)
     assert len(carried) == 18
 
 
-def test_two_slow_lasers_that_never_meet_are_both_heard() -> None:
+def test_two_slow_lasers_that_never_coincide_are_both_used() -> None:
     scans = [entry for k in range(20) for entry in (scan("a", 450 * k), scan("b", 450 * k + 110))]
-    frames = [frame for frame, _, what in told(*scans) if what != "held"]
+    frames = [frame for frame, _, what in merged(*scans) if what != "held"]
     assert frames.count("a") == 20
     assert frames.count("b") >= 18
 
 
 def test_the_slower_of_two_lasers_sets_the_pace() -> None:
     fast, slow = [("a", 25 * k) for k in range(20)], [("b", 10 + 100 * k) for k in range(5)]
-    found = told(*(scan(*entry) for entry in sorted(fast + slow, key=lambda entry: entry[1])))
+    found = merged(*(scan(*entry) for entry in sorted(fast + slow, key=lambda entry: entry[1])))
     carried = [entry for entry in found[6:] if entry[2] != "held"]
     assert len(carried) == 4
     assert all({frame, *companions} == {"a", "b"} for frame, _, companions in carried)
@@ -76,7 +78,7 @@ def test_the_slower_of_two_lasers_sets_the_pace() -> None:
 
 def test_a_laser_that_falls_silent_is_not_waited_for() -> None:
     pairs = [scan(frame, 100 * k) for k in range(3) for frame in "ab"]
-    found = told(*pairs, *(scan("a", 100 * k) for k in range(3, 12)))
+    found = merged(*pairs, *(scan("a", 100 * k) for k in range(3, 12)))
     alone = [entry[1] for entry in found if entry[2] == ()][1:]
     # b is waited for half a second, in which a scan of a leads now and then; afterwards each does.
     assert alone[-5:] == [700, 800, 900, 1000, 1100]
@@ -86,7 +88,7 @@ def test_a_laser_that_falls_silent_is_not_waited_for() -> None:
 def test_lasers_that_never_meet_are_matched_alone_now_and_then() -> None:
     """One at 10 Hz, and one whose scans come at odd times after it, too late for it and too early for the next."""
     scans = [entry for k in range(20) for entry in (scan("a", 100 * k), scan("b", 100 * k + 65))]
-    frames = [frame for frame, _, what in told(*scans) if what != "held"]
+    frames = [frame for frame, _, what in merged(*scans) if what != "held"]
     assert len(frames) > 10
     assert {*frames} == {"a", "b"} or frames.count("a") > 10
 

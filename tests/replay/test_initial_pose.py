@@ -25,7 +25,7 @@ ROOM = OccupancyGrid(np.zeros((100, 200), dtype=np.int8), 0.1, Pose2(0.0, 0.0, n
 S = 10**9
 
 
-def told(
+def found_start(
     stated: tuple[float, Pose2] | None,
     odometry: list[tuple[int, float]] = (),  # type: ignore[assignment]
     start_s: float | None = None,
@@ -45,21 +45,21 @@ def told(
 
 def test_the_start_of_the_log_holds_at_its_beginning_alone() -> None:
     pose = Pose2(-2.0, 3.0, 0.0)
-    assert told((100.0, pose)) == (pose, ())
-    assert told((99.5, pose)) == (pose, ())
-    start, (warning,) = told((100.0, pose), start_s=60.0)
+    assert found_start((100.0, pose)) == (pose, ())
+    assert found_start((99.5, pose)) == (pose, ())
+    start, (warning,) = found_start((100.0, pose), start_s=60.0)
     assert start is None
     assert "60.0 s before the first event" in warning.text
-    assert told((160.0, pose), start_s=60.0) == (pose, ())
-    assert told((100.0, pose), unknown_start=True) == (None, ())
+    assert found_start((160.0, pose), start_s=60.0) == (pose, ())
+    assert found_start((100.0, pose), unknown_start=True) == (None, ())
 
 
 def test_a_start_stated_late_is_carried_back_over_a_short_way() -> None:
-    start, warnings = told((110.0, Pose2(-2.0, 3.0, np.pi / 2)), odometry=[(100, 5.0), (105, 5.5), (110, 6.0)])
+    start, warnings = found_start((110.0, Pose2(-2.0, 3.0, np.pi / 2)), odometry=[(100, 5.0), (105, 5.5), (110, 6.0)])
     assert not warnings
     assert start is not None
     assert np.allclose(start.to_array(), (-2.0, 2.0, np.pi / 2))  # a metre back along its heading
-    start, (warning,) = told((110.0, Pose2(-2.0, 3.0, 0.0)), odometry=[(100, 0.0), (105, 9.0), (110, 0.0)])
+    start, (warning,) = found_start((110.0, Pose2(-2.0, 3.0, 0.0)), odometry=[(100, 0.0), (105, 9.0), (110, 0.0)])
     assert start is None
     assert warning.code == WarningCode.START_LATE
     assert "10.0 s after the first event" in warning.text
@@ -67,17 +67,17 @@ def test_a_start_stated_late_is_carried_back_over_a_short_way() -> None:
 
 def test_a_start_that_is_not_on_the_map_is_named_with_its_remedy() -> None:
     with pytest.raises(MapError, match=r"--initial-pose, \(50, 0\), is not on the map, which spans x from -10 to"):
-        told(None, initial_pose=Pose2(50.0, 0.0, 0.0))
+        found_start(None, initial_pose=Pose2(50.0, 0.0, 0.0))
     with pytest.raises(MapError, match=r"run.mcap: the start that the log states.*--unknown-start"):
-        told((100.0, Pose2(5.5, 0.0, 0.0)))
-    assert told(None, initial_pose=Pose2(3.0, 21.0, 0.0))[0] is not None
+        found_start((100.0, Pose2(5.5, 0.0, 0.0)))
+    assert found_start(None, initial_pose=Pose2(3.0, 21.0, 0.0))[0] is not None
 
 
 def test_an_unknown_start_needs_a_free_cell() -> None:
     unknown = OccupancyGrid(np.full((5, 5), -1, dtype=np.int8), 0.1)
     with pytest.raises(MapError, match="no free cell"):
-        told(None, grid=unknown)
-    assert told(None, grid=unknown, initial_pose=Pose2(0.1, 0.1, 0.0))[0] is not None
+        found_start(None, grid=unknown)
+    assert found_start(None, grid=unknown, initial_pose=Pose2(0.1, 0.1, 0.0))[0] is not None
 
 
 def test_a_run_from_the_middle_of_a_log_does_not_begin_at_the_log_s_start() -> None:

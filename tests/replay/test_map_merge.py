@@ -44,11 +44,11 @@ def test_two_drives_through_one_building_become_one_map(
 ) -> None:
     out = tmp_path / "both"
     assert main(["merge", str(maps / "a"), str(maps / "b"), "--out", str(out), "--json", "--no-progress"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said == json.loads((out / "merge.json").read_text())
-    assert said["verdict"] == "good"
-    assert said["maps"][0] == {"map": str(maps / "a"), "x": 0.0, "y": 0.0, "yaw": 0.0, "loops": 0}
-    assert said["maps"][1]["loops"] >= 2
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((out / "merge.json").read_text())
+    assert printed["verdict"] == "good"
+    assert printed["maps"][0] == {"map": str(maps / "a"), "x": 0.0, "y": 0.0, "yaw": 0.0, "loops": 0}
+    assert printed["maps"][1]["loops"] >= 2
     state = read_state(out / STATE_FILE)
     truths = [event for event in open_log(RECORDINGS / "office.mcap").events() if isinstance(event, Truth)]
     truth = Trajectory.from_pairs([(event.stamp_ns, event.T_map_base) for event in truths])

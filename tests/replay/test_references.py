@@ -54,7 +54,7 @@ def replay(tmp_path: Path, capsys: pytest.CaptureFixture[str], *options: Path | 
     return json.loads(captured.out) if code == 0 else captured.err
 
 
-def test_a_log_tells_its_truth_and_any_topic(truth: Trajectory) -> None:
+def test_a_reference_is_the_truth_of_a_log_or_any_topic(truth: Trajectory) -> None:
     assert len(truth) > 1000
     named = read_reference(str(HALL))
     assert np.array_equal(named.poses, truth.poses)
@@ -85,7 +85,7 @@ def test_transforms_between_two_frames(moving: Path) -> None:
         ("{log}:/tf:map.base_link", EvaluationError, "no transforms lead from map to base_link; name a topic, as in"),
     ],
 )
-def test_what_cannot_be_found_is_told_with_what_can(name: str, error: type[Any], match: str) -> None:
+def test_what_cannot_be_found_is_reported_with_what_can(name: str, error: type[Any], match: str) -> None:
     with pytest.raises(error, match=match) as caught:
         read_reference(name.format(log=HALL))
     assert "\n" not in str(caught.value)
@@ -121,7 +121,7 @@ def test_a_sparse_reference_between_the_beats_is_met_by_interpolation(
     assert found["ape"]["trans_part"]["rmse"] < 0.02
 
 
-def test_a_reference_of_another_time_is_told(
+def test_a_reference_of_another_time_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], truth: Trajectory
 ) -> None:
     write_tum(tmp_path / "late.tum", Trajectory(truth.stamps_ns + 3600 * SECOND, truth.poses))

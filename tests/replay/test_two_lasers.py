@@ -49,7 +49,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def write(path: Path, log: Log, events: Sequence[Event], T_base_rear: Pose2 | None) -> Path:
-    """The events with the map and the start of a log, and a rear laser that is said to be there (None: unsaid)."""
+    """Events, map and start of a log, and a rear laser with the declared mounting (None: not declared)."""
     start = log.initial_pose()[1]
     links = [("base_link", "front", FRONT)] + ([] if T_base_rear is None else [("base_link", "rear", T_base_rear)])
     with LogWriter(path) as writer:
@@ -121,21 +121,21 @@ def test_the_command_takes_the_flag_twice_or_commas(
     assert "/rear: x -0.300 m, y 0.050 m, yaw 3.1416 rad (/tf_static)" in capsys.readouterr().out
 
 
-def test_several_lasers_must_be_asked_for(log: Path) -> None:
+def test_several_lasers_need_an_option(log: Path) -> None:
     with pytest.raises(TopicError, match=r"--scan-topic /front, or take all with --scan-topic /front,/rear"):
         open_log(log)
     with pytest.raises(TopicError, match="no topic /left"):
         open_log(log, ReadOptions(scan_topic="/front,/left"))
 
 
-def test_a_mounting_by_hand_is_for_all_and_said_so(log: Path) -> None:
+def test_a_mounting_by_hand_is_for_all_and_reported(log: Path) -> None:
     summary = open_log(log, replace(BOTH, laser_pose=Pose2(1.0, 0.0, 0.0))).summary
     assert [laser.T_base_laser.x for laser in summary.lasers] == [1.0, 1.0]
     assert "laser_pose_shared" in [warning.code for warning in summary.warnings]
 
 
 @pytest.mark.parametrize(
-    ("T_base_rear", "told"),
+    ("T_base_rear", "expected"),
     [
         (REAR, []),
         (
@@ -156,8 +156,8 @@ def test_a_mounting_by_hand_is_for_all_and_said_so(log: Path) -> None:
         (None, ["no transform from base_link to rear", "of the points of the laser rear lie at a wall"]),
     ],
 )
-def test_a_laser_that_is_mounted_otherwise_than_is_said_is_told(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], T_base_rear: Pose2 | None, told: list[str]
+def test_a_laser_that_is_not_mounted_as_declared_is_reported(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], T_base_rear: Pose2 | None, expected: list[str]
 ) -> None:
     opened = open_log(log, BOTH)
     path = write(tmp_path / "told.mcap", opened, list(opened.events()), T_base_rear)
@@ -165,8 +165,8 @@ def test_a_laser_that_is_mounted_otherwise_than_is_said_is_told(
     assert main(["replay", str(path), *options]) == 0
     captured = capsys.readouterr()
     warnings = [line for line in captured.err.splitlines() if line.startswith("hsloc: warning: ")]
-    assert len(warnings) == len(told)
-    for line, pattern in zip(warnings, told, strict=True):
+    assert len(warnings) == len(expected)
+    for line, pattern in zip(warnings, expected, strict=True):
         assert re.search(pattern, line)
     assert [
         f"hsloc: warning: {each['text']}; {each['remedy']}" for each in json.loads(captured.out)["warnings"]

@@ -123,14 +123,14 @@ def test_a_robot_at_rest_and_odometry_that_ticks_raise_nothing(changed: float, m
     assert list(OdometryWatch(events)) == events
 
 
-def test_a_robot_that_moves_without_odometry_is_noticed_within_seconds() -> None:
+def test_a_robot_that_moves_without_odometry_is_detected_within_seconds() -> None:
     passed: list[Odometry | Scan] = []
     with pytest.raises(UnusableOdometry, match="does not move"):
         passed.extend(OdometryWatch(still(60.0, 0.95, False)))  # type: ignore[arg-type]
     assert len(passed) < 6 * 60
 
 
-def test_a_heading_that_never_changes_is_noticed_when_the_scans_turn() -> None:
+def test_a_heading_that_never_changes_is_detected_when_the_scans_turn() -> None:
     events = [
         replace(e, T_odom_base=Pose2(e.T_odom_base.x, e.T_odom_base.y, 0.0)) if isinstance(e, Odometry) else e
         for e in open_log(OFFICE).events()

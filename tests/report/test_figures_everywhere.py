@@ -55,7 +55,7 @@ def test_the_same_figure_is_the_same_everywhere(
     figures = {row.label: row for row in ResultSummary.of(metrics).figures}
     shown = {name: row.values for name, row in figures.items()}
     assert len(shown) >= 7
-    # metrics.json: where a figure says that its numbers are, they are, and its text is them in its unit
+    # metrics.json: a figure's numbers are where it refers to, and its text is them in its unit
     written = json.loads(format_json(metrics.to_json()))
     for row in figures.values():
         for k, (source, number) in enumerate(zip(row.sources, row.numbers, strict=True)):
@@ -109,7 +109,7 @@ def test_over_seeds_runs_are_one_column(
     assert view_in((tmp_path / "c.html").read_text())["seeds"]["names"] == ["office: 3 seeds"]
 
 
-def test_the_interval_of_a_mean_holds_it_as_often_as_it_says() -> None:
+def test_the_interval_of_a_mean_has_its_nominal_coverage() -> None:
     rng, n, runs = np.random.default_rng(7), 10, 120
     held = 0
     for _ in range(runs):

@@ -136,7 +136,7 @@ def test_where_it_cannot_be_written(run: Any, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_poses_are_known_where_the_result_says_so_else_where_no_scan_was_lost(run: Any) -> None:
+def test_poses_are_known_by_the_states_of_the_result_else_where_no_scan_was_lost(run: Any) -> None:
     known = np.arange(len(run["trajectory"])) > 7
     assert parts(run["trajectory"], diagnostics=run["diagnostics"], localised=known).localised is known
     lost = diagnostics_of(np.random.default_rng(1), run["reference"], lost=((0.0, 5.0),))

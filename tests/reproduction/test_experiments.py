@@ -48,7 +48,7 @@ def test_hs_is_visibly_off_with_the_bandwidth_of_the_report(small: Reproduction)
     assert np.median(rows["HIDE, paper-literal"].tally.metres) < 0.01
 
 
-def test_the_start_is_off_by_what_the_text_says() -> None:
+def test_the_start_is_off_by_what_the_paper_gives() -> None:
     assert START.distance(SEEN_FROM) == pytest.approx(0.404, abs=1e-3)
     assert np.degrees(START.theta - SEEN_FROM.theta) == pytest.approx(12.0, abs=0.1)
     assert Window(START, *HALF).contains(SEEN_FROM)
@@ -73,8 +73,8 @@ def test_curves_rise_and_end_where_the_match_ends(short_material: Material) -> N
             assert curve.fitness[1, -1] == pytest.approx(match.fitness, abs=1e-9)
 
 
-def test_the_improvisations_of_hide_are_told_from_its_evolution(short_material: Material) -> None:
-    """A slow twin of the index: a run that ends after k improvisations ends with the curve's k-th value."""
+def test_the_improvisations_of_hide_are_counted_apart_from_its_evolution(short_material: Material) -> None:
+    """A slow version of the index: a run that ends after k improvisations ends with the curve's k-th value."""
     result = run_convergence(short_material.scan, 1, silent)
     (curve,) = (
         c for c in result.curves if (c.matcher, c.preset, c.counts) == ("HIDE", "paper-literal", "improvisations")

@@ -24,7 +24,7 @@ def test_one_experiment_on_our_own(tmp_path: Path, capsys: pytest.CaptureFixture
     }
 
 
-def test_missing_default_data_is_told(
+def test_missing_default_data_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HSLOC_DATA", str(tmp_path / "nowhere"))

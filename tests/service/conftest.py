@@ -54,7 +54,7 @@ def make_live(tmp_path: Path) -> Iterator[Callable[..., Live]]:
 
 @pytest.fixture(scope="session")
 def postgresql() -> Iterator[postgresql_server.Server]:
-    """A PostgreSQL, started when the first test asks for it."""
+    """A PostgreSQL, started when the first test needs it."""
     with postgresql_server.running() as server:
         yield server
 
@@ -73,7 +73,7 @@ _FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A Chromium; without Playwright or Chromium the test skips and says so."""
+    """A Chromium; without Playwright or Chromium the test is skipped with that reason."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="THE PAGE IS NOT TESTED: playwright is not installed")
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:

@@ -1,4 +1,4 @@
-"""A job's process that does what the first word of the log says; runs like `hsloc_service.execution.worker`."""
+"""A job's process that does what the first word of the log commands; runs like `hsloc_service.execution.worker`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def main() -> int:
     limits.apply(job["limits"], parent)
     word, *rest = (folder / "input" / job["log"]).read_bytes()[:200].decode("latin-1").split() or ["ok"]
 
-    def tell(line: dict[str, object]) -> None:
+    def emit(line: dict[str, object]) -> None:
         os.write(fd, json.dumps(line).encode() + b"\n")
 
     if job["request"].get("inspect"):
@@ -38,7 +38,7 @@ def main() -> int:
             os.link(folder / "secret", folder / "output" / "viewer.json")
             (folder / "output" / "viewer-map.png").write_bytes(b"picture")
         read = dict.fromkeys(("scan_topic", "odom_topic", "truth_topic", "initial_pose", "findings"))
-        tell({"done": {"format": word, "duration_s": 1.0, "topics": [], "warnings": [], **read}})
+        emit({"done": {"format": word, "duration_s": 1.0, "topics": [], "warnings": [], **read}})
         return 0
     if word == "ignore-term":
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -48,7 +48,7 @@ def main() -> int:
         seconds = float(rest[0])
         begin = time.monotonic()
         while (done := time.monotonic() - begin) < seconds:
-            tell({"phase": "replay", "part": done, "total": seconds, "scans": int(done * 10)})
+            emit({"phase": "replay", "part": done, "total": seconds, "scans": int(done * 10)})
             time.sleep(0.05)
     elif word == "allocate":
         kept = []
@@ -56,7 +56,7 @@ def main() -> int:
             while True:
                 kept.append(bytearray(64 << 20))
         except MemoryError:
-            tell({"failed": "out_of_memory", "message": "no memory"})
+            emit({"failed": "out_of_memory", "message": "no memory"})
             return 1
     elif word == "spin":
         while True:
@@ -71,7 +71,7 @@ def main() -> int:
                     file.write(bytes(1 << 20))
                     file.flush()
             except OSError:
-                tell({"failed": "output_limit", "message": "too much"})
+                emit({"failed": "output_limit", "message": "too much"})
                 return 1
     elif word == "abort":
         os.abort()
@@ -79,7 +79,7 @@ def main() -> int:
         sys.stdout.write("last words\n")
         return int(rest[0])
     elif word == "lie":
-        tell({"done": {}})
+        emit({"done": {}})
         return 0  # but there is no output
     elif word == "nonsense":
         os.write(fd, b"\x00\xff not json\n" + b"x" * (1 << 20))
@@ -100,7 +100,7 @@ def main() -> int:
         return 0
     elif word == "link":
         (folder / "output").symlink_to(rest[0])
-        tell({"done": {}})
+        emit({"done": {}})
         return 0
     elif word == "silent":
         os.close(fd)
@@ -108,7 +108,7 @@ def main() -> int:
     elif word == "kill-self":
         os.kill(os.getpid(), signal.SIGKILL)
     elif word == "bad-input":
-        tell({"failed": "invalid_input", "message": "run.mcap: no scan"})
+        emit({"failed": "invalid_input", "message": "run.mcap: no scan"})
         return 1
     output = folder / "output"
     output.mkdir()
@@ -132,7 +132,7 @@ def main() -> int:
     warning = {"code": "clocks_apart", "text": "the stamps are 3.0 s apart", "remedy": "check the clocks"}
     figure = {"name": "APE rmse", "values": ["1.23 cm", "0.45°"]}
     summary = {"metrics": {"verdict": "check"}, "figures": [figure], "warnings": [warning]}
-    tell({"done": {**summary, "data_lost": False, "notes": [], "timings": {}}})
+    emit({"done": {**summary, "data_lost": False, "notes": [], "timings": {}}})
     return 0
 
 

@@ -67,7 +67,7 @@ def test_waiting_outlives_a_server_that_is_killed(make_live: Callable[..., Live]
     assert ended[0]["state"] == "succeeded"
 
 
-def test_refusals_are_told_at_once(make_live: Callable[..., Live], log: Path) -> None:
+def test_refusals_are_reported_at_once(make_live: Callable[..., Live], log: Path) -> None:
     live = make_live(HSLOC_TOKEN="a-token-of-the-operator-0123456789", HSLOC_MAX_UPLOAD_BYTES="1M")
     with pytest.raises(ClientError, match="send a token") as refused:
         Client(live.url).upload(log)
@@ -179,7 +179,7 @@ def test_a_reference_is_uploaded_and_named_without_the_servers_folders(
     assert "--reference=reference.tum" in (tmp_path / "there" / "config.yaml").read_text()
 
 
-def test_a_dead_port_is_given_up_within_seconds(log: Path) -> None:
+def test_a_closed_port_is_given_up_within_seconds(log: Path) -> None:
     begin = time.monotonic()
     with pytest.raises(ClientError, match=r"cannot be reached.*refused.*is the server running, and the address right"):
         Client(f"http://127.0.0.1:{free_port()}").upload(log)

@@ -1,4 +1,4 @@
-"""The API keeps what its OpenAPI says: requests made from the schema by schemathesis, to a server over the wire.
+"""The API keeps to its OpenAPI: requests made from the schema by schemathesis, to a server over the wire.
 
 No answer is a 5xx; status, content type, headers and body are those that are described; what fits the schema is taken,
 what does not is refused, and so is whoever has no token.
@@ -52,12 +52,12 @@ def described() -> dict[str, Any]:
 def configuration() -> schemathesis.Config:
     config = schemathesis.Config()
     project = config.projects.default
-    # A query or a header that no route knows is ignored, as everywhere in HTTP: none is expected to be refused.
+    # A query or a header that no route has is ignored, as everywhere in HTTP: none is expected to be refused.
     project.generation.allow_extra_parameters = False
     # The token is given to every request below; schemathesis itself tries each route without, and with a wrong one.
     project.generation.with_security_parameters = False
     # tus has numbers of its own: 412 for its version, before all else, and 460 for a checksum. What is larger than a
-    # setting allows (413) fits the schema, and may be what is told of a request that does not.
+    # setting allows (413) fits the schema, and may be the answer to a request that does not.
     checks = project.checks
     for check in (checks.negative_data_rejection, checks.positive_data_acceptance, checks.missing_required_header):
         check.expected_statuses = [*check.expected_statuses, "412", "413", "460"]
@@ -69,7 +69,7 @@ schema = schemathesis.openapi.from_dict(described(), config=configuration())
 
 
 class World:
-    """A server with a file, an upload that waits for more, and a job; what a request removes is made anew."""
+    """A server with a file, an upload that waits for more, and a job; what a request removes is made again."""
 
     def __init__(self, live: Live) -> None:
         self.live, self.client, self.session = live, live.client(), requests.Session()

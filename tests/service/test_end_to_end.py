@@ -44,7 +44,7 @@ def test_the_result_is_that_of_hsloc_replay_byte_for_byte(
     file = upload(client, (RECORDINGS / "office.mcap").read_bytes(), "office.mcap")
     job = client.post("/v1/jobs", json={"log": file, **request_}).json()["id"]
     (tmp_path / "c.yaml").write_text("hide: {budget: 250}\n")
-    # A job knows its log by its name alone; so does a command in the folder of the log.
+    # A job has the name of its log alone; so has a command in the folder of the log.
     shutil.copy(RECORDINGS / "office.mcap", tmp_path)
     command = [sys.executable, "-m", "hsloc.cli.main", "replay", "office.mcap", "-q", *options]
     subprocess.run([*command, "--out", str(tmp_path / "out")], check=True, cwd=tmp_path)

@@ -1,4 +1,4 @@
-"""A store that refuses, hangs, loses bytes or dies half-way: accepted jobs are kept, and the API answers."""
+"""A store that refuses, hangs, loses bytes or fails half-way: accepted jobs are kept, and the API answers."""
 
 from __future__ import annotations
 
@@ -140,11 +140,11 @@ def test_a_job_waits_for_its_store_and_nothing_is_seen_before(client: TestClient
     Faulty.fault = ""
     Faulty.release.set()
     ended = wait(client, job)
-    assert (ended["state"], ended["attempt"]) == ("succeeded", 1)  # what was computed was not thrown away
+    assert (ended["state"], ended["attempt"]) == ("succeeded", 1)  # what was computed was kept
     assert client.get(f"/v1/jobs/{job}/results/trajectory.tum").content == b"3 []\n"
 
 
-def test_a_store_that_hangs_holds_up_nobody_else(client: TestClient) -> None:
+def test_a_store_that_hangs_does_not_delay_others(client: TestClient) -> None:
     job = submit(client)
     wait(client, job)
     Faulty.fault = "hang"
@@ -277,7 +277,7 @@ def test_what_a_broken_attempt_left_behind_is_swept(client: TestClient) -> None:
     assert stored(job) == []
 
 
-def test_deleting_does_not_wait_for_the_store_and_is_not_forgotten(client: TestClient) -> None:
+def test_deleting_does_not_wait_for_the_store_and_is_completed_later(client: TestClient) -> None:
     job = submit(client)
     wait(client, job)
     Faulty.fault = "hang"
@@ -320,7 +320,7 @@ def test_a_disk_that_is_not_mounted_is_away_and_nothing_is_gone(
     assert client.delete(f"/v1/jobs/{doomed}").status_code == 204
     deletions = client.app.state.context.deletions  # type: ignore[attr-defined]
     assert deletions.clear() == 0
-    assert not mounted.exists()  # made anew, it would be on another disk, and hidden when the right one is there again
+    assert not mounted.exists()  # made again, it would be on another disk, and hidden when the right one is there again
     aside.rename(mounted)
     assert wait(client, waiting)["state"] == "succeeded"
     assert client.get(f"/v1/jobs/{first}/results/metrics.json").status_code == 200

@@ -1,4 +1,4 @@
-"""Several servers and workers on one PostgreSQL and one store: any may die, each job ends once."""
+"""Several servers and workers on one PostgreSQL and one store: any may be killed, each job ends once."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def upload_by_turns(servers: list[TestClient], content: bytes, block: int) -> st
     return str(place.rsplit("/", 1)[1])
 
 
-def test_servers_know_each_other_and_the_dashboard_names_metrics_that_are_there(
+def test_servers_list_each_other_and_the_dashboard_names_metrics_that_are_there(
     make_client: Callable[..., TestClient], fleet: Fleet
 ) -> None:
     rates = {"requests_per_s": 0.01, "heartbeat_s": 0.1}
@@ -106,7 +106,7 @@ def test_servers_know_each_other_and_the_dashboard_names_metrics_that_are_there(
     assert len({panel["id"] for panel in board["panels"]}) == len(board["panels"])
 
 
-def test_jobs_and_cancellations_at_one_server_are_heard_at_once_by_another(
+def test_jobs_and_cancellations_at_one_server_reach_another_at_once(
     make_client: Callable[..., TestClient], fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hsloc_service.execution.dispatcher.IDLE_S", 60.0)  # it does not look by itself
@@ -151,7 +151,7 @@ def test_an_upload_begun_at_one_server_goes_on_at_the_other_and_a_worker_runs_th
         measured = answer.read().decode()
     expected = {'hsloc_jobs_ended_total{state="succeeded"} 1.0', "hsloc_slots 2.0", "hsloc_slots_busy 1.0"}
     assert expected <= set(measured.splitlines())
-    assert "hsloc_fleet_slots" not in measured  # which servers know alone
+    assert "hsloc_fleet_slots" not in measured  # which only servers have
     worker.process.send_signal(signal.SIGTERM)
     later = submit(other)
     assert worker.process.wait(30.0) == 0
@@ -218,7 +218,7 @@ def test_parts_that_nothing_is_made_of_are_swept(servers: list[TestClient]) -> N
         staged.mkdir()
         (staged / "part").write_bytes(b"left")
         store.publish(staged, name, [])
-    # A last block that was stored, but whose upload was not completed, is sent again, and the first is forgotten.
+    # A last block that was stored, but whose upload was not completed, is sent again, and the first is removed.
     for content in (b"wrong bit", b"right bit"):
         staged = context.storage.work / content.decode().replace(" ", "-")
         staged.mkdir()

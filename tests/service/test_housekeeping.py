@@ -45,7 +45,7 @@ def test_old_jobs_go_with_results_and_uploads_but_active_ones_stay(make_client: 
     wait(client, active)
 
 
-def test_a_server_whose_clock_is_wrong_says_what_that_of_the_database_does(
+def test_a_server_whose_clock_is_wrong_uses_that_of_the_database(
     make_client: Callable[..., TestClient], postgresql: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client = make_client(slots=0, database_url=postgresql.new_database())
@@ -114,7 +114,7 @@ def test_a_misspelt_variable_is_refused(name: str, remedy: str) -> None:
     from_environment({"HSLOC_TOKEN": "x", "HSLOC_DATA": "/logs", "HSLOCATION": "x"})
 
 
-def test_retention_of_many_jobs_holds_up_nobody(make_client: Callable[..., TestClient]) -> None:
+def test_retention_of_many_jobs_does_not_delay_requests(make_client: Callable[..., TestClient]) -> None:
     """Before, 8,000 jobs were one transaction: 66 s, in which no upload and no heartbeat was written."""
     client = make_client(retention_s=100.0, tenant_bytes=1 << 40)
     context = client.app.state.context  # type: ignore[attr-defined]

@@ -197,7 +197,7 @@ class Histories(RuleBasedStateMachine):
     # What holds at any time.
 
     @invariant()
-    def the_database_says_the_same(self) -> None:
+    def the_database_agrees(self) -> None:
         rows = {row.id: row for row in self.parts.jobs.list(ANYBODY, JobFilter(), limit=1000)}
         assert set(rows) == {job for job, model in self.models.items() if not model.deleted}
         for job, row in rows.items():

@@ -27,7 +27,7 @@ def test_the_same_idempotency_key_makes_one_job(client: TestClient) -> None:
     assert len(client.get("/v1/jobs").json()["jobs"]) == 1
 
 
-def test_a_running_job_tells_its_progress(client: TestClient) -> None:
+def test_a_running_job_reports_its_progress(client: TestClient) -> None:
     job = submit(client, b"slow 3")
     wait(client, job, states=("running",))
     time.sleep(1.3)
@@ -58,7 +58,7 @@ def test_events_have_a_cursor(client: TestClient) -> None:
     assert f"id: {blocks[-1]['id']}\n" in rest
 
 
-def test_a_waiting_job_is_cancelled_at_once_and_a_running_one_when_it_is_dead(client: TestClient) -> None:
+def test_a_waiting_job_is_cancelled_at_once_and_a_running_one_when_its_process_ended(client: TestClient) -> None:
     running, waiting = submit(client, b"slow 60"), submit(client, b"slow 60")
     wait(client, running, states=("running",))
     assert client.post(f"/v1/jobs/{waiting}/cancel").json()["state"] == "cancelled"

@@ -126,7 +126,7 @@ def test_cancel_wins_over_success(parts: Parts) -> None:
     assert parts.jobs.get(ANYBODY, job).state == "cancelled"
 
 
-def test_cancelled_while_its_server_dies(parts: Parts) -> None:
+def test_cancelled_while_its_server_is_killed(parts: Parts) -> None:
     job = parts.submit()
     leases = parts.leases()
     leases.claim("folder:a")
@@ -367,7 +367,7 @@ def test_a_claim_that_waits_for_a_tenants_share_holds_no_other(tmp_path: Path, p
     parts.storage.close()
 
 
-def test_a_reason_is_retried_as_the_policy_says(parts: Parts) -> None:
+def test_a_reason_is_retried_by_the_policy(parts: Parts) -> None:
     job = parts.submit()
     policy = RetryPolicy(3, {"signal": 3}, wait_s=0.15)
     leases = replace(parts.leases(), retries=policy)

@@ -232,7 +232,7 @@ def leave_before_it_is_compared(page: Any) -> None:
 
 
 def drawn(page: Any, selector: str = MAP) -> str:
-    """What a canvas shows, when the frame that was asked for is drawn."""
+    """What a canvas shows, when the requested frame is drawn."""
     script = """(s) => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(
       () => done(document.querySelector(s).toDataURL()))))"""
     return str(page.evaluate(script, selector))

@@ -1,4 +1,4 @@
-"""The page asks for a token, and goes on with an upload after a broken line, a killed server and a reload."""
+"""The page requires a token, and goes on with an upload after a broken line, a killed server and a reload."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from live_service import Live
 
 
-def test_a_token_is_asked_for(make_live: Callable[..., Live], open_page: Callable[..., Any]) -> None:
+def test_a_token_is_required(make_live: Callable[..., Live], open_page: Callable[..., Any]) -> None:
     token = "a-token-of-the-operator-0123456789"
     live = make_live(HSLOC_TOKEN=token)
     page = open_page(live.url)

@@ -67,7 +67,7 @@ def test_odometry_and_reference_are_those_of_the_report(hall: Any) -> None:
     assert view["ellipses"] is not None
 
 
-def test_a_job_whose_poses_are_all_guesses_says_so(tmp_path: Path) -> None:
+def test_a_job_whose_poses_are_all_guesses_has_a_warning(tmp_path: Path) -> None:
     """The warnings of the analysis are in the job's summary, not those of the replay alone."""
     (tmp_path / "input").mkdir()
     (tmp_path / "input" / "office.mcap").symlink_to(RECORDINGS / "office.mcap")

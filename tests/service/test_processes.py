@@ -154,7 +154,7 @@ def test_a_second_server_is_refused_the_folder(make_live: Callable[..., Live]) -
     first.wait(10.0)
 
 
-def test_the_process_sees_no_secret_of_the_server(make_live: Callable[..., Live]) -> None:
+def test_the_process_has_no_secret_of_the_server(make_live: Callable[..., Live]) -> None:
     token = "a-token-of-the-operator-0123456789"
     live = make_live(HSLOC_TOKEN=token)
     with live.client() as client:
@@ -174,7 +174,7 @@ def test_the_process_sees_no_secret_of_the_server(make_live: Callable[..., Live]
             assert token.encode() not in path.read_bytes()
 
 
-def test_what_a_mad_process_says_hurts_nobody(client: TestClient) -> None:
+def test_invalid_output_of_a_process_does_no_harm(client: TestClient) -> None:
     """Neither the slot, which must note it, nor the readers of the list, which must get JSON."""
     job = submit(client, b"mad")
     deadline = time.monotonic() + 10.0

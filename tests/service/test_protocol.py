@@ -140,7 +140,7 @@ def test_event_streams_that_come_at_once_are_counted_all(make_live: Callable[...
 
 
 def test_the_description_is_made_beside_all_else(make_live: Callable[..., Live]) -> None:
-    """It takes seconds when it is asked for the first time, and anybody may ask."""
+    """The first request takes seconds, and anybody may send it."""
     live = make_live()
     longest, done = 0.0, threading.Event()
 

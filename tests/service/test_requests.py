@@ -93,7 +93,7 @@ def test_two_parts_then_an_extended_map_scored_by_relations(
 
     # The next run begins where these end, and is scored by what the first one found for the time of both.
     first, last = lines[-40].split(), lines[-1].split()
-    (tmp_path / "some.relations").write_text(f"{first[0]} {last[0]} 0.1 0 0 0 0 0\n# seen by nobody\n1 2 0 0 0 0 0 0\n")
+    (tmp_path / "some.relations").write_text(f"{first[0]} {last[0]} 0.1 0 0 0 0 0\n# a comment\n1 2 0 0 0 0 0 0\n")
     more = {
         "log": upload(client, OFFICE.read_bytes(), "office.mcap"),
         "relations": upload(client, (tmp_path / "some.relations").read_bytes(), "some.relations"),
@@ -119,7 +119,7 @@ def test_two_parts_then_an_extended_map_scored_by_relations(
     assert summary["metrics"]["relations"] == metrics["relations"]
 
 
-def test_relations_that_cannot_be_read_are_told_at_once(make_client: Callable[..., TestClient]) -> None:
+def test_relations_that_cannot_be_read_are_refused_at_once(make_client: Callable[..., TestClient]) -> None:
     client = make_client(worker_command=REAL, job_memory_bytes=4 << 30)
     log = upload(client, OFFICE.read_bytes(), "office.mcap")
     relations = upload(client, b"1 2 0 0 0 0 0 0\n1 2 3\n", "wrong.relations")
@@ -244,7 +244,7 @@ def test_a_saved_map_that_was_changed_is_not_extended(make_client: Callable[...,
         assert "map.npz" in ended["message"]
 
 
-def test_the_folder_of_an_attempt_has_what_was_asked_for(client: TestClient) -> None:
+def test_the_folder_of_an_attempt_has_the_inputs_of_the_request(client: TestClient) -> None:
     drawn = mapped(client)
     logs = [upload(client, b"slow 30", "run.mcap"), upload(client, b"part two", "run.mcap")]
     relations = upload(client, b"1 2 0 0 0 0 0 0", "../a relation")

@@ -139,9 +139,9 @@ def test_a_tree_without_permissions_is_removed(tmp_path: Path) -> None:
 def test_where_no_sandbox_can_be_had_the_server_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "which", lambda name: None)
     monkeypatch.setattr(limits, "landlock_abi", lambda: 0)
-    for wanted in ("auto", "bubblewrap", "landlock"):
+    for expected in ("auto", "bubblewrap", "landlock"):
         with pytest.raises(SettingsError, match=r"cannot be kept apart.*install bubblewrap.*HSLOC_SANDBOX=none"):
-            choose_sandbox(wanted, tmp_path, ())
+            choose_sandbox(expected, tmp_path, ())
     for allowed in ("none", "if-possible"):
         assert choose_sandbox(allowed, tmp_path, ()).kind == "none"
     with pytest.raises(SettingsError, match="sandbox is 'chroot'"):

@@ -84,7 +84,7 @@ def test_a_data_folder_of_schema_1_opens_with_everything_in_it(client: TestClien
     assert answer.content == b"7 []\n"
     assert answer.headers["etag"] == '"bb3bf29c29d099503eba622ca7c090b8d1b77d3f785141830ba9c199c8086e5b"'
     assert len(client.get(f"/v1/jobs/{SUCCEEDED}/events").text.split("\n\n")) > 3
-    # What ran and what waited when the old server died runs now.
+    # What ran and what waited when the old server was killed runs now.
     assert wait(client, RUNNING)["state"] == "succeeded"
     assert wait(client, WAITING)["state"] == "succeeded"
     assert len(client.get("/v1/files").json()["files"]) == 5
@@ -170,7 +170,7 @@ STEPS = "; ".join((*migrations.STEPS[1], *migrations.STEPS[2]))
 
 
 @pytest.mark.parametrize(
-    ("statements", "said"),
+    ("statements", "expected"),
     [
         (f"PRAGMA user_version={SCHEMA_VERSION + 1}", f"newer hsloc .schema {SCHEMA_VERSION + 1}, known up to"),
         (
@@ -189,12 +189,12 @@ STEPS = "; ".join((*migrations.STEPS[1], *migrations.STEPS[2]))
         ("PRAGMA user_version=0", "not a database of hsloc"),
     ],
 )
-def test_a_database_that_does_not_fit_is_refused_in_one_line(old: Path, statements: str, said: str) -> None:
+def test_a_database_that_does_not_fit_is_refused_in_one_line(old: Path, statements: str, expected: str) -> None:
     with sqlite3.connect(old) as connection:
         connection.executescript(statements)
     connection.close()
     before = old.read_bytes()
-    with pytest.raises(SettingsError, match=said) as error:
+    with pytest.raises(SettingsError, match=expected) as error:
         Database(old)
     assert "\n" not in str(error.value)
     assert str(old) in str(error.value)
@@ -220,7 +220,7 @@ def test_programs_of_the_schema_before_go_on_with_a_newer_one(old: Path, monkeyp
 
 
 def test_a_script_since_the_oldest_schema_takes_nothing_from_older_programs() -> None:
-    """It adds tables, indexes, and columns that an INSERT which does not know them may leave out."""
+    """It adds tables, indexes, and columns that an older INSERT may leave out."""
     for path in sorted((Path(migrations.__file__).parent / "scripts" / "versions").glob("schema_*.py")):
         if int(path.stem.removeprefix("schema_")) <= migrations.OLDEST_SCHEMA:
             continue

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 def test_jobs_are_found_by_title_labels_and_notes(make_client: Callable[..., TestClient], database_url: str) -> None:
     client = make_client(**({"database_url": database_url, "store_url": "memory://shares"} if database_url else {}))
     first, second = submit(client), submit(client)
-    said = {"title": "Hall 3", "labels": ["floor 2", "50 %", "floor 2"], "notes": "people at the door"}
-    assert client.patch(f"/v1/jobs/{first}", json=said).json()["labels"] == ["floor 2", "50 %"]
+    expected = {"title": "Hall 3", "labels": ["floor 2", "50 %", "floor 2"], "notes": "people at the door"}
+    assert client.patch(f"/v1/jobs/{first}", json=expected).json()["labels"] == ["floor 2", "50 %"]
     client.patch(f"/v1/jobs/{second}", json={"labels": ["floor 22"]})
     assert client.get("/v1/labels").json()["labels"] == ["50 %", "floor 2", "floor 22"]
 
@@ -78,7 +78,7 @@ def test_a_link_shows_one_job_until_it_is_revoked_or_expires(make_client: Callab
     link = f"/v1/shared/{made['secret']}"
     (listed,) = client.get(f"/v1/jobs/{job}/shares").json()["shares"]
     assert (listed["id"], listed["secret"]) == (made["id"], None)
-    key = client.headers.pop("Authorization")  # from here on a stranger, on a page of another site
+    key = client.headers.pop("Authorization")  # from here on without a token, on a page of another site
     client.headers["Origin"] = "https://viewer.example.com"
     seen = client.get(link).json()
     assert (seen["id"], seen["title"], seen["notes"], "webhook" in seen["request"]) == (job, "Hall 3", None, False)

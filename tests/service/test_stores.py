@@ -248,7 +248,7 @@ def test_abandoned_attempts_are_swept_and_nothing_else(client: TestClient, tmp_p
         (copy / "a").write_bytes((place / "a").read_bytes())
         context.stores.current.publish(copy, name, assets)
     waiting = submit(client)
-    with context.database.write() as session:  # a server died when it had stored what its first attempt computed
+    with context.database.write() as session:  # a server was killed when it had stored what its first attempt computed
         session.scalars(select(JobRow).where(JobRow.id == waiting)).one().attempt = 1
     copy = tmp_path / f"{waiting}.1"
     copy.mkdir()
@@ -309,7 +309,7 @@ def test_a_map_in_a_store_that_is_not_set_any_more_cannot_be_extended(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "expected"),
     [
         ("bucket/prefix", "must be a URL"),
         ("nonsense://x", "cannot be used"),
@@ -317,8 +317,8 @@ def test_a_map_in_a_store_that_is_not_set_any_more_cannot_be_extended(tmp_path: 
         ("simplecache::s3://bucket", "must be a URL"),
     ],
 )
-def test_a_url_that_cannot_be_used_is_told_in_one_line(tmp_path: Path, wrong: str, said: str) -> None:
-    with pytest.raises(SettingsError, match=said) as error:
+def test_a_url_that_cannot_be_used_is_refused_in_one_line(tmp_path: Path, wrong: str, expected: str) -> None:
+    with pytest.raises(SettingsError, match=expected) as error:
         create_app(settings(tmp_path, results_url=wrong))
     assert "\n" not in str(error.value)
     assert "secret" not in str(error.value)
@@ -339,12 +339,12 @@ def test_a_range_is_a_part_of_the_file_or_refused(text: str, size: int) -> None:
     try:
         span = parse_range(text, size)
     except HTTPException:
-        return  # what is refused, and how, is told below
+        return  # what is refused, and how, is tested below
     assert span is None or 0 <= span.start < span.stop <= size
 
 
 @given(st.integers(0, 40), st.integers(0, 40), st.integers(1, 30))
-def test_ranges_mean_what_the_standard_says(first: int, last: int, size: int) -> None:
+def test_ranges_are_those_of_the_standard(first: int, last: int, size: int) -> None:
     content = list(range(size))
 
     def taken(text: str) -> list[int] | str | None:

@@ -94,7 +94,7 @@ def test_a_sweep_is_cancelled_and_deleted_as_a_whole(client: TestClient) -> None
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "expected"),
     [
         ({"logs": []}, "logs"),
         ({"seeds": [1, 1]}, "seeds: one is named twice"),
@@ -106,10 +106,10 @@ def test_a_sweep_is_cancelled_and_deleted_as_a_whole(client: TestClient) -> None
         ({"run": {"resume": "3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f"}}, "run.resume"),
     ],
 )
-def test_a_sweep_that_does_not_fit_makes_no_job(client: TestClient, changes: dict[str, Any], said: str) -> None:
+def test_a_sweep_that_does_not_fit_makes_no_job(client: TestClient, changes: dict[str, Any], expected: str) -> None:
     answer = client.post("/v1/sweeps", json={"logs": [upload(client)], **changes})
     assert answer.status_code == 422
-    assert said in answer.text
+    assert expected in answer.text
     assert client.get("/v1/jobs").json()["jobs"] == []
 
 

@@ -71,11 +71,11 @@ def test_tokens_are_listed_and_revoked_while_the_service_runs(
         assert serve("--revoke-token", ident)[0] == 0
         assert client.get("/v1/info").status_code == 401
     assert serve("--list-tokens")[1].rstrip().endswith("revoked")
-    for options, said in ((["--revoke-token", "nothing"], "no token 'nothing'"), ([], "no data folder")):
+    for options, expected in ((["--revoke-token", "nothing"], "no token 'nothing'"), ([], "no data folder")):
         folder = [] if options else ["--data", str(live.data / "elsewhere"), "--list-tokens"]
         code, _, err = serve(*options, *folder)
         assert code == 1
-        assert said in err
+        assert expected in err
         assert err.count("\n") == 1
 
 

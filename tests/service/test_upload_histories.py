@@ -63,8 +63,8 @@ class Histories(RuleBasedStateMachine):
     def expect(self, path: str, answer: Any, status: int) -> None:
         """The status, or what stands before it: an upload that is gone, or whole."""
         model = self.models[path]
-        wanted = 404 if model.gone else 409 if model.whole else status
-        assert answer.status_code == wanted, answer.text
+        expected = 404 if model.gone else 409 if model.whole else status
+        assert answer.status_code == expected, answer.text
 
     @rule(target=uploads, size=st.integers(0, 100))
     def create(self, size: int) -> str:
@@ -112,7 +112,7 @@ class Histories(RuleBasedStateMachine):
         self.models[path].gone = True
 
     @rule(path=uploads, junk=bodies, lost=st.integers(0, 30))
-    def the_server_dies(self, path: str, junk: bytes, lost: int) -> None:
+    def the_server_is_killed(self, path: str, junk: bytes, lost: int) -> None:
         """Behind the offset may be bytes that were never acknowledged; a bad disk may have lost some before it."""
         model = self.models[path]
         self.client.__exit__(None, None, None)
@@ -121,7 +121,7 @@ class Histories(RuleBasedStateMachine):
             self.file(path).write_bytes(model.content + junk if lost == 0 else kept)
         self.up()
         if not model.gone and not model.whole and lost and model.content:
-            answer = append(self.client, path, len(model.content), b"")  # the server sees it when it looks
+            answer = append(self.client, path, len(model.content), b"")  # the server finds it when it checks
             assert answer.status_code == 409
             model.content = kept
 
@@ -138,7 +138,7 @@ class Histories(RuleBasedStateMachine):
                 model.gone = self.client.head(path, headers=TUS).status_code == 404
 
     @invariant()
-    def the_server_says_the_same(self) -> None:
+    def the_server_agrees(self) -> None:
         for path, model in self.models.items():
             answer = self.client.head(path, headers=TUS)
             found = self.client.get(path.replace("tus", "files"))

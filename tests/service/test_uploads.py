@@ -101,7 +101,7 @@ def test_quota_and_reservation(make_client: Callable[..., TestClient]) -> None:
     begin(client, 300)
 
 
-def test_an_unfinished_upload_that_begins_anew_keeps_to_the_limits(make_client: Callable[..., TestClient]) -> None:
+def test_an_unfinished_upload_that_is_restarted_keeps_to_the_limits(make_client: Callable[..., TestClient]) -> None:
     client = make_client(max_upload_bytes=2000, tenant_bytes=3000)
     ident = begin(client, 1500).rsplit("/", 1)[1]
     refused = client.put(f"/v1/files/{ident}", content=bytes(2001))
@@ -154,7 +154,7 @@ def test_tus_from_beginning_to_end(client: TestClient) -> None:
     assert offset(client, path) == len(content)
 
 
-def test_tus_checks_what_it_is_told(client: TestClient) -> None:
+def test_tus_checks_its_headers(client: TestClient) -> None:
     path = begin(client, 10)
     assert client.head(path).status_code == 412
     assert client.patch(path, headers={**TUS, "Upload-Offset": "0"}, content=b"x").status_code == 415
@@ -184,7 +184,7 @@ def test_metadata_that_is_not_a_text_does_not_matter_but_its_form_does(client: T
         assert answer.status_code == status, length
 
 
-def test_a_refused_method_is_told_all_that_there_are(client: TestClient) -> None:
+def test_the_answer_to_a_refused_method_lists_all_that_there_are(client: TestClient) -> None:
     some = f"{uuid.uuid4()}"
     expected = {
         "/": "GET",
@@ -227,7 +227,7 @@ def test_termination(client: TestClient) -> None:
 
 
 def test_bytes_beyond_the_offset_do_not_count(client: TestClient) -> None:
-    """After a kill the file may be longer than the database says; and a disk may have lost its end."""
+    """After a kill the file may be longer than in the database; and a disk may have lost its end."""
     content = os.urandom(3000)
     path = begin(client, len(content))
     append(client, path, 0, content[:1000])
@@ -319,17 +319,17 @@ def test_a_line_that_breaks_after_the_last_byte_leaves_a_complete_upload(make_li
         assert client.post("/v1/jobs", json={"log": ident}).status_code == 201
 
 
-def test_no_offset_says_that_all_is_there_before_the_upload_is_complete(
+def test_no_offset_is_the_full_length_before_the_upload_is_complete(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A server that dies between the last byte and the commit: the client must see that there is something to do."""
+    """A server that is killed between the last byte and the commit: the upload must not look complete."""
 
-    def dies(*_: Any) -> None:
+    def is_killed(*_: Any) -> None:
         raise KeyError("kill -9")
 
     place = begin(client, 10)
     with monkeypatch.context() as patch:
-        patch.setattr(Files, "complete", dies)
+        patch.setattr(Files, "complete", is_killed)
         assert client.patch(place, headers={**PATCH, "Upload-Offset": "0"}, content=b"0123456789").status_code == 500
     at = offset(client, place)
     assert at < 10

@@ -181,11 +181,11 @@ def test_a_tenant_with_many_webhooks_does_not_hold_up_another(tmp_path: Path, mo
             )
     order: list[str] = []
 
-    def dead(url: str, body: bytes, headers: dict[str, str], private: bool) -> int:
+    def unreachable(url: str, body: bytes, headers: dict[str, str], private: bool) -> int:
         order.append(headers["Hsloc-Event-Id"].partition("-")[0])
         raise TimeoutError
 
-    monkeypatch.setattr(webhooks, "post", dead)
+    monkeypatch.setattr(webhooks, "post", unreachable)
     deliverer = webhooks.WebhookSender(database, settings(tmp_path))
     while deliverer.deliver_next():
         assert len(order) <= 22

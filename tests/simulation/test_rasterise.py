@@ -1,4 +1,4 @@
-"""Cells of walls, by hand, and by a brute-force twin."""
+"""Cells of walls, by hand, and by brute force."""
 
 from __future__ import annotations
 

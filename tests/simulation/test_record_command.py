@@ -28,13 +28,13 @@ def scenario_of(path: Path) -> Scenario:
     return Scenario.from_dict(json.loads(open_log(path).metadata()["hsloc.scenario"]["scenario"]))
 
 
-def test_records_and_says_what(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_records_and_prints_what(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run.mcap"
     assert run(out, "--world", "office", "--seed", 7, "--duration", 2) == 0
-    said = capsys.readouterr()
-    assert said.out.startswith(f"{out}: 2.0 s, ")
-    assert "21 scans" in said.out
-    assert said.err == ""  # no terminal, no progress
+    printed = capsys.readouterr()
+    assert printed.out.startswith(f"{out}: 2.0 s, ")
+    assert "21 scans" in printed.out
+    assert printed.err == ""  # no terminal, no progress
     assert scenario_of(out).seed == 7
 
 
@@ -47,7 +47,7 @@ def test_summary_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert Scenario.from_dict(summary["scenario"]) == scenario_of(tmp_path / "x.mcap")
 
 
-def test_quiet_says_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(tmp_path / "x.mcap", "--world", "hall", "--duration", 0.5, "-q") == 0
     assert capsys.readouterr() == ("", "")
 
@@ -134,7 +134,7 @@ def test_words_that_are_no_numbers_are_wrong_use(
 
 
 @pytest.mark.parametrize("words", [[], ["x.mcap"], ["x.mcap", "--world", "office", "--scenario", "slip"]])
-def test_what_is_missing_is_said(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_missing_is_named(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*words) == 2
     assert capsys.readouterr().err.startswith("hsloc record: error: give ")
 

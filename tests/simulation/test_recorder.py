@@ -78,7 +78,7 @@ def test_what_is_read_is_what_was_simulated(recorded: tuple[Path, Recording]) ->
         np.testing.assert_allclose(written.points_base(), read.points_base(), atol=1e-9)
 
 
-def test_the_log_knows_its_map_its_start_and_its_scenario(recorded: tuple[Path, Recording]) -> None:
+def test_the_log_holds_its_map_its_start_and_its_scenario(recorded: tuple[Path, Recording]) -> None:
     path, recording = recorded
     log = open_log(path)
     grid, world = log.map(), built_in("office")
@@ -165,9 +165,9 @@ def test_memory_does_not_grow_with_the_drive() -> None:
     assert peaks[1] < 1.1 * peaks[0] + 20_000
 
 
-def test_progress_is_told_seconds_and_metres(tmp_path: Path) -> None:
-    told = []
-    record(SHORT, tmp_path / "x.mcap", progress=lambda seconds, metres: told.append((seconds, metres)))
-    assert [round(seconds) for seconds, _ in told] == [1, 2, 3, 4]
-    assert told[0][1] < 0.01  # it stands still at first
+def test_progress_is_reported_in_seconds_and_metres(tmp_path: Path) -> None:
+    reported = []
+    record(SHORT, tmp_path / "x.mcap", progress=lambda seconds, metres: reported.append((seconds, metres)))
+    assert [round(seconds) for seconds, _ in reported] == [1, 2, 3, 4]
+    assert reported[0][1] < 0.01  # it stands still at first
     assert isinstance(built_in("office").start(), Pose2)

@@ -1,4 +1,4 @@
-"""The fixture recordings are what their README says, and are made again by its commands."""
+"""The fixture recordings are what their README describes, and are made again by its commands."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_checksums(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_recorded_anew_by_its_command(name: str, tmp_path: Path) -> None:
+def test_recorded_again_by_its_command(name: str, tmp_path: Path) -> None:
     """The same messages always; the same bytes wherever the same zstd packs them."""
     if os.environ.get("NUMBA_DISABLE_JIT") == "1" and name != "paper":
         pytest.skip("a hundred million rays and walls take minutes without the compiler")
@@ -74,7 +74,7 @@ def _contents(path: Path) -> tuple[Any, ...]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_they_hold_what_the_readme_says(name: str) -> None:
+def test_they_hold_what_the_readme_lists(name: str) -> None:
     world, seed, seconds = TABLE[name]
     log = open_log(FOLDER / f"{name}.mcap")
     metadata = log.metadata()["hsloc.scenario"]

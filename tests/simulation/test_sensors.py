@@ -1,4 +1,4 @@
-"""What the sensors see, against closed forms; their noise, against what was asked for."""
+"""What the sensors see, against closed forms; their noise, against its parameters."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 WAY = np.array([(1.0, 1.0), (2.0, 1.0)])
 ROOM = World("room", polygon([(0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (0.0, 4.0)]), WAY)
-NOBODY = np.empty((0, 3))
+NO_PEOPLE = np.empty((0, 3))
 IDEAL = Lidar(range_noise=0.0, range_step=1e-9)
 
 
@@ -29,7 +29,7 @@ def measure(
     sensor: Lidar | PointSensor,
     pose: NDArray[np.float64] | Pose2,
     world: World = ROOM,
-    legs: NDArray[np.float64] = NOBODY,
+    legs: NDArray[np.float64] = NO_PEOPLE,
     seed: int = 0,
 ) -> Scan:
     noise = SensorNoise(*(np.random.default_rng((seed, i)) for i in range(2)))
@@ -102,7 +102,7 @@ def test_out_of_range_is_inf_and_too_near_is_minus_inf() -> None:
     assert scan.ranges[scan.hits()].max() <= 3.0
 
 
-def test_noise_never_brings_back_what_is_out_of_range() -> None:
+def test_noise_never_returns_what_is_out_of_range() -> None:
     scans = [measure(Lidar(range_max=3.0, range_noise=0.2), Pose2(1.0, 2.0, 0.0), seed=seed) for seed in range(20)]
     truth = measure(IDEAL, Pose2(1.0, 2.0, 0.0)).ranges
     for scan in scans:

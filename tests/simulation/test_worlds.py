@@ -112,7 +112,7 @@ def test_a_world_from_a_map_has_the_borders_of_its_cells_for_walls(tmp_path: Pat
     assert world.distance_to_walls(dense).min() > 0.3
 
 
-def test_a_map_that_says_free_where_it_means_unknown_is_noted(tmp_path: Path) -> None:
+def test_a_map_that_marks_unknown_as_free_has_a_note(tmp_path: Path) -> None:
     grid = OccupancyGrid(np.pad(np.zeros((40, 40), dtype=np.int8), 10, constant_values=-1), 0.1)
     grid.cells[10, 10:50] = 100
     yaml = save_map(grid, tmp_path / "m")
@@ -158,7 +158,7 @@ def test_a_world_of_points_is_seen_through_walls(tmp_path: Path) -> None:
         ("0 0 nan 1\n", r"line 1: .* not finite"),
     ],
 )
-def test_a_text_that_is_no_world_says_where(tmp_path: Path, text: str, message: str) -> None:
+def test_a_text_that_is_no_world_is_refused_with_its_line(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / "w.txt"
     file.write_text(text)
     with pytest.raises(ConfigError, match=message) as caught:

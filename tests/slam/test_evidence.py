@@ -43,7 +43,7 @@ def stretches(sigma: np.ndarray, normalised: np.ndarray) -> Stretches:
     return Stretches(ends, np.zeros((3, 3)), normalised, sigma, np.zeros(3), np.full(3, np.inf))
 
 
-def test_slips_and_stretches_in_which_none_would_be_noticed_are_named(lap: Recorded) -> None:
+def test_slips_and_stretches_in_which_none_would_be_detected_are_named(lap: Recorded) -> None:
     sigma, normalised = np.array((0.02, 0.15, 0.02)), np.array((9.0, 6.0, 12.0))
     (reason,) = weigh(replace(lap, stretches=stretches(sigma, normalised))).reasons
     assert reason.code == "slip"
@@ -84,9 +84,9 @@ def test_refused_steps_that_no_loop_spans_are_named(lap: Recorded) -> None:
     assert codes(replace(once, loops=np.array([(10, 110), (20, 120)]))) == ("good", [])
 
 
-@pytest.mark.parametrize(("counts", "codes_wanted"), [((90.0, 5.0), []), ((60.0, 60.0), ["open-joint"])])
+@pytest.mark.parametrize(("counts", "expected"), [((90.0, 5.0), []), ((60.0, 60.0), ["open-joint"])])
 def test_scans_around_refused_steps_may_agree_after_all(
-    lap: Recorded, counts: tuple[float, float], codes_wanted: list[str]
+    lap: Recorded, counts: tuple[float, float], expected: list[str]
 ) -> None:
     refused = lap.refused.copy()
     refused[150:153] = True
@@ -96,15 +96,15 @@ def test_scans_around_refused_steps_may_agree_after_all(
         pairs=np.vstack((lap.pairs, (149, 154))),
         counts=np.vstack((lap.counts, (*counts, 150.0, 0.0, 90.0))),
     )
-    assert codes(around)[1] == codes_wanted
+    assert codes(around)[1] == expected
 
 
 @pytest.mark.parametrize(
-    ("sigma", "conflict", "wanted"),
+    ("sigma", "conflict", "expected"),
     [(0.01, 1.0, []), (0.1, 1.0, ["open-joint", "odometry"]), (0.01, 60.0, ["open-joint", "odometry"])],
 )
 def test_a_slip_that_the_scans_measured_step_by_step_is_no_doubt(
-    lap: Recorded, sigma: float, conflict: float, wanted: list[str]
+    lap: Recorded, sigma: float, conflict: float, expected: list[str]
 ) -> None:
     """The scans contradict the odometry over 20 steps, longer than any pair of keyscans, and agree with each other."""
     refused, odometry = lap.refused.copy(), lap.poses.copy()
@@ -123,7 +123,7 @@ def test_a_slip_that_the_scans_measured_step_by_step_is_no_doubt(
             np.array([(110, 190)]), np.zeros((1, 3)), np.array((9.0,)), np.array((sigma,)), np.zeros(1), np.zeros(1)
         ),
     )
-    assert codes(slipped)[1] == wanted
+    assert codes(slipped)[1] == expected
 
 
 def test_one_refused_step_matters_if_it_may_hide_much(lap: Recorded) -> None:
@@ -157,7 +157,7 @@ def test_a_refused_scan_that_does_not_fit_is_named_and_condemns_no_map(lap: Reco
     assert (found.verdict, len(found.stray_scans)) == ("good", 1)
 
 
-def test_odometry_that_contradicts_is_told_where_no_loop_spans(lap: Recorded) -> None:
+def test_odometry_that_contradicts_is_reported_where_no_loop_spans(lap: Recorded) -> None:
     odometry = lap.poses.copy()
     odometry[150:, 0] += 8.0
     assert codes(replace(lap, odometry=odometry)) == ("check", ["odometry"])
@@ -167,11 +167,11 @@ def test_odometry_that_contradicts_is_told_where_no_loop_spans(lap: Recorded) ->
     assert codes(replace(lap, odometry=None)) == ("good", [])
 
 
-def test_loops_that_contradict_each_other_are_told(lap: Recorded) -> None:
+def test_loops_that_contradict_each_other_are_reported(lap: Recorded) -> None:
     assert codes(replace(lap, torn=np.array([(20, 120), (30, 140)]))) == ("check", ["torn-loop"])
 
 
-def test_what_the_lidar_did_not_see_is_told(lap: Recorded) -> None:
+def test_what_the_lidar_did_not_see_is_reported(lap: Recorded) -> None:
     motions = lap.motions.copy()
     motions[60:70, 0] = 3.0
     assert codes(replace(lap, motions=motions)) == ("check", ["blind"])

@@ -38,6 +38,6 @@ def test_a_pass_uses_what_the_one_before_found_of_scans_that_did_not_move() -> N
     np.testing.assert_allclose(changed.poses, afresh.poses, atol=3e-3)
 
 
-def test_a_crowd_of_nobody_is_refused() -> None:
+def test_a_registration_of_no_scans_is_refused() -> None:
     with pytest.raises(ConfigError, match="max_scans_per_view is 0; it must be from 1"):
         JointRegistrationParameters(max_scans_per_view=0)

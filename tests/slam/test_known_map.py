@@ -44,7 +44,7 @@ def test_a_lap_in_a_known_building_adds_nothing(laps: tuple[Events, Trajectory])
     """The map is solved after 480 keyscans, and again as it is left; at both times the path leaves it with a gap."""
     events, truth = laps
     mapper = Mapper(GraphMapperParameters(solve_after=480), np.random.default_rng(0))
-    said = [mapper.update(event) for event in events]
+    estimates = [mapper.update(event) for event in events]
     result = mapper.finish()
     quality = result.quality
     assert quality.followed > 100
@@ -52,7 +52,9 @@ def test_a_lap_in_a_known_building_adds_nothing(laps: tuple[Events, Trajectory])
     assert ape_rmse(events, result.scan_poses, truth) < 0.01
     assert result.evidence.verdict == "good"
     assert [loop.reason for loop in result.loops if loop.accepted and loop.reason] == ["left the known map"] * 2
-    scans = [(event, estimate) for event, estimate in zip(events, said, strict=True) if isinstance(event, PairedScan)]
+    scans = [
+        (event, estimate) for event, estimate in zip(events, estimates, strict=True) if isinstance(event, PairedScan)
+    ]
     lap = [estimate for event, estimate in scans if seconds(event, events) > _LAP_S + 5.0]
     assert sum(estimate.status is Status.MATCHED for estimate in lap) > 0.4 * len(lap), "every second one"
     matched = [estimate.covariance for estimate in lap if estimate.status is Status.MATCHED]
@@ -64,7 +66,7 @@ def test_a_lap_in_a_known_building_adds_nothing(laps: tuple[Events, Trajectory])
     assert late.max() < 0.03
 
 
-def test_a_known_map_knows_where_it_is_known() -> None:
+def test_a_known_map_has_the_places_where_it_is_known() -> None:
     angles = np.linspace(-np.pi, np.pi, 360, endpoint=False)
     ranges = (3.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))).astype(np.float32)
     points = (ranges[:, None] * np.column_stack((np.cos(angles), np.sin(angles)))).astype(np.float32)

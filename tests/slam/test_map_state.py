@@ -54,7 +54,7 @@ def changed(path: Path, **arrays: NDArray[Any] | np.int64) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("spoil", "expected"),
     [
         (lambda path: path.write_bytes(b"P5 not at all"), "not a saved map"),
         (lambda path: path.write_bytes(path.read_bytes()[:5000]), "not a saved map"),
@@ -68,13 +68,13 @@ def changed(path: Path, **arrays: NDArray[Any] | np.int64) -> None:
         (lambda path: changed(path, points=np.zeros((3, 2))), "points"),
     ],
 )
-def test_files_that_are_no_saved_map_are_told_in_one_line(
-    state: MapState, tmp_path: Path, spoil: Callable[..., Any], said: str
+def test_files_that_are_no_saved_map_are_refused_in_one_line(
+    state: MapState, tmp_path: Path, spoil: Callable[..., Any], expected: str
 ) -> None:
     path = tmp_path / "map.npz"
     write_state(state, path)
     spoil(path)
-    with pytest.raises(MapError, match=said) as error:
+    with pytest.raises(MapError, match=expected) as error:
         read_state(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 def mapped(events: Any, parameters: Any = None, seed: int = 0) -> Any:
     mapper = Mapper(parameters or GraphMapperParameters(), np.random.default_rng(seed))
-    said = [mapper.update(event) for event in events]
-    return mapper.finish(), said
+    estimates = [mapper.update(event) for event in events]
+    return mapper.finish(), estimates
 
 
 def scans_of(events: Any) -> Any:
@@ -43,9 +43,9 @@ def loop_map(loop: Any) -> Any:
 
 def test_the_office_is_mapped_to_the_centimetre(office: Any, office_map: Any) -> None:
     events, truth = office
-    result, said = office_map
+    result, estimates = office_map
     assert ape_rmse(events, result.scan_poses, truth) < 0.02
-    matched = [estimate for estimate in said if estimate.status is Status.MATCHED]
+    matched = [estimate for estimate in estimates if estimate.status is Status.MATCHED]
     assert len(matched) > 0.8 * len(scans_of(events))
     assert all(estimate.fitness is not None and estimate.covariance is not None for estimate in matched)
     assert result.quality.residual_median < 0.04
@@ -54,9 +54,9 @@ def test_the_office_is_mapped_to_the_centimetre(office: Any, office_map: Any) ->
 
 def test_every_event_has_its_pose_in_the_order_of_the_log(office: Any, office_map: Any) -> None:
     events, _ = office
-    result, said = office_map
+    result, estimates = office_map
     messages = [event for event in events if isinstance(event, Odometry)]
-    assert len(said) == len(events)
+    assert len(estimates) == len(events)
     assert result.odometry_poses.shape == (len(messages), 3)
     assert result.scan_poses.shape == (len(scans_of(events)), 3)
     assert [k for k, _ in result.revision] == list(range(len(messages)))
@@ -79,11 +79,11 @@ def test_the_grid_shows_walls_free_and_unknown(office_map: Any) -> None:
 
 def test_a_long_loop_is_closed_without_a_wrong_one(loop: Any, loop_map: tuple[MappingResult, list[Estimate]]) -> None:
     events, truth = loop
-    result, said = loop_map
+    result, estimates = loop_map
     assert result.quality.loops >= 1
     assert ape_rmse(events, result.scan_poses, truth) <= 0.05
     online = np.array(
-        [e.T_map_base.to_array() for e, event in zip(said, events, strict=True) if isinstance(event, PairedScan)]
+        [e.T_map_base.to_array() for e, event in zip(estimates, events, strict=True) if isinstance(event, PairedScan)]
     )
     assert ape_rmse(events, online, truth) > ape_rmse(events, result.scan_poses, truth)
 
@@ -120,7 +120,7 @@ def test_the_noise_of_points_is_found_behind_robust_weights(sigma: float) -> Non
     assert abs(noise_of(rms, 0.15, 0.05) / sigma - 1.0) < 0.03
 
 
-def test_loops_say_why_they_were_refused(loop_map: Any) -> None:
+def test_loops_have_the_reason_of_their_refusal(loop_map: Any) -> None:
     result, _ = loop_map
     for loop in result.loops:
         assert loop.accepted == (loop.reason == "")
@@ -139,10 +139,10 @@ def test_the_same_seed_gives_the_same_bytes(office: Any, office_map: Any) -> Non
 def test_without_odometry_a_constant_velocity_predicts(office: Any) -> None:
     events, truth = office
     scans = [PairedScan(event.scan, IDENTITY) for event in scans_of(events)]
-    result, said = mapped(scans, GraphMapperParameters(use_odometry=False))
+    result, estimates = mapped(scans, GraphMapperParameters(use_odometry=False))
     assert ape_rmse(events, result.scan_poses, truth) < 0.03
     assert result.revision == ()
-    assert sum(estimate.status is Status.MATCHED for estimate in said) > 0.9 * len(said)
+    assert sum(estimate.status is Status.MATCHED for estimate in estimates) > 0.9 * len(estimates)
 
 
 def test_odometry_that_is_not_to_be_used_is_not_used(office: Any) -> None:
@@ -163,8 +163,8 @@ def test_a_stretch_without_returns_is_bridged(office: Any) -> None:
         else event
         for event in events
     ]
-    result, said = mapped(blind)
-    skipped = [estimate for estimate in said if estimate.status is Status.NO_RETURNS]
+    result, estimates = mapped(blind)
+    skipped = [estimate for estimate in estimates if estimate.status is Status.NO_RETURNS]
     assert skipped
     assert all("0 returns" in estimate.reason for estimate in skipped)
     assert ape_rmse(events, result.scan_poses, truth) < 0.1
@@ -184,7 +184,7 @@ def test_a_slip_along_a_corridor_is_found_and_mended(loop: Any) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_in_a_corridor_of_twins_no_wrong_loop_is_closed(seed: Any) -> None:
+def test_in_a_corridor_of_equal_rooms_no_wrong_loop_is_closed(seed: Any) -> None:
     events, truth = drive("symmetric-corridor", seed=seed)
     result, _ = mapped(events, seed=seed)
     assert ape_rmse(events, result.scan_poses, truth) < 0.3, "a wrong loop is 5 m off or more"
@@ -195,7 +195,7 @@ def test_in_a_corridor_of_twins_no_wrong_loop_is_closed(seed: Any) -> None:
 def test_next_to_nothing_is_no_error(office: Any, what: Any) -> None:
     events, _ = office
     scan = scans_of(events)[0]
-    told = {
+    inputs = {
         "nothing": [],
         "odometry": [event for event in events if isinstance(event, Odometry)][:20],
         "no returns": [
@@ -205,9 +205,9 @@ def test_next_to_nothing_is_no_error(office: Any, what: Any) -> None:
         "one scan": [scan],
         "standing": [scan] * 5,
     }[what]
-    result, said = mapped(told)
-    assert len(said) == len(told)  # type: ignore[arg-type]
-    assert len(result.scan_poses) + len(result.odometry_poses) == len(told)  # type: ignore[arg-type]
+    result, estimates = mapped(inputs)
+    assert len(estimates) == len(inputs)  # type: ignore[arg-type]
+    assert len(result.scan_poses) + len(result.odometry_poses) == len(inputs)  # type: ignore[arg-type]
     assert result.quality.keyscans == (1 if what in ("one scan", "standing") else 0)
     assert to_json(result.quality)["loop_max"] is None
 

@@ -32,9 +32,9 @@ def mapper() -> PointMapper:
 
 def test_the_first_scan_is_the_map(mapper: PointMapper) -> None:
     points = np.array([(5.0, 0.0), (0.0, 8.0), (-3.0, -3.0), (7.0, 7.0)])
-    said = mapper.update(PairedScan(scan_of(points), Pose2()))
-    assert said.T_map_base == Pose2(10.0, 5.0, 0.2)
-    assert said.status is Status.MATCHED
+    found = mapper.update(PairedScan(scan_of(points), Pose2()))
+    assert found.T_map_base == Pose2(10.0, 5.0, 0.2)
+    assert found.status is Status.MATCHED
     assert len(mapper.points) == 4
     np.testing.assert_allclose(np.sort(mapper.points, axis=0), np.sort(Pose2(10, 5, 0.2) @ points, axis=0), atol=0.1)
 
@@ -43,9 +43,9 @@ def test_only_points_far_from_the_map_are_added(mapper: PointMapper) -> None:
     points = np.array([(5.0, 0.0), (0.0, 8.0), (-3.0, -3.0), (7.0, 7.0), (-9.0, 2.0), (4.0, -8.0)])
     mapper.update(PairedScan(scan_of(points), Pose2()))
     more = np.concatenate((points, [(20.0, 6.0), (5.9, 0.3)]))
-    said = mapper.update(PairedScan(scan_of(more, 10**8), Pose2()))
-    assert said.fitness is not None
-    assert said.fitness > 0.5
+    found = mapper.update(PairedScan(scan_of(more, 10**8), Pose2()))
+    assert found.fitness is not None
+    assert found.fitness > 0.5
     assert len(mapper.points) == 7
     np.testing.assert_allclose(mapper.points[-1], Pose2(10, 5, 0.2) @ np.array((20.0, 6.0)), atol=0.4)
 
@@ -54,16 +54,16 @@ def test_a_scan_that_does_not_fit_adds_nothing(mapper: PointMapper) -> None:
     random = np.random.default_rng(2)
     mapper.update(PairedScan(scan_of(random.uniform(5, 9, (30, 2))), Pose2()))
     before = len(mapper.points)
-    said = mapper.update(PairedScan(scan_of(-random.uniform(15, 40, (30, 2))), Pose2()))
+    found = mapper.update(PairedScan(scan_of(-random.uniform(15, 40, (30, 2))), Pose2()))
     assert len(mapper.points) == before
-    assert "nothing added" in said.reason
+    assert "nothing added" in found.reason
 
 
 def test_too_few_points_leave_the_prediction(mapper: PointMapper) -> None:
     mapper.update(PairedScan(scan_of(np.array([(5.0, 0.0), (0.0, 8.0), (-3.0, -3.0)])), Pose2()))
-    said = mapper.update(PairedScan(scan_of(np.array([(5.0, 0.0), (0.0, 8.0)])), Pose2(1.0, 0.0, 0.0)))
-    assert said.status is Status.NO_RETURNS
-    assert said.T_map_base.distance(Pose2(10, 5, 0.2) @ Pose2(1.0, 0.0, 0.0)) < 1e-12
+    found = mapper.update(PairedScan(scan_of(np.array([(5.0, 0.0), (0.0, 8.0)])), Pose2(1.0, 0.0, 0.0)))
+    assert found.status is Status.NO_RETURNS
+    assert found.T_map_base.distance(Pose2(10, 5, 0.2) @ Pose2(1.0, 0.0, 0.0)) < 1e-12
     assert mapper.grid().occupied().sum() == 3
 
 
@@ -72,9 +72,9 @@ def test_the_reports_experiment_is_bettered() -> None:
     sensor = replace(preset("paper").sensor, range_max=60.0)
     events, truth = drive("paper", seed=1, sensor=sensor, odometry=SteeringNoise(0.2, np.radians(1.0)))
     mapper = PointMapper(Hide(), PointMapperParameters(), np.random.default_rng(1), Pose2.from_array(truth.poses[0]))
-    said = [mapper.update(event) for event in events]
-    stamps = np.array([estimate.stamp_ns for estimate in said])
-    errors = np.array([estimate.T_map_base.to_array() for estimate in said]) - truth.interpolated(
+    found = [mapper.update(event) for event in events]
+    stamps = np.array([estimate.stamp_ns for estimate in found])
+    errors = np.array([estimate.T_map_base.to_array() for estimate in found]) - truth.interpolated(
         np.clip(stamps, truth.stamps_ns[0], truth.stamps_ns[-1])
     )
     errors[:, 2] = (errors[:, 2] + np.pi) % (2 * np.pi) - np.pi

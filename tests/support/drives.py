@@ -20,9 +20,11 @@ if TYPE_CHECKING:
 def drive(scenario: str, **changes: Any) -> tuple[list[Odometry | PairedScan], Trajectory]:
     """Events of a drive as the mapper gets them, and the truth."""
     setting = replace(preset(scenario), **changes)
-    told = list(pair(events(setting, load_world(setting.world, None))))
-    truth = Trajectory.from_pairs([(event.stamp_ns, event.T_map_base) for event in told if isinstance(event, Truth)])
-    return [event for event in told if not isinstance(event, Truth)], truth
+    recorded = list(pair(events(setting, load_world(setting.world, None))))
+    truth = Trajectory.from_pairs(
+        [(event.stamp_ns, event.T_map_base) for event in recorded if isinstance(event, Truth)]
+    )
+    return [event for event in recorded if not isinstance(event, Truth)], truth
 
 
 def ape_rmse(events: list[Odometry | PairedScan], poses: NDArray[np.float64], truth: Trajectory) -> float:

@@ -89,7 +89,7 @@ def drive(waypoints: Any, *, speed: float = 0.6, rate_hz: float = 50.0, start_ns
 
 
 def odometry_of(rng: Any, path: Any, *, drift: float = 0.02) -> Any:
-    """What the wheels say: each step with a noise and a bias, from the origin."""
+    """The odometry of wheels: each step with a noise and a bias, from the origin."""
     deltas = relative_poses(path.poses[:-1], path.poses[1:])
     deltas[:, 0] *= 1.0 + drift * 0.5
     deltas[:, 2] += rng.normal(drift * 0.01, 0.002, len(deltas))

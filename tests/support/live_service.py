@@ -48,11 +48,11 @@ def submit(client: Any, content: bytes = b"ok", **request: Any) -> str:
 
 def wait(client: Any, job: str, seconds: float = 20.0, states: tuple[str, ...] = ()) -> dict[str, Any]:
     """The job when it has ended (or is in one of the states)."""
-    wanted = states or ("succeeded", "failed", "crashed", "cancelled")
+    ends = states or ("succeeded", "failed", "crashed", "cancelled")
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         found: dict[str, Any] = client.get(f"/v1/jobs/{job}").json()
-        if found["state"] in wanted:
+        if found["state"] in ends:
             return found
         time.sleep(0.03)
     raise AssertionError(f"job is still {found['state']} after {seconds} s: {found}")

@@ -24,7 +24,7 @@ MOUNTING = Pose2(0.2, 0.0, 0.5)
 
 
 def make_scan(stamp_ns: int, number: int = 0, beams: int = 8, frame: str = "laser") -> Scan:
-    """A scan that can be told from all others by its first range."""
+    """A scan that is identified by its first range."""
     ranges = np.full(beams, 2.0, dtype=np.float32)
     ranges[0] = 1.0 + number / 1000.0
     return Scan(stamp_ns, ranges, -1.0, 0.25, 0.05, 12.0, frame_id=frame)
@@ -120,7 +120,7 @@ def flipped(data: bytes, at: int) -> bytes:
 
 
 def describe(event: Event) -> tuple[str, int, float]:
-    """(kind, stamp, a number that tells events of a kind apart)."""
+    """(kind, stamp, a number that identifies events of a kind)."""
     if isinstance(event, Scan):
         return "scan", event.stamp_ns, round(float(event.ranges[0]), 4)
     if isinstance(event, Odometry):

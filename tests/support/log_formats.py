@@ -126,7 +126,7 @@ def bag1(source: Path, target: Path) -> Path:
 
 
 def bag2(source: Path, target: Path, compression: str = "", storage: StoragePlugin = StoragePlugin.SQLITE3) -> Path:
-    """As a folder with a ROS 2 bag in SQLite, compressed as `FILE` or `MESSAGE` if asked for."""
+    """As a folder with a ROS 2 bag in SQLite, compressed as `FILE` or `MESSAGE`, or not."""
     bag = Writer2(target, version=8, storage_plugin=storage)
     if compression:
         bag.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
@@ -157,7 +157,7 @@ def _pose(x: float, y: float, rotation: tuple[float, ...]) -> dict[str, Any]:
 
 
 def to_foxglove(typename: str, data: bytes) -> tuple[str, dict[str, Any]] | None:
-    """(type, content) of the message that says the same, if there is one."""
+    """(type, content) of the equivalent message, if there is one."""
     if typename == definitions.LASER_SCAN:
         scan = decode.laser_scan(data)
         return "foxglove.LaserScan", {
@@ -189,7 +189,7 @@ def to_foxglove(typename: str, data: bytes) -> tuple[str, dict[str, Any]] | None
 
 
 def foxglove_mcap(source: Path, target: Path, encoding: str, single_transforms: bool = False) -> Path:
-    """As MCAP of Foxglove's messages in `json` or `protobuf`; each transform on its own if asked for."""
+    """As MCAP of Foxglove's messages in `json` or `protobuf`; each transform on its own, or all in one."""
 
     def items() -> Iterator[Message]:
         for schema, channel, log_time, data in messages(source):

@@ -1,4 +1,4 @@
-"""Slow, obvious twins of the kernels, and small worlds to try things in. Nothing here is fast, all of it is plain."""
+"""Slow, obvious versions of the kernels, and small worlds to try things in."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The slow, obvious twin of hsloc.kernels.raycasting: every ray against every shape, by solving for both."""
+"""The slow, obvious version of hsloc.kernels.raycasting: every ray against every shape, by solving for both."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tests of the localiser share: a small map, events, and a matcher whose answers are written down."""
+"""What the tests of the localiser share: a small map, events, and a matcher with scripted results."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def odometry(x: float, stamp_s: float) -> Odometry:
 
 
 class ScriptedMatcher:
-    """Answers with the next fitness of a list, at the window's centre moved by `offset`; notes each window."""
+    """Answers with the next fitness of a list, at the window's centre moved by `offset`; records each window."""
 
     def __init__(self, fitness: Sequence[float], offset: Pose2 = IDENTITY) -> None:
         self.fitness = list(fitness)
@@ -58,7 +58,7 @@ class ScriptedMatcher:
 def localiser(
     matcher: Matcher, start: Pose2 | None = IDENTITY, grid: OccupancyGrid | None = None, **changes: Any
 ) -> Localiser:
-    """A localiser that asks the matcher for every match; in a room unless a grid is given."""
+    """A localiser that calls the matcher for every match; in a room unless a grid is given."""
     chosen = room() if grid is None else grid
     field = LikelihoodField.from_grid(chosen)
     parameters = replace(LocaliserParameters(refine_first=False), **changes)

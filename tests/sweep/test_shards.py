@@ -175,7 +175,7 @@ def test_a_run_at_a_url_is_done_again_where_the_log_has_changed_or_it_is_not_who
     folder = tmp_path / "out" / "hall-default-seed0"
     assert not list(folder.glob(".*"))
     for name in ("timings.json", "sweep_key.json"):
-        (folder / name).unlink()  # a machine died while it wrote
+        (folder / name).unlink()  # a machine failed while it wrote
         assert (
             finished(plan(remote_logs(words[1]), {"default": Config()})[0], UrlFolder(f"file://{tmp_path}/out"), "")
             is None
@@ -186,16 +186,16 @@ def test_a_run_at_a_url_is_done_again_where_the_log_has_changed_or_it_is_not_who
 
 
 def test_urls_that_cannot_be_used_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def says(*words: str) -> str:
+    def error_of(*words: str) -> str:
         assert main(["sweep", *words, "-q"]) == 1
         return capsys.readouterr().err.removeprefix("hsloc: error: ").splitlines()[-1]
 
     out = ["--out", f"file://{tmp_path}/out"]
-    assert says(f"file://{tmp_path}/*.mcap", *out) == f"file://{tmp_path}/*.mcap: no log is there"
-    assert says(f"file://{tmp_path}/no.mcap", *out) == f"file://{tmp_path}/no.mcap: not found"
-    assert "Protocol not known: nothing" in says("nothing://x/*.mcap", *out)
+    assert error_of(f"file://{tmp_path}/*.mcap", *out) == f"file://{tmp_path}/*.mcap: no log is there"
+    assert error_of(f"file://{tmp_path}/no.mcap", *out) == f"file://{tmp_path}/no.mcap: not found"
+    assert "Protocol not known: nothing" in error_of("nothing://x/*.mcap", *out)
     (tmp_path / "file").touch()
-    assert "cannot be written" in says(str(OFFICE), "--end", "1", "--out", f"file://{tmp_path}/file/out")
+    assert "cannot be written" in error_of(str(OFFICE), "--end", "1", "--out", f"file://{tmp_path}/file/out")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").touch()
     with pytest.raises(OutputError, match="is in use for something else"):

@@ -141,11 +141,11 @@ def test_what_goes_wrong_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_run_that_ends_its_process_ends_no_other(tmp_path: Path) -> None:
     runs = plan([OFFICE], DEFAULT, range(3), read=SHORT)
     runs[1] = replace(runs[1], request=replace(runs[1].request, labels=(Bomb(),)))  # type: ignore[arg-type]
-    told: list[Any] = []
-    outcomes = sweep_in_processes(runs, tmp_path, 2, told.append)
+    reported: list[Any] = []
+    outcomes = sweep_in_processes(runs, tmp_path, 2, reported.append)
     assert states(outcomes) == [DONE, FAILED, DONE]
     assert outcomes[1].error.startswith("the process ended: ")
-    assert len(told) == 3
+    assert len(reported) == 3
     assert "NUMBA_NUM_THREADS" not in os.environ
 
 
@@ -176,7 +176,7 @@ def command(capsys: pytest.CaptureFixture[str], *argv: Path | str) -> tuple[int,
     return code, printed.out, printed.err
 
 
-def test_the_command_varies_what_it_is_told_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_varies_the_named_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = [OFFICE, "--out", tmp_path, "--end", "1.5", "--seeds", "5", "--vary", "hide.budget=100,200", "--json"]
     code, out, err = command(capsys, *arguments)  # type: ignore[arg-type]
     assert (code, err) == (0, "")
@@ -253,5 +253,5 @@ def test_an_interrupt_ends_a_sweep_with_one_line(tmp_path: Path, after_s: Any) -
     time.sleep(after_s)
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=120)
-    assert process.returncode in (130, -signal.SIGINT)  # a shell says 130 to both
+    assert process.returncode in (130, -signal.SIGINT)  # a shell reports 130 for both
     assert err == "hsloc: interrupted\n"

@@ -40,7 +40,7 @@ def test_turtlebot_from_an_unknown_start(data: Path, log: Any) -> None:
     found = run(request)
     assert found.localised.all()
     metrics = analyse(found).metrics
-    # The stamps of this robot's lidar are a tenth of a second late, which is the one thing to say against the result.
+    # The stamps of this robot's lidar are a tenth of a second late, which is the only fault of the result.
     (offset,) = metrics.warnings[len(found.warnings) :]
     assert metrics.warnings[: len(found.warnings)] == found.warnings
     assert offset.code.startswith("clock_offset")

@@ -107,15 +107,15 @@ def test_all_forms_of_a_map_can_be_localised_in(first: tuple[Result, Path]) -> N
         assert np.sqrt((errors**2).mean()) < 0.05
 
 
-def test_mistakes_are_told(first: tuple[Result, Path], tmp_path: Path) -> None:
+def test_mistakes_are_reported(first: tuple[Result, Path], tmp_path: Path) -> None:
     _, folder = first
     wrong: dict[str, Any]
-    for wrong, said in (
+    for wrong, expected in (
         ({"resume": tmp_path}, "no map.npz there"),
         ({"resume": OFFICE}, "not a saved map"),
         ({"map_path": tmp_path}, "without a map.yaml"),
     ):
-        with pytest.raises(HslocError, match=said):
+        with pytest.raises(HslocError, match=expected):
             run(RunRequest(logs=(OFFICE,), **wrong))  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="leave out one"):
         RunRequest(logs=(OFFICE,), resume=folder, map_path=folder)

@@ -30,7 +30,7 @@ def written(path: Path, lines: list[str], head: str = "") -> LoadedTrajectory:
 
 
 def check(found: LoadedTrajectory, poses: NDArray[np.float64] = PATH) -> str:
-    """The poses are right; returns what the reader says about them."""
+    """The poses are right; returns the reader's notes about them."""
     np.testing.assert_array_equal(found.trajectory.stamps_ns, STAMPS)
     np.testing.assert_allclose(found.trajectory.poses[:, :2], poses[:, :2], atol=1e-9)
     np.testing.assert_allclose(wrap_angles(found.trajectory.poses[:, 2] - poses[:, 2]), 0.0, atol=1e-9)

@@ -50,7 +50,7 @@ def test_no_stamp(text: str) -> None:
         parse_stamp(text)
 
 
-def test_the_text_is_what_evo_asks_for() -> None:
+def test_the_text_is_what_evo_reads() -> None:
     text = format_tum(Trajectory(np.array([1, 2_000_000_000]), np.array([[1.5, -2.0, 0.0], [-0.0, 0.0, np.pi / 2]])))
     first, second = text.splitlines()
     assert first == "0.000000001 1.500000000000 -2.000000000000 0 0 0 0.000000000000 1.000000000000"

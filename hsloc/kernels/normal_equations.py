@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit
 
-from hsloc.kernels.point_to_line import ScanArrays, Term, pair_terms
+from hsloc.kernels.point_to_line import PairTerm, ScanArrays, Term, pair_terms
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -135,6 +135,8 @@ class PairTerms(NamedTuple):
     """Shape (m, 3)."""
     counts: F64
     """Shape (m, 5), as in `pair_terms`, the sum over both directions."""
+    observed: F64
+    """Information by the normals of both scans, as in `PairTerm`, shape (m, 3, 3)."""
 
 
 @njit(cache=True, nogil=True)
@@ -173,7 +175,10 @@ def evaluate_pairs(
     A pair that has hardly moved since it was evaluated `before`, with the same gate, keeps its points: its gradient
     changes by its information.
     """
-    one = Term(np.empty((3, 3)), np.empty(3))
+    one = PairTerm(np.empty((3, 3)), np.empty(3), np.empty((3, 3)))
+    term = Term(one.information, one.gradient)
+    of_both = Term(one.observed, np.zeros(3))
+    none = np.zeros(3)
     rel = np.empty(3)
     back = np.empty(3)
     tally = np.empty(5)
@@ -194,10 +199,12 @@ def evaluate_pairs(
         pair_terms(i, j, rel, scans, gate, scale, one, tally)
         terms.information[m] = one.information
         terms.gradient[m] = one.gradient
+        terms.observed[m] = one.observed
         terms.counts[m] = tally
         relative(poses[i], poses[j], back)
         pair_terms(j, i, back, scans, gate, scale, one, tally)
-        add_inverse_term(rel, one, terms.information[m], terms.gradient[m])
+        add_inverse_term(rel, term, terms.information[m], terms.gradient[m])
+        add_inverse_term(rel, of_both, terms.observed[m], none)
         terms.counts[m] += tally
         before.at[m] = rel
         before.gradient[m] = terms.gradient[m]

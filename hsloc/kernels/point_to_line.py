@@ -28,6 +28,9 @@ _MOST_NEIGHBOURS = 16
 """Maximum number of hits on each side of a hit. Internal: bounds the time where beams are dense."""
 MOST_BEAMS = 4
 """Maximum number of beams on each side of a point's own beam. Internal: bounds the time where beams are dense."""
+_NEXT_BUT_ONE = 1.4
+"""Least distance of a point to the beam next but one to its own, in distances between two beams there. Internal: the
+sine of one and a half angles; less than that for beams up to 20 degrees apart."""
 _DIRECTIONS = 16
 """Sectors of the normals among which hits are chosen. Internal: walls of one direction in each, 22.5 degrees."""
 SAME_FACE = 0.7
@@ -69,6 +72,19 @@ class Term(NamedTuple):
 
     information: F64
     gradient: F64
+
+
+class PairTerm(NamedTuple):
+    """What `pair_terms` writes: a `Term`, and the information that is `observed` by the normals of both scans (3, 3).
+
+    Each product in it is of the normals of both. The square of one normal holds the variance of its own noise: along a
+    bare corridor that alone looks like a measurement (errors in variables; both normals together are an instrument,
+    Fuller 1987). It may be indefinite where there is next to none.
+    """
+
+    information: F64
+    gradient: F64
+    observed: F64
 
 
 @njit(cache=True, nogil=True)
@@ -227,39 +243,55 @@ def beam_towards(x: float, y: float, zero_angle: float, increment: float) -> int
 
 
 @njit(cache=True, nogil=True, inline="always")
-def nearest_hit(x: float, y: float, j: int, low: int, high: int, scans: ScanArrays) -> tuple[int, float]:
-    """The hit of the beams `low` to `high` of scan j that is nearest to a point in its frame, and the squared distance.
+def nearest_hit(
+    x: float, y: float, middle: int, reach: int, spread: float, hit_of_beam: I32, points: F32
+) -> tuple[int, float]:
+    """The hit that is nearest to a point in the frame of a scan, and the squared distance.
 
-    Without a hit -1, and an infinite distance.
+    The scan is given by the hits of its beams and their `points`. The point is on the beam `middle`, where two beams
+    are `spread` metres apart; up to `reach` beams on either side are tried. Without a hit -1, and an infinite distance.
     """
-    first = scans.table_start[j]
-    hits = scans.start[j]
+    n = len(hit_of_beam)
     best = np.inf
     chosen = -1
-    for k in range(max(low, 0), min(high + 1, scans.table_start[j + 1] - first)):
-        row = scans.hit_of_beam[first + k]
+    for k in range(max(middle - 1, 0), min(middle + 2, n)):
+        row = hit_of_beam[k]
         if row >= 0:
-            ex = x - np.float64(scans.points[hits + row, 0])
-            ey = y - np.float64(scans.points[hits + row, 1])
+            ex = x - np.float64(points[row, 0])
+            ey = y - np.float64(points[row, 1])
             squared = ex * ex + ey * ey
             if squared < best:
                 best = squared
-                chosen = hits + row
+                chosen = row
+    # The point is one and a half beams or more from all others.
+    if reach == 1 or best < (_NEXT_BUT_ONE * spread) ** 2:
+        return chosen, best
+    for side in range(2):
+        low = middle - reach if side == 0 else middle + 2
+        high = middle - 1 if side == 0 else middle + reach + 1
+        for k in range(max(low, 0), min(high, n)):
+            row = hit_of_beam[k]
+            if row >= 0:
+                ex = x - np.float64(points[row, 0])
+                ey = y - np.float64(points[row, 1])
+                squared = ex * ex + ey * ey
+                if squared < best:
+                    best = squared
+                    chosen = row
     return chosen, best
 
 
 @njit(cache=True, nogil=True, inline="always")
-def ends_around(beam: int, j: int, scans: ScanArrays) -> tuple[int, float, float]:
-    """Of a beam of scan j and those next to it how many are known, and how near and how far these end (m).
+def ends_around(beam: int, ranges: F32) -> tuple[int, float, float]:
+    """Of a beam of a scan with these ranges and those next to it how many are known, how near and how far they end (m).
 
     A beam without a return ends at `_CLEARED`.
     """
-    first = scans.table_start[j]
     nearest = np.inf
     farthest = 0.0
     known = 0
-    for k in range(max(beam - 1, 0), min(beam + 2, scans.table_start[j + 1] - first)):
-        end = np.float64(scans.ranges[first + k])
+    for k in range(max(beam - 1, 0), min(beam + 2, len(ranges))):
+        end = np.float64(ranges[k])
         if end == np.inf:
             end = np.float64(_CLEARED)
         if end == end:
@@ -270,28 +302,35 @@ def ends_around(beam: int, j: int, scans: ScanArrays) -> tuple[int, float, float
 
 
 @njit(cache=True, nogil=True)
-def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: float, term: Term, counts: F64) -> None:
+def pair_terms(
+    i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: float, term: PairTerm, counts: F64
+) -> None:
     """Equations of scan i against scan j, the pose of i in j being `rel` (x, y, theta).
 
-    Overwrites `term`, information = sum w J^T J and gradient = sum w J^T r with the residuals r (m) and their
+    Overwrites `term`: information = sum w J^T J and gradient = sum w J^T r with the residuals r (m) and their
     derivatives by `rel`, weights w = 1 / (1 + r^2 / scale^2)^2 (Geman-McClure), and `counts` =
     (paired within `gate`, conflicts: points where j looked through, points in j's field of view, sum of w r^2, sum of
     w). Of scan i the chosen hits are used.
     """
-    points = scans.points
-    normals = scans.normals
-    centroids = scans.centroids
-    start = scans.start
-    table_start = scans.table_start
     geometry = scans.geometry
-    chosen_hits = scans.chosen_hits
-    chosen_start = scans.chosen_start
+    # Slices, taken once: each look into the tuple of arrays in a loop counts references.
+    own = slice(scans.start[i], scans.start[i + 1])
+    own_points = scans.points[own]
+    own_normals = scans.normals[own]
+    rows = scans.chosen_hits[scans.chosen_start[i] : scans.chosen_start[i + 1]]
+    hits = slice(scans.start[j], scans.start[j + 1])
+    points = scans.points[hits]
+    normals = scans.normals[hits]
+    centroids = scans.centroids[hits]
+    beams = slice(scans.table_start[j], scans.table_start[j + 1])
+    hit_of_beam = scans.hit_of_beam[beams]
+    ranges = scans.ranges[beams]
     rx = rel[0]
     ry = rel[1]
     rt = rel[2]
     c = cos(rt)
     s = sin(rt)
-    n_beams = table_start[j + 1] - table_start[j]
+    n_beams = len(ranges)
     laser_x = geometry[j, 0]
     laser_y = geometry[j, 1]
     zero_angle = geometry[j, 2] + geometry[j, 3]
@@ -302,14 +341,14 @@ def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: 
     paired = conflicts = seen = 0
     squares = weights = 0.0
     xx = xy = xt = yy = yt = tt = gx = gy = gt = 0.0
-    for q in range(chosen_start[i], chosen_start[i + 1]):
-        a = start[i] + chosen_hits[q]
-        mx = np.float64(normals[a, 0])
-        my = np.float64(normals[a, 1])
+    both_xx = both_xy = both_xt = both_yy = both_yt = both_tt = 0.0
+    for a in rows:
+        mx = np.float64(own_normals[a, 0])
+        my = np.float64(own_normals[a, 1])
         if mx == 0.0 and my == 0.0:
             continue
-        px = np.float64(points[a, 0])
-        py = np.float64(points[a, 1])
+        px = np.float64(own_points[a, 0])
+        py = np.float64(own_points[a, 1])
         dx = c * px - s * py
         dy = s * px + c * py
         x = rx + dx
@@ -323,10 +362,10 @@ def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: 
         depth = sqrt(lx * lx + ly * ly)
         # The hit nearest to the point, among the beams around its own.
         reach = min(int(gate / (depth * spacing + 1e-9)) + 1, MOST_BEAMS)
-        chosen, best = nearest_hit(x, y, j, middle - reach, middle + reach, scans)
+        chosen, best = nearest_hit(x, y, middle, reach, spacing * depth, hit_of_beam, points)
         if best > gate2:
             # Did j look through the point? Only where all three beams around it ended well behind it.
-            known, nearest, _ = ends_around(middle, j, scans)
+            known, nearest, _ = ends_around(middle, ranges)
             if known >= 2 and depth + THROUGH < nearest:
                 conflicts += 1
                 continue
@@ -335,7 +374,9 @@ def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: 
         nx = np.float64(normals[chosen, 0])
         ny = np.float64(normals[chosen, 1])
         # Both sides must have seen the same face of the wall; (0, 0), no surfel, fails here too.
-        if nx * (c * mx - s * my) + ny * (s * mx + c * my) < SAME_FACE:
+        ox = c * mx - s * my
+        oy = s * mx + c * my
+        if nx * ox + ny * oy < SAME_FACE:
             continue
         ex = x - np.float64(centroids[chosen, 0])
         ey = y - np.float64(centroids[chosen, 1])
@@ -360,6 +401,13 @@ def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: 
         gx += wx * r
         gy += wy * r
         gt += wt * r
+        ot = oy * dx - ox * dy
+        both_xx += wx * ox
+        both_xy += wx * oy + wy * ox
+        both_xt += wx * ot + wt * ox
+        both_yy += wy * oy
+        both_yt += wy * ot + wt * oy
+        both_tt += wt * ot
     information = term.information
     information[0, 0] = xx
     information[0, 1] = information[1, 0] = xy
@@ -367,6 +415,13 @@ def pair_terms(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: 
     information[1, 1] = yy
     information[1, 2] = information[2, 1] = yt
     information[2, 2] = tt
+    observed = term.observed
+    observed[0, 0] = both_xx
+    observed[0, 1] = observed[1, 0] = 0.5 * both_xy
+    observed[0, 2] = observed[2, 0] = 0.5 * both_xt
+    observed[1, 1] = both_yy
+    observed[1, 2] = observed[2, 1] = 0.5 * both_yt
+    observed[2, 2] = both_tt
     term.gradient[0] = gx
     term.gradient[1] = gy
     term.gradient[2] = gt

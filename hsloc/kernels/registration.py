@@ -16,7 +16,7 @@ from numba import njit
 
 from hsloc.kernels.levenberg_marquardt import solve_damped
 from hsloc.kernels.normal_equations import Blocks, PairTerms, add_relative_term, relative
-from hsloc.kernels.point_to_line import ScanArrays, Term, pair_terms
+from hsloc.kernels.point_to_line import PairTerm, ScanArrays, Term, pair_terms
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -95,7 +95,8 @@ def add_pairs(pose: F64, scene: Scene, gate: float, p: RegistrationParameters, t
     gradient = term.gradient
     moved = np.empty(3)
     rel = np.empty(3)
-    one = Term(np.empty((3, 3)), np.empty(3))
+    one = PairTerm(np.empty((3, 3)), np.empty(3), np.empty((3, 3)))
+    one_term = Term(one.information, one.gradient)
     tally = np.empty(5)
     ha = np.empty((3, 3))
     away = np.zeros((3, 3))
@@ -130,9 +131,9 @@ def add_pairs(pose: F64, scene: Scene, gate: float, p: RegistrationParameters, t
                     for b in range(3):
                         one.information[a, b] *= p.weight
                 if direction == 0:
-                    add_relative_term(scan_poses[m], rel, one, onto_second, ha)
+                    add_relative_term(scan_poses[m], rel, one_term, onto_second, ha)
                 else:
-                    add_relative_term(moved, rel, one, onto_first, ha)
+                    add_relative_term(moved, rel, one_term, onto_first, ha)
         # From the moved scan's pose to `pose`: x and y shift with it, theta also swings the scan around it.
         information += block
         for a in range(3):

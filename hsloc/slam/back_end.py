@@ -98,7 +98,7 @@ def finish_session(
     edges = Edges.concatenate([gathered.steps, loop_edges])
     arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
     refined, passes = _refine(poses, arrays, edges, parameters, lambda part: report(0.5 + 0.4 * part))
-    observed = observed_terms(refined, arrays)
+    observed = observed_terms(refined)
     stretches = compare_with_odometry(refined, gathered.steps, arrays, observed)
     if parameters.use_odometry and stretches.contradicted.any():
         steps = without_slips(gathered.steps, stretches.slipped(len(gathered.steps)))
@@ -106,7 +106,7 @@ def finish_session(
         edges = Edges.concatenate([steps, loop_edges])
         refined, more = _refine(refined.poses, arrays, edges, _near_the_end(parameters), _silent, refined)
         passes += more
-        observed = observed_terms(refined, arrays)
+        observed = observed_terms(refined)
     covariances = marginal_covariances(refined, observed, edges)
     grid = build_grid(refined.poses, gathered.scans, parameters.occupancy)
     report(1.0)

@@ -138,7 +138,8 @@ def refine(
 
 def _known_terms(pairs: I64, scans: int, previous: Registration | None) -> tuple[PairTerms, Evaluated]:
     """Terms of the pairs (m, 2), and where they were evaluated: those that a previous pass has, the others to be."""
-    terms = PairTerms(np.empty((len(pairs), 3, 3)), np.empty((len(pairs), 3)), np.zeros((len(pairs), 5)))
+    m = len(pairs)
+    terms = PairTerms(np.empty((m, 3, 3)), np.empty((m, 3)), np.zeros((m, 5)), np.empty((m, 3, 3)))
     evaluated = Evaluated(np.full((len(pairs), 3), np.nan), np.empty((len(pairs), 3)))
     if previous is not None:
         old, new = (numbers[:, 0] * scans + numbers[:, 1] for numbers in (previous.pairs, pairs))

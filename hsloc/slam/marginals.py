@@ -1,8 +1,8 @@
 """How well a map's poses are known: marginal covariances of the solved graph, and the graph with all that holds it.
 
 The information of a pair of scans is that of its paired points, whose noise is measured in the log itself
-(`noise_of`), without what the noise of the normals adds to it (`hsloc.kernels.wall_agreement`). What is not modelled is
-not in it: stamps that are wrong, lidars that tilt, walls that moved.
+(`noise_of`), without what the noise of the normals adds to it (`hsloc.kernels.point_to_line.PairTerm`). What is not
+modelled is not in it: stamps that are wrong, lidars that tilt, walls that moved.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.wall_agreement import evaluate_information
 from hsloc.model.pose2 import relative_poses, wrap_angles
 from hsloc.slam.joint_registration import normal_equations
 from hsloc.slam.pose_graph import Edges, anchored, edge_errors
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.kernels.normal_equations import PairTerms
-    from hsloc.kernels.point_to_line import ScanArrays
     from hsloc.slam.joint_registration import Registration
 
     F64 = NDArray[np.float64]
@@ -58,18 +56,16 @@ def marginal_covariances(refined: Registration, terms: PairTerms, edges: Edges) 
     return covariances
 
 
-def observed_terms(refined: Registration, scans: ScanArrays) -> PairTerms:
+def observed_terms(refined: Registration) -> PairTerms:
     """The terms of the pairs with the information that is not due to the noise of the normals.
 
     In no direction it is more than theirs; of the part that is left at least `_LEAST_REAL` is kept.
     """
     before = refined.terms
-    unbiased = before._replace(information=np.empty_like(before.information))
-    evaluate_information(refined.linearised_at, refined.pairs, scans, refined.gate, refined.scale, unbiased)
     added = 1e-9 * np.trace(before.information, axis1=1, axis2=2)[:, None, None] + 1e-12
     root = np.linalg.cholesky(before.information + added * np.eye(3))
     # In coordinates in which the terms' information is the identity.
-    half = np.linalg.solve(root, unbiased.information)
+    half = np.linalg.solve(root, before.observed)
     parts, axes = np.linalg.eigh(np.linalg.solve(root, half.transpose(0, 2, 1)))
     axes = root @ axes
     information = np.einsum("mik,mk,mjk->mij", axes, np.clip(parts, _LEAST_REAL, 1.0), axes)

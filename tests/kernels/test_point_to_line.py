@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from room_scans import DEGREE, room_scan, terms
+from room_scans import DEGREE, pair_term, room_scan, terms
 
 from hsloc.kernels.point_to_line import bearing, choose_hits
-from hsloc.kernels.wall_agreement import add_information, displaced_agreement
+from hsloc.kernels.wall_agreement import displaced_agreement
 from hsloc.model import Pose2, Scan
 from hsloc.slam.keyscans import KeyScan, KeyScans
 
@@ -124,9 +124,7 @@ def test_what_lies_beyond_a_short_range_was_not_looked_through() -> None:
 
 
 def information_of_both_normals(scans: KeyScans, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    information = np.empty((3, 3))
-    add_information(1, 0, pose, scans.arrays(10_000), 0.3, 1e6, information)
-    return information
+    return pair_term(scans, 1, 0, pose)[0].observed
 
 
 def corridor(noise: float) -> tuple[KeyScans, NDArray[np.float64]]:

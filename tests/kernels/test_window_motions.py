@@ -60,7 +60,7 @@ def test_pairs_in_a_window_give_its_motion(rng: Any) -> None:
     pairs = np.array([[0, 1], [0, 2], [1, 2], [1, 3], [2, 3], [2, 5], [3, 4], [4, 5]])
     information, weight = 50.0 * spread(rng, len(pairs)), 3.0
     gradient = rng.normal(size=(len(pairs), 3))
-    terms = PairTerms(information, gradient, np.zeros((len(pairs), 5)))
+    terms = PairTerms(information, gradient, np.zeros((len(pairs), 5)), information)
     windows = np.array([[0, 3], [1, 4], [2, 5]])
     motions, found = np.empty((3, 3)), np.empty((3, 3, 3))
     window_motions(poses, pairs, terms, weight, windows, motions, found)

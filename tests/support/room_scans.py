@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hsloc.kernels.point_to_line import Term, pair_terms
+from hsloc.kernels.point_to_line import PairTerm, pair_terms
 from hsloc.model import Pose2, Scan
 
 if TYPE_CHECKING:
@@ -37,8 +37,20 @@ def terms(
     gate: float = 0.3,
     scale: float = 1e6,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    information, gradient, counts = np.empty((3, 3)), np.empty(3), np.empty(5)
-    pair_terms(
-        i, j, np.array(pose, dtype=float), scans.arrays(10_000), gate, scale, Term(information, gradient), counts
-    )
-    return information, gradient, counts
+    term, counts = pair_term(scans, i, j, pose, gate=gate, scale=scale)
+    return term.information, term.gradient, counts
+
+
+def pair_term(
+    scans: KeyScans,
+    i: int,
+    j: int,
+    pose: NDArray[np.float64] | tuple[float, float, float],
+    *,
+    gate: float = 0.3,
+    scale: float = 1e6,
+) -> tuple[PairTerm, NDArray[np.float64]]:
+    """The whole term, and its counts."""
+    term, counts = PairTerm(np.empty((3, 3)), np.empty(3), np.empty((3, 3))), np.empty(5)
+    pair_terms(i, j, np.array(pose, dtype=float), scans.arrays(10_000), gate, scale, term, counts)
+    return term, counts

@@ -19,6 +19,7 @@ from hsloc.config import Config
 from hsloc.localisation.localiser import Localiser
 from hsloc.matching import LikelihoodField
 from hsloc.model import Event, OccupancyGrid, Pose2, Scan, wrap_angles
+from hsloc.replay.clock_offset import ClockEvidence
 from hsloc.replay.engine import replay
 from hsloc.replay.run_history import RunHistory
 from hsloc.simulation import presets
@@ -27,6 +28,7 @@ from hsloc.simulation.odometer import OdometryNoise
 from hsloc.simulation.scenario import Kidnap, Scenario
 from hsloc.simulation.simulator import events
 from hsloc.simulation.world import World
+from hsloc.slam.time_offset import estimate_offset
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -151,8 +153,35 @@ class Scored(NamedTuple):
 def scored(
     drive: Iterable[Event], grid: OccupancyGrid, start: Pose2 | None, rng: np.random.Generator, is_wrong: bool
 ) -> Scored:
-    """Localise on a map; wrong are poses off by more than 0.25 m or 5 deg, and all where the map `is_wrong`."""
+    """Localise on a map; wrong are poses off by more than 0.25 m or 5 deg, and all where the map `is_wrong`.
+
+    As in `hsloc.run`, stamps of scans that turn out to be late or early are corrected, and the drive replayed again.
+    """
+    drive, state = list(drive), rng.bit_generator.state
     field, config = LikelihoodField.from_grid(grid), Config()
+    found, evidence = _localised(drive, grid, field, start, rng, is_wrong)
+    if evidence.hints:
+        offset = estimate_offset(drive, config.graph_mapper.front_end, np.random.default_rng(0))
+        if offset.is_significant:
+            by = round((offset.seconds - offset.half_sweep_s) * 1e9)
+            moved = [replace(each, stamp_ns=each.stamp_ns - by) if isinstance(each, Scan) else each for each in drive]
+            moved.sort(key=lambda event: event.stamp_ns)
+            rng.bit_generator.state = state
+            again, after = _localised(moved, grid, field, start, rng, is_wrong)
+            if after.is_better(evidence):
+                return again
+    return found
+
+
+def _localised(
+    drive: Iterable[Event],
+    grid: OccupancyGrid,
+    field: LikelihoodField,
+    start: Pose2 | None,
+    rng: np.random.Generator,
+    is_wrong: bool,
+) -> tuple[Scored, ClockEvidence]:
+    config = Config()
     localiser = Localiser.from_parameters(grid, field, config.make_matcher(), config.localiser, rng, start)
     history = RunHistory(config.localiser.smoothing_model())
     for event, estimate in replay(drive, localiser):
@@ -164,7 +193,8 @@ def scored(
     off = trajectory.poses - reference.poses
     off[:, 2] = wrap_angles(off[:, 2])
     wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.25) | (np.abs(off[:, 2]) > np.radians(5.0)) | is_wrong
-    return Scored(off, wrong, states)
+    evidence = ClockEvidence.of(history.diagnostics(), history.odometry(), trajectory, states.is_localised())
+    return Scored(off, wrong, states), evidence
 
 
 def measure(name: str, seed: int, is_known: bool) -> str:

@@ -74,7 +74,7 @@ class WarningCode(StrEnum):
     CLOCK_OFFSET_LARGE = "clock_offset_large"
     """The same by a tenth of a second or more."""
     CLOCK_OFFSET_APPLIED = "clock_offset_applied"
-    """The offset between scans and odometry was estimated and removed, as asked for."""
+    """The offset between scans and odometry was estimated and removed: as asked for, or as the result showed it."""
     CLOCK_DRIFT = "clock_drift"
     """The clocks of scans and odometry do not run equally fast: their offset changes during the log."""
     SCANS_MIRRORED = "scans_mirrored"

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.localisation.states import localisation_reasons
-from hsloc.model.estimate import Status
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
+from hsloc.replay.clock_offset import KNOWN, is_matched, matched_headings
 from hsloc.slam.time_offset import Headings, clock_warnings, drift_warning, find_drift, find_offset, offsets_of_log
 from hsloc.trajectory_io.tum import NS_PER_S
 from hsloc.warnings import RunWarning, WarningCode
@@ -99,28 +99,22 @@ def _scale_warnings(result: Result) -> list[RunWarning]:
 
 
 def offset_warnings(result: Result) -> list[RunWarning]:
-    """Whether scans and odometry are stamped by clocks, or at moments, that differ: by the headings of the result.
-
-    The pose of a matched scan follows what the lidar saw; odometry with the same stamp should have turned as much.
-    """
-    known = (WarningCode.CLOCK_OFFSET, WarningCode.CLOCK_OFFSET_LARGE, WarningCode.CLOCK_OFFSET_APPLIED)
-    if result.lidar_only or not len(result.odometry) or any(w.code in known for w in result.warnings):
+    """Whether scans and odometry are stamped by clocks, or at moments, that differ: by the headings of the result."""
+    if result.lidar_only or not len(result.odometry) or any(warning.code in KNOWN for warning in result.warnings):
         return []
     stamps, odometry = result.diagnostics.stamps_ns, result.odometry
-    matched = np.array([status in (Status.MATCHED, Status.RELOCALISED) for status in result.diagnostics.status])
+    given = result.request.read.offsets_s()
+    if result.clock_offsets is not None:
+        return [warning for _, warning in clock_warnings(result.clock_offsets, given)]
     if result.mapping is not None:
-        theta = result.mapping.scan_poses[:, 2]
+        matched = is_matched(result.diagnostics)
+        scans = Headings.of(stamps[matched], result.mapping.scan_poses[matched, 2])
+        turned = Headings.of(odometry.stamps_ns, odometry.poses[:, 2])
+        is_lost = bool(2 * np.count_nonzero(matched) < len(matched))
     else:
-        # A match corrects the poses from the next odometry message on.
-        rows = np.searchsorted(odometry.stamps_ns, stamps)
-        matched &= rows < len(odometry)
-        rows = np.minimum(rows, len(odometry) - 1)
-        there = np.interp(stamps, odometry.stamps_ns, np.unwrap(odometry.poses[:, 2]))
-        theta = result.trajectory.poses[rows, 2] - odometry.poses[rows, 2] + there
-    scans = Headings.of(stamps[matched], theta[matched])
-    turned = Headings.of(odometry.stamps_ns, odometry.poses[:, 2])
+        scans, turned = matched_headings(result.diagnostics, odometry, result.trajectory)
+        is_lost = False  # then the run itself has looked for them
     offset = find_offset(scans, turned)
-    is_lost = 2 * np.count_nonzero(matched) < len(matched)
     if not (offset.is_significant or is_lost):
         drift = find_drift(scans, turned, offset.seconds)
         return [drift_warning(result.summary.scan_topic or "the scans", drift)] if drift else []
@@ -128,7 +122,6 @@ def offset_warnings(result: Result) -> list[RunWarning]:
     request = result.request
     reading = result.reading or request.reading()
     found = offsets_of_log(request.logs, reading, request.config.graph_mapper.front_end)
-    given = request.read.offsets_s()
     return [warning for _, warning in clock_warnings(found, given)]
 
 

@@ -64,6 +64,9 @@ _LEAST_SIGMA = 0.002
 """Standard deviation of a wall's place, at least (m): no building is drawn better."""
 _SIGMAS, _LEAST = 3.0, 0.005
 """A scale is significant if it differs from 1 by this number of standard deviations, and by this much: 5 cm in 10 m."""
+_DOUBTED_SIGMAS = 2.0
+"""Standard deviations from which on 1 lies outside the 95 % interval: poses are then not taken for right by this much.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,14 +82,20 @@ class MapScale:
         """Whether the map is too large or too small beyond doubt, and by enough to matter."""
         return abs(self.value - 1.0) > max(_SIGMAS * self.sigma, _LEAST)
 
+    @property
+    def is_doubted(self) -> bool:
+        """Whether poses far from the map's corner may be wrong by the scale: it need not be beyond doubt for that."""
+        return abs(self.value - 1.0) > max(_DOUBTED_SIGMAS * self.sigma, _LEAST)
+
     def position_errors(self, poses: F64) -> F64:
         """Errors (n, 2) in x and y of poses (n, 3) that come from the scale (m): the cells grow from the corner.
 
-        0 where the scale is not significant.
+        0 where the scale is not doubted.
         """
-        if not self.is_significant:
+        if not self.is_doubted:
             return np.zeros((len(poses), 2))
-        errors: F64 = np.abs(self.value - 1.0) * np.abs(poses[:, :2] - self.corner)
+        largest = abs(self.value - 1.0) + self.sigma
+        errors: F64 = largest * np.abs(poses[:, :2] - self.corner)
         return errors
 
 

@@ -13,13 +13,12 @@ from hsloc.config import preset
 from hsloc.errors import ConfigError, LogError
 from hsloc.interrupts import interrupts_held_back
 from hsloc.kernels.cache import compilation_reported
-from hsloc.log import LogSummary, Losses, open_log
 from hsloc.matching.window import Window
 from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
-from hsloc.options import AUTO
 from hsloc.preprocessing.odometry import ContinuousOdometry, OdometryWatch, UnusableOdometry
+from hsloc.replay.clock_offset import ClockEvidence, clock_offsets, open_as_meant
 from hsloc.replay.engine import rarely_collected, replay
 from hsloc.replay.map_and_start import find_map, find_start, first_odometry, load_state, require_map, resumed
 from hsloc.replay.references import read_reference
@@ -27,21 +26,20 @@ from hsloc.replay.run_history import RunHistory, pose_covariances
 from hsloc.request import RunRequest
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
-from hsloc.slam.mounting_choice import with_chosen_mountings
 from hsloc.slam.point_mapper import PointMapper
 from hsloc.slam.stated_loops import StatedLoops
-from hsloc.slam.time_offset import HINT_S, as_option, clock_warnings, offsets_of_log
+from hsloc.slam.time_offset import clock_warnings
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from hsloc.localisation.localiser import Localiser
     from hsloc.localisation.map_scale import MapScale
     from hsloc.localisation.states import StateRows
-    from hsloc.log import Log, ReadOptions
+    from hsloc.log import Log, LogSummary, Losses, ReadOptions
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
     from hsloc.model.estimate import Ambiguity, ScanDiagnostics
@@ -51,6 +49,7 @@ if TYPE_CHECKING:
     from hsloc.replay.engine import Estimator
     from hsloc.slam.map_state import MapState
     from hsloc.slam.result import MappingResult
+    from hsloc.slam.time_offset import Offset
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +101,8 @@ class Result:
     ambiguities: tuple[Ambiguity, ...] = ()
     lidar_only: bool = False
     deskewed: bool = False
+    clock_offsets: Mapping[str, Offset] | None = None
+    """Offsets of the scans' stamps that were found and not removed, by topic."""
     reading: ReadOptions | None = None
     """How the log was read, with what was found on the way; None is what the request says."""
     log: Log | None = field(default=None, repr=False)
@@ -129,6 +130,10 @@ class Result:
         config = self.request.config
         noise = config.localiser.noise() if self.mode == "localise" else config.point_mapper.odometry_noise
         return pose_covariances(self.trajectory, self.localised, self.diagnostics, noise.covariance)
+
+    def clock_evidence(self) -> ClockEvidence:
+        """Whether the stamps of scans and odometry agree, by the headings of a localiser's result with odometry."""
+        return ClockEvidence.of(self.diagnostics, self.odometry, self.trajectory, self.localised)
 
     @property
     def matcher_name(self) -> str | None:
@@ -168,7 +173,7 @@ def run(
 def _run(request: RunRequest, progress: Callable[[Progress], None] | None) -> Result:
     """The run; without the odometry of the log where that proves unusable on the way."""
     try:
-        return _run_with(request, progress, lidar_only=request.no_odometry)
+        result = _run_with(request, progress, lidar_only=request.no_odometry)
     except UnusableOdometry as error:
         warning = RunWarning(
             WarningCode.ODOMETRY_UNUSABLE,
@@ -176,6 +181,20 @@ def _run(request: RunRequest, progress: Callable[[Progress], None] | None) -> Re
             "repair its source, or name another with --odom-topic",
         )
         return _run_with(request, progress, lidar_only=True, warnings=(warning,))
+    is_corrected = any(warning.code == WarningCode.CLOCK_OFFSET_APPLIED for warning in result.warnings)
+    if result.mode != "localise" or result.lidar_only or is_corrected:
+        return result
+    evidence = result.clock_evidence()
+    if not evidence.hints:
+        return result
+    offsets, option = clock_offsets(request, result.reading or request.reading(), deskew=result.deskewed)
+    if option is not None:
+        warnings = tuple(warning for _, warning in clock_warnings(offsets, removed=True))
+        again = _run_with(request, progress, lidar_only=False, warnings=warnings, time_offset=option)
+        if again.clock_evidence().is_better(evidence):
+            seconds = {name: value + again.seconds[name] for name, value in result.seconds.items()}
+            return replace(again, seconds=seconds)
+    return replace(result, clock_offsets=offsets)
 
 
 def _run_with(
@@ -184,9 +203,10 @@ def _run_with(
     *,
     lidar_only: bool,
     warnings: tuple[RunWarning, ...] = (),
+    time_offset: str | None = None,
 ) -> Result:
     begin = time.perf_counter()
-    log, reading, of_log = open_as_meant(request, lidar_only)
+    log, reading, of_log = open_as_meant(request, lidar_only, time_offset)
     warnings = (*warnings, *of_log)
     lidar_only = lidar_only or log.summary.heading_topic is not None
     of_reference: list[RunWarning] = []
@@ -221,11 +241,12 @@ def _run_with(
         for event, estimate in replay(_reported(log, events, history, progress), estimator, deskew=deskew, first=first):
             history.add(event, estimate)
     replayed = time.perf_counter()
+    is_cut = request.read.start_s is not None or request.read.end_s is not None
     if history.scans == 0:
-        where = "between --start and --end" if _cut(request) else f"on {log.summary.scan_topic} that could be read"
+        where = "between --start and --end" if is_cut else f"on {log.summary.scan_topic} that could be read"
         raise LogError(f"{request.logs[0]}: no scan {where}{_lost(log)}")
     if first is None and not lidar_only:
-        where = "between --start and --end" if _cut(request) else f"on {log.summary.odom_topic} that could be read"
+        where = "between --start and --end" if is_cut else f"on {log.summary.odom_topic} that could be read"
         raise LogError(f"{request.logs[0]}: no odometry {where}{_lost(log)}; the scans alone can do: --no-odom")
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
     mapping, true_grid = None, None if localise else grid
@@ -273,25 +294,6 @@ def _lost(log: Log) -> str:
     """What could not be read, as the end of a message; empty where all could."""
     lost = [*log.losses.lines(), *log.losses.reasons]
     return f": {'; '.join(lost)}" if lost else ""
-
-
-def open_as_meant(request: RunRequest, lidar_only: bool) -> tuple[Log, ReadOptions, tuple[RunWarning, ...]]:
-    """The log, and how it is read: with the right one of several mountings, and the offset of its scans if asked for.
-
-    Otherwise that is estimated only where log times hint at it: `hsloc.analysis` finds smaller ones in the result.
-    """
-    front_end = request.config.graph_mapper.front_end
-    log = open_log(request.logs, request.reading())
-    reading, warnings = with_chosen_mountings(log, request.logs, request.reading(), front_end)
-    option, automatic = None, request.read.time_offset == AUTO and not lidar_only
-    apart = abs(log.summary.clocks_apart_s) > HINT_S and request.read.time_offset is None and not lidar_only
-    if automatic or apart:
-        found = offsets_of_log(request.logs, reading, front_end)
-        option = as_option(found) if automatic else None
-        warnings = (*warnings, *(warning for _, warning in clock_warnings(found, removed=automatic)))
-    if option is not None:
-        reading = replace(reading, time_offset=option)
-    return (log if reading == request.reading() else open_log(request.logs, reading)), reading, warnings
 
 
 def _mapped(history: RunHistory, mapping: MappingResult) -> tuple[Trajectory, NDArray[np.bool_]]:
@@ -376,10 +378,6 @@ def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:
     window = Window(likelihood.T_map_field, 0.1, 0.1, 0.1)
     with interrupts_held_back():  # A compiler that is interrupted may take the process with it.
         matcher.match(points, likelihood, window, np.random.default_rng(0))
-
-
-def _cut(request: RunRequest) -> bool:
-    return request.read.start_s is not None or request.read.end_s is not None
 
 
 def _reported(

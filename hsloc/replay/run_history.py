@@ -185,10 +185,10 @@ class RunHistory:
         covariances = dict(zip(self._anchor_states, smoothed.covariances, strict=True))
         between = bridge_variances(self.odometry().poses, self._anchors, smoothed.motion)
         rows = self._states.at_odometry(len(self._odometry_stamps), covariances, between)
-        if scale is None or not scale.is_significant:
+        if scale is None or not scale.is_doubted:
             return rows
         errors = scale.position_errors(self.trajectory()[0].poses)
-        return with_position_errors(rows, errors, f"the scale of the map is {scale.value:.3f}")
+        return with_position_errors(rows, errors, f"the scale of the map is {scale.value:.3f} +- {scale.sigma:.3f}")
 
     def ambiguities(self, states: StateRows | None) -> tuple[Ambiguity, ...]:
         """Between which places the run does not decide, and when; `states` are those of its poses."""

@@ -77,6 +77,8 @@ class Offset(NamedTuple):
     """By how much it grows from the first scan to the last (s), where that matters and is not chance."""
     is_mirrored: bool = False
     """The scans turn the other way than the odometry: then there is no offset."""
+    half_sweep_s: float = 0.0
+    """From the first beam, whose stamp is meant, to the middle of a scan (s)."""
 
     @property
     def is_significant(self) -> bool:
@@ -175,6 +177,7 @@ def estimate_offset(
     odometry: list[tuple[int, float]] = []
 
     middles: dict[int, int] = {}
+    halves: list[int] = []
 
     def kept() -> Iterable[Event]:
         count, last_ns = 0, 0
@@ -188,7 +191,8 @@ def estimate_offset(
                 count += 1
                 if count <= most_scans:
                     last_ns = event.stamp_ns
-                    middles[event.stamp_ns] = event.stamp_ns + half_sweep_ns(event)
+                    halves.append(half_sweep_ns(event))
+                    middles[event.stamp_ns] = event.stamp_ns + halves[-1]
                     yield event
 
     matched = with_laser_odometry(kept(), parameters, rng)
@@ -198,7 +202,8 @@ def estimate_offset(
     turns, odometry_turns = _headings(scans), _headings(odometry)
     found = _best_offset(turns, odometry_turns)
     if _agreement(turns, odometry_turns, found.seconds) >= _LEAST_AGREEMENT:
-        return found._replace(drift_s=find_drift(turns, odometry_turns, found.seconds))
+        half = float(np.median(halves)) / NANOSECONDS
+        return found._replace(drift_s=find_drift(turns, odometry_turns, found.seconds), half_sweep_s=half)
     mirrored = Headings(turns.stamps_ns, -turns.theta)
     back = find_offset(_thinned(mirrored), odometry_turns)
     if isfinite(back.sigma) and _agreement(mirrored, odometry_turns, back.seconds) >= _LEAST_AGREEMENT:
@@ -354,9 +359,16 @@ def offset_warning(topic: str, offset: Offset, given_s: float = 0.0) -> RunWarni
     )
 
 
-def as_option(offsets: Mapping[str, Offset]) -> str | None:
-    """The value of `--time-offset` that removes the offsets that are significant; None where none is."""
-    items = [f"{_first(topic)}={-offset.seconds:.3f}" for topic, offset in offsets.items() if offset.is_significant]
+def as_option(offsets: Mapping[str, Offset], *, deskew: bool) -> str | None:
+    """The value of `--time-offset` that removes the offsets that are significant; None where none is.
+
+    A scan that is not deskewed shows the robot as it was in the middle of the sweep: it gets the stamp of then.
+    """
+    items = [
+        f"{_first(topic)}={(0.0 if deskew else offset.half_sweep_s) - offset.seconds:.3f}"
+        for topic, offset in offsets.items()
+        if offset.is_significant
+    ]
     return ",".join(items) or None
 
 

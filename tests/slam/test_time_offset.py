@@ -12,7 +12,7 @@ import pytest
 
 from hsloc.analysis.analyse import analyse
 from hsloc.evaluation import evaluate
-from hsloc.log import ReadOptions, open_log
+from hsloc.log import ReadOptions, convert_log, open_log
 from hsloc.model import Odometry, Scan
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
@@ -114,8 +114,25 @@ def test_a_run_warns_of_late_scans_and_auto_removes_it(tmp_path: Path) -> None:
     assert re.search(r"--time-offset /scan=-?0\.00", warning.remedy)
     assert analyse(warned).metrics.verdict == "check"
     found = offsets_of_log((OFFICE,), END, FrontEndParameters())
-    assert as_option(found) is None
+    assert as_option(found, deskew=False) is None
+    (sweeping,) = ({topic: offset._replace(seconds=0.2, half_sweep_s=0.05)} for topic, offset in found.items())
+    assert as_option(sweeping, deskew=True) == "/scan=-0.200"
+    assert as_option(sweeping, deskew=False) == "/scan=-0.150"
     sound = run(RunRequest(logs=(OFFICE,), read=replace(END, time_offset="auto")))
     assert sound.reference is not None
     assert evaluate(sound.trajectory, sound.reference).ape.trans_part.rmse < 0.01
     assert analyse(sound).metrics.warnings == ()
+
+
+def test_stamps_of_a_log_that_is_localised_are_corrected_unless_the_user_gives_them(tmp_path: Path) -> None:
+    late = tmp_path / "late.mcap"
+    convert_log(open_log((OFFICE,), replace(END, time_offset="/scan=0.2", end_s=20.0)), late)
+    result = run(RunRequest(logs=(late,)))
+    metrics = analyse(result).metrics
+    assert [warning.code for warning in metrics.warnings] == ["clock_offset_applied"]
+    assert metrics.verdict == "good"
+    assert result.reference is not None
+    assert evaluate(result.trajectory, result.reference).ape.trans_part.max < 0.05
+    as_stamped = run(RunRequest(logs=(late,), read=ReadOptions(time_offset="/scan=0")))
+    assert [each.code for each in analyse(as_stamped).metrics.warnings] == ["clock_offset_large"]
+    assert evaluate(as_stamped.trajectory, result.reference).ape.trans_part.max > 0.15

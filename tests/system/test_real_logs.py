@@ -40,10 +40,11 @@ def test_turtlebot_from_an_unknown_start(data: Path, log: Any) -> None:
     found = run(request)
     assert found.localised.all()
     metrics = analyse(found).metrics
-    # The stamps of this robot's lidar are a tenth of a second late, which is the only fault of the result.
-    (offset,) = metrics.warnings[len(found.warnings) :]
-    assert metrics.warnings[: len(found.warnings)] == found.warnings
-    assert offset.code.startswith("clock_offset")
-    assert {reason.code for reason in metrics.verdict_reasons} <= {"clock_offset_large"}
+    # The stamps of this robot's lidar are a tenth of a second late, which is corrected.
+    assert metrics.warnings == found.warnings
+    (offset,) = (warning for warning in found.warnings if warning.code.startswith("clock_offset"))
+    assert offset.code == "clock_offset_applied"
+    assert "0.16" in offset.text
+    assert metrics.verdict_reasons == ()
     assert metrics.map.residuals.within_15_cm >= 0.85  # type: ignore[operator]
     assert any(warning.code == "map_unknown_read_as_free" for warning in found.warnings)

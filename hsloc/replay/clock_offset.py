@@ -1,0 +1,120 @@
+"""The offset between the stamps of scans and odometry: before a run where it is asked for, after it where it shows.
+
+The pose of a matched scan follows what the lidar saw; odometry with the same stamp should have turned as much. Where it
+did not, the correction of each match belongs to another moment, and poses are wrong by what the robot moved meanwhile.
+Stamps are then corrected, and the log is replayed once more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.log import open_log
+from hsloc.model.estimate import Status
+from hsloc.options import AUTO
+from hsloc.slam.mounting_choice import with_chosen_mountings
+from hsloc.slam.time_offset import HINT_S, Headings, as_option, clock_warnings, find_offset, offsets_of_log
+from hsloc.warnings import WarningCode
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hsloc.log import Log, ReadOptions
+    from hsloc.model.estimate import ScanDiagnostics
+    from hsloc.model.trajectory import Trajectory
+    from hsloc.request import RunRequest
+    from hsloc.slam.time_offset import Offset
+    from hsloc.warnings import RunWarning
+
+KNOWN = (WarningCode.CLOCK_OFFSET, WarningCode.CLOCK_OFFSET_LARGE, WarningCode.CLOCK_OFFSET_APPLIED)
+"""Warnings of a run that has looked for the offset."""
+
+
+def open_as_meant(
+    request: RunRequest, lidar_only: bool, time_offset: str | None = None
+) -> tuple[Log, ReadOptions, tuple[RunWarning, ...]]:
+    """The log, and how it is read: with the right one of several mountings, and the offset of its scans if asked for.
+
+    Otherwise that is estimated only where log times hint at it: smaller ones show in the result. `time_offset` is known
+    from a run before.
+    """
+    front_end = request.config.graph_mapper.front_end
+    log = open_log(request.logs, request.reading())
+    reading, warnings = with_chosen_mountings(log, request.logs, request.reading(), front_end)
+    looks = time_offset is None and not lidar_only
+    automatic = looks and request.read.time_offset == AUTO
+    apart = looks and abs(log.summary.clocks_apart_s) > HINT_S and request.read.time_offset is None
+    if automatic or apart:
+        found = offsets_of_log(request.logs, reading, front_end)
+        if automatic:
+            time_offset = as_option(found, deskew=reading.deskew or log.summary.segments > 1)
+        warnings = (*warnings, *(warning for _, warning in clock_warnings(found, removed=automatic)))
+    if time_offset is not None:
+        reading = replace(reading, time_offset=time_offset)
+    return (log if reading == request.reading() else open_log(request.logs, reading)), reading, warnings
+
+
+def matched_headings(scans: ScanDiagnostics, odometry: Trajectory, trajectory: Trajectory) -> tuple[Headings, Headings]:
+    """Headings of the scans that were matched on a given map, by the result, and those of the odometry."""
+    # A match corrects the poses from the next odometry message on.
+    rows = np.searchsorted(odometry.stamps_ns, scans.stamps_ns)
+    matched = is_matched(scans) & (rows < len(odometry))
+    rows = np.minimum(rows, len(odometry) - 1)
+    there = np.interp(scans.stamps_ns, odometry.stamps_ns, np.unwrap(odometry.poses[:, 2]))
+    theta = trajectory.poses[rows, 2] - odometry.poses[rows, 2] + there
+    turned = Headings.of(odometry.stamps_ns, odometry.poses[:, 2])
+    return Headings.of(scans.stamps_ns[matched], theta[matched]), turned
+
+
+def is_matched(scans: ScanDiagnostics) -> NDArray[np.bool_]:
+    """Which scans were matched, shape (n,)."""
+    return np.isin(scans.status, (Status.MATCHED.value, Status.RELOCALISED.value))
+
+
+@dataclass(frozen=True, slots=True)
+class ClockEvidence:
+    """What the result of a localiser shows of the clocks.
+
+    `offset` is what is left of an offset in the headings of its matches; a part of it is hidden, for poses also follow
+    the odometry. `localised` is the share of its poses that are localised; `is_lost` says that most scans found no
+    match, which an offset of seconds causes.
+    """
+
+    offset: Offset
+    localised: float
+    is_lost: bool
+
+    @classmethod
+    def of(
+        cls, scans: ScanDiagnostics, odometry: Trajectory, trajectory: Trajectory, localised: NDArray[np.bool_]
+    ) -> ClockEvidence:
+        """Of a localiser's result with odometry; `localised` (n,) says which of its poses are."""
+        matched = is_matched(scans)
+        offset = find_offset(*matched_headings(scans, odometry, trajectory))
+        return cls(offset, float(localised.mean()), 2 * int(np.count_nonzero(matched)) < len(matched))
+
+    @property
+    def hints(self) -> bool:
+        """Whether it is worth while to look for an offset in the scans themselves, which takes a part of a run."""
+        return self.is_lost or self.offset.is_significant
+
+    def is_better(self, before: ClockEvidence) -> bool:
+        """Whether a run with corrected stamps shows less of an offset than before, or was found where that was lost."""
+        if not before.offset.is_significant:
+            return self.localised > before.localised
+        return not self.offset.is_significant or abs(self.offset.seconds) < 0.5 * abs(before.offset.seconds)
+
+
+def clock_offsets(request: RunRequest, reading: ReadOptions, *, deskew: bool) -> tuple[dict[str, Offset], str | None]:
+    """The offsets (s) by topic that the scans of a log, as it was read, show by themselves, and what removes them.
+
+    That is a value of `--time-offset`; None where there is no offset to be removed, and where the user has given one.
+    `deskew` says whether the scans of the run are.
+    """
+    # Poses are weighed with the odometry, which hides a part of the offset: the scans alone show the whole of it.
+    found = offsets_of_log(request.logs, reading, request.config.graph_mapper.front_end)
+    is_given = request.read.time_offset is not None or bool(request.reading().offsets_s())
+    return found, None if is_given else as_option(found, deskew=deskew)

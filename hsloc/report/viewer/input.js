@@ -11,10 +11,15 @@ globalThis.listenToView = (view) => {
     }
     return best;
   }
+  // The start of the run that leads to the place that may be right at a pixel, or null.
+  const place = (px, py) => (view.startable && !view.picking && view.placeMarkAt(px, py)?.start()) || null;
   function hover(px, py) {
     const [x, y] = view.metres(px, py), k = nearest(px, py), path = view.data.trajectory;
     const words = [`${(x + view.ox).toFixed(2)}, ${(y + view.oy).toFixed(2)} m`];
     if (k !== null) words.push(`${path.t[k].toFixed(1)} s, ${path.states[path.state[k]].replaceAll("_", " ")}`);
+    const start = place(px, py);
+    if (start) words.push("click: run again, with the start that leads to this place");
+    view.$over.classList.toggle("rv-hit", Boolean(start));
     if (view.measure?.length) { const [a, b = [x, y]] = view.measure; words.push(`distance ${globalThis.lengthText(Math.hypot(b[0] - a[0], b[1] - a[1]))}`); }
     view.$place.textContent = words.join(" · ");
     view.charts.cursor(k === null ? view.time : path.t[k]);
@@ -27,6 +32,13 @@ globalThis.listenToView = (view) => {
       view.drawOver();
       return;
     }
+    const start = place(px, py);
+    if (start) {
+      const tail = view.local(...start), length = 60 * view.ratio / view.scale;
+      view.setPose([tail, [tail[0] + length * Math.cos(start[2]), tail[1] + length * Math.sin(start[2])]]);
+      view.root.dispatchEvent(new CustomEvent("pose", { detail: start }));
+      return;
+    }
     const k = nearest(px, py, view.picking ? 40 : 14);
     if (k === null) return;
     const t = view.data.trajectory.t[k];
@@ -36,21 +48,21 @@ globalThis.listenToView = (view) => {
       view.root.dispatchEvent(new CustomEvent("loop", { detail: [...view.picked].sort((a, b) => a - b) }));
     }
   }
-  const { signal } = view.listening, over = view.$over, place = (event) => [event.offsetX * view.ratio, event.offsetY * view.ratio];
+  const { signal } = view.listening, over = view.$over, at = (event) => [event.offsetX * view.ratio, event.offsetY * view.ratio];
   over.addEventListener("wheel", (event) => {
     // An untouched map lets the page scroll by.
     if (!event.ctrlKey && document.activeElement !== over) return;
     event.preventDefault();
-    view.zoom(Math.exp(-Math.max(-200, Math.min(200, event.deltaY)) * 0.002), ...place(event));
+    view.zoom(Math.exp(-Math.max(-200, Math.min(200, event.deltaY)) * 0.002), ...at(event));
   }, { passive: false });
   over.addEventListener("pointerdown", (event) => {
     over.focus({ preventScroll: true });
     over.setPointerCapture(event.pointerId);
-    view.fingers.set(event.pointerId, place(event));
-    view.pressed = place(event);
+    view.fingers.set(event.pointerId, at(event));
+    view.pressed = at(event);
   });
   over.addEventListener("pointermove", (event) => {
-    const was = view.fingers.get(event.pointerId), now = place(event);
+    const was = view.fingers.get(event.pointerId), now = at(event);
     if (was && view.posing) { view.setPose([view.metres(...view.pressed), view.metres(...now)]); return; }
     if (!was) { hover(...now); return; }
     const others = [...view.fingers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
@@ -61,7 +73,7 @@ globalThis.listenToView = (view) => {
     view.fingers.set(event.pointerId, now);
   });
   over.addEventListener("pointerup", (event) => {
-    const now = place(event);
+    const now = at(event);
     if (view.posing && view.fingers.size === 1) {
       view.fingers.clear();
       const [[x, y], [tx, ty]] = view.arrow ?? [[0, 0], [0, 0]];
@@ -75,7 +87,7 @@ globalThis.listenToView = (view) => {
   });
   over.addEventListener("pointercancel", (event) => view.fingers.delete(event.pointerId));
   over.addEventListener("pointerleave", () => { view.$place.textContent = ""; view.charts.cursor(view.time); });
-  over.addEventListener("dblclick", (event) => view.zoom(2, ...place(event)));
+  over.addEventListener("dblclick", (event) => view.zoom(2, ...at(event)));
   const measure = () => { view.measure = view.measure ? null : []; over.classList.toggle("rv-measuring", Boolean(view.measure)); view.drawOver(); };
   const toggle = (name, on) => {
     over.classList.toggle("rv-measuring", on);

@@ -6,6 +6,7 @@
   const SCALE = ["#440154", "#46327e", "#365c8d", "#277f8e", "#1fa187", "#4ac16d", "#a0da39", "#fde725"];
   const MARKS = { rejected: "✕", no_returns: "▼", relocalised: "★" };
   const PLACE = [[13, 0], [-9, 8], [-5, 0], [-9, -8]]; // an arrow, in pixels
+  const PIECE = 256, THIN_PX = 0.5; // points or ellipses that are stroked at once; points that are closer (pixels) are joined
   const HEAT_M = 0.3, HEAT_CELLS = 240; // where the scale ends; cells along the longer side of the extent
   const make = (tag, attributes = {}, ...children) => {
     const made = document.createElement(tag);
@@ -21,17 +22,59 @@
     return low;
   };
 
-  // A path for a canvas, and the same as text for a drawing.
+  // Lines and ellipses in metres: strokes on a canvas, and the same as text for a drawing.
   class Path {
-    constructor() { this.canvas = new Path2D(); this.parts = []; }
-    moveTo(x, y) { this.canvas.moveTo(x, y); this.parts.push("M", x, y); }
-    lineTo(x, y) { this.canvas.lineTo(x, y); this.parts.push("L", x, y); }
-    ellipse(x, y, a, b, angle, from, to) {
-      this.canvas.ellipse(x, y, a, b, angle, from, to);
-      const dx = a * Math.cos(angle), dy = a * Math.sin(angle), turn = 180 * angle / Math.PI;
-      this.parts.push("M", x + dx, y + dy, "A", a, b, turn, 1, 1, x - dx, y - dy, "A", a, b, turn, 1, 1, x + dx, y + dy);
+    constructor() { this.x = []; this.y = []; this.starts = new Set(); this.ellipses = []; }
+    moveTo(x, y) { this.starts.add(this.x.length); this.lineTo(x, y); }
+    lineTo(x, y) { this.x.push(x); this.y.push(y); }
+    ellipse(x, y, a, b, angle) { this.ellipses.push([x, y, a, b, angle]); }
+    // Pieces with their bounds, so that those out of sight are left out; points closer than `least` (m) are joined.
+    pieces(least) {
+      if (this.least === least) return this.made;
+      const made = [], begin = (x, y) => made.push({ path: new Path2D(), n: 0, x0: x, y0: y, x1: x, y1: y });
+      const add = (x, y, reach = 0) => {
+        const piece = made.at(-1);
+        piece.n += 1;
+        piece.x0 = Math.min(piece.x0, x - reach); piece.x1 = Math.max(piece.x1, x + reach);
+        piece.y0 = Math.min(piece.y0, y - reach); piece.y1 = Math.max(piece.y1, y + reach);
+        return piece.path;
+      };
+      let px, py;
+      for (const [k, x] of this.x.entries()) {
+        const y = this.y[k], start = this.starts.has(k), last = k + 1 === this.x.length || this.starts.has(k + 1);
+        if (!start && !last && Math.abs(x - px) < least && Math.abs(y - py) < least) continue;
+        if (start || made.at(-1).n >= PIECE) {
+          if (!made.length || made.at(-1).n >= PIECE) begin(start ? x : px, start ? y : py);
+          const path = add(start ? x : px, start ? y : py);
+          path.moveTo(start ? x : px, start ? y : py);
+        }
+        if (!start) add(x, y).lineTo(x, y);
+        px = x; py = y;
+      }
+      for (const [k, [x, y, a, b, angle]] of this.ellipses.entries()) {
+        if (k % PIECE === 0) begin(x, y);
+        const path = add(x, y, a);
+        path.moveTo(x + a * Math.cos(angle), y + a * Math.sin(angle));
+        path.ellipse(x, y, a, b, angle, 0, 2 * Math.PI);
+      }
+      this.least = least; this.made = made;
+      return made;
     }
-    toString() { return this.parts.map((part) => typeof part === "number" ? Number(part.toFixed(4)) : part).join(" "); }
+    // What lies in [x0, y0, x1, y1], at so many pixels a metre.
+    stroke(c, scale, [x0, y0, x1, y1]) {
+      for (const piece of this.pieces(THIN_PX / 2 ** Math.ceil(Math.log2(scale)))) {
+        if (piece.x1 >= x0 && piece.x0 <= x1 && piece.y1 >= y0 && piece.y0 <= y1) c.stroke(piece.path);
+      }
+    }
+    toString() {
+      const text = (value) => Number(value.toFixed(4));
+      const lines = this.x.map((x, k) => `${this.starts.has(k) ? "M" : "L"} ${text(x)} ${text(this.y[k])}`);
+      const ellipses = this.ellipses.map(([x, y, a, b, angle]) => {
+        const dx = a * Math.cos(angle), dy = a * Math.sin(angle), arc = `A ${text(a)} ${text(b)} ${text(180 * angle / Math.PI)} 1 1`;
+        return `M ${text(x + dx)} ${text(y + dy)} ${arc} ${text(x - dx)} ${text(y - dy)} ${arc} ${text(x + dx)} ${text(y + dy)}`;
+      });
+      return [...lines, ...ellipses].join(" ");
+    }
   }
 
   const methods = {
@@ -80,7 +123,7 @@
     },
     // Where the frame of the map has its origin, and its axes.
     drawAxes(c) {
-      c.setTransform(1, 0, 0, 1, 0, 0);
+      this.flat(c);
       const [px, py] = this.pixels(...this.local(0, 0)), r = this.ratio;
       c.font = `${11 * r}px system-ui, sans-serif`; c.textAlign = "center"; c.textBaseline = "middle"; c.lineWidth = 1.6 * r;
       for (const [dx, dy, name, colour] of [[28, 0, "x", "vermillion"], [0, -28, "y", "green"]]) {
@@ -122,10 +165,23 @@
       const found = [], r = this.ratio;
       for (const each of this.shown.has("places") ? this.data.ambiguities : []) for (const [k, text] of each.labels.entries()) {
         const [px, py] = this.pixels(...this.local(each.x[k], each.y[k])), cos = Math.cos(each.theta[k]), sin = -Math.sin(each.theta[k]);
-        const outline = PLACE.map(([x, y]) => [px + r * (cos * x - sin * y), py + r * (sin * x + cos * y)]);
-        found.push({ outline, text, at: [px, py + 20 * r] });
+        const middle = [px, py], start = () => this.startOf(each, k), outline = PLACE.map(([x, y]) => [px + r * (cos * x - sin * y), py + r * (sin * x + cos * y)]);
+        found.push({ outline, text, at: [px, py + 20 * r], middle, start });
       }
       return found;
+    },
+    placeMarkAt(px, py) { return this.placeMarks().find(({ middle: [x, y] }) => Math.hypot(px - x, py - y) < 16 * this.ratio); },
+    // Where the robot was at the first pose if it is at place k later: back along the trajectory, whose jumps are no motion.
+    startOf({ at, x, y, theta }, k) {
+      const path = this.data.trajectory, breaks = new Set(path.breaks);
+      let px = x[k], py = y[k], yaw = theta[k];
+      for (let row = path.t.length ? before(path.t, at + 1e-6) : 0; row > 0; row -= 1) {
+        if (breaks.has(row)) continue;
+        const turn = yaw - path.theta[row], cos = Math.cos(turn), sin = Math.sin(turn);
+        const dx = path.x[row - 1] - path.x[row], dy = path.y[row - 1] - path.y[row];
+        px += cos * dx - sin * dy; py += sin * dx + cos * dy; yaw = path.theta[row - 1] + turn;
+      }
+      return [px, py, Math.atan2(Math.sin(yaw), Math.cos(yaw))];
     },
     drawPlaces(c) {
       c.textAlign = "center"; c.textBaseline = "middle"; c.font = `600 ${13 * this.ratio}px system-ui, sans-serif`; c.lineJoin = "round";
@@ -139,7 +195,7 @@
       }
     },
     drawMarks(c) {
-      c.setTransform(1, 0, 0, 1, 0, 0);
+      this.flat(c);
       c.textAlign = "center"; c.textBaseline = "middle";
       for (const mark of this.data.marks) {
         if (!this.shown.has(mark.status)) continue;

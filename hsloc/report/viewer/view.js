@@ -5,6 +5,7 @@
 (() => {
   const { MARKS, Path, before, make } = globalThis.ResultLayers;
   const NEAR_CM = 5, FAR_CM = 15;
+  const MARGIN = 0.25, REST_MS = 150; // drawn beyond each edge, as a share of the view; without a move for so long, the map rests
   const KINDS = [["", "any event"], ["warning", "warning"], ["loss", "loss"], ["ambiguous", "several places fit"], ["loop", "loop"], ["rejected", "refused scan"]];
 
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
@@ -36,7 +37,7 @@
     }
 
     // A tool by which an arrow is dragged: the event `pose` has [x, y, yaw] in the frame of the map (m, rad).
-    offerPose(title) { this.offer("pose", "⇗", title); }
+    offerPose(title) { this.startable = true; this.offer("pose", "⇗", title); }
     setPose(arrow) { this.arrow = arrow; this.drawOver(); }
     // A tool by which two places of the trajectory are clicked: the event `loop` has their times (s).
     offerLoop(title) { this.offer("loop", "∞", title); }
@@ -49,6 +50,7 @@
     // Frees what the page holds beyond the element.
     end() {
       this.stop();
+      clearTimeout(this.resting);
       this.observer.disconnect();
       this.listening.abort();
       this.charts.end();
@@ -68,6 +70,7 @@
     build() {
       const button = (name, text, title) => make("button", { type: "button", "data-do": name, title, "aria-label": title }, text);
       this.$base = make("canvas", { class: "rv-base", "aria-hidden": "true" });
+      this.$still = make("canvas");
       this.$over = make("canvas", { class: "rv-over", tabindex: "0", role: "img", "aria-label":
         "Map with the trajectory. Arrow keys move, plus and minus zoom, 0 shows all, comma and full stop step by scan, n and p go to the next and previous event." });
       this.$place = make("div", { class: "rv-place" });
@@ -165,10 +168,23 @@
       const [nx, ny] = this.metres(px, py);
       this.move(this.scale * (nx - mx), -this.scale * (ny - my));
     }
-    move(dx, dy) { this.x -= dx / this.scale; this.y += dy / this.scale; this.whole = false; this.draw(); }
+    move(dx, dy) {
+      this.x -= dx / this.scale; this.y += dy / this.scale; this.whole = false;
+      this.frame();
+      clearTimeout(this.resting);
+      this.resting = setTimeout(() => this.rest(), REST_MS);
+    }
+    // Drawn sharp, and with a whole margin on each side, once nothing moves.
+    rest() {
+      const { x, y, scale } = this.still ?? {}, near = (a, b, size) => Math.abs(a - b) * this.scale < 0.5 * MARGIN * size;
+      if (scale !== this.scale || !near(x, this.x, this.$base.width) || !near(y, this.y, this.$base.height)) this.draw();
+    }
     metres(px, py) { return [this.x + (px - this.$base.width / 2) / this.scale, this.y - (py - this.$base.height / 2) / this.scale]; }
     pixels(x, y) { return [this.$base.width / 2 + (x - this.x) * this.scale, this.$base.height / 2 - (y - this.y) * this.scale]; }
-    world(c) { c.setTransform(this.scale, 0, 0, -this.scale, this.$base.width / 2 - this.x * this.scale, this.$base.height / 2 + this.y * this.scale); }
+    // The canvas that is kept has a margin on each side.
+    margin(c) { return [(c.canvas.width - this.$base.width) / 2, (c.canvas.height - this.$base.height) / 2]; }
+    flat(c) { c.setTransform(1, 0, 0, 1, ...this.margin(c)); }
+    world(c) { const [x, y] = this.pixels(0, 0), [left, top] = this.margin(c); c.setTransform(this.scale, 0, 0, -this.scale, left + x, top + y); }
 
     // --- drawing -------------------------------------------------------------------------------------------------------
     ink(name) {
@@ -179,23 +195,41 @@
       }
       return this.colours[name];
     }
-    draw() {
+    draw() { this.still = null; this.frame(); }
+    frame() {
       if (!this.scale || this.drawn) return;
       // Once for each frame of the screen, however many events there were.
       this.drawn = requestAnimationFrame(() => { this.drawn = null; this.drawBase(); this.drawOver(); });
     }
     // What is printed is taken before the next frame.
-    drawNow() { if (this.scale) { this.drawBase(); this.drawOver(); } }
+    drawNow() { this.still = null; if (this.scale) { this.drawBase(); this.drawOver(); } }
+    // While the map moves, what was drawn last is shown at its new place; it is drawn again once it does not cover the view.
     drawBase() {
-      const c = this.$base.getContext("2d"), d = this.data;
+      const c = this.$base.getContext("2d"), { width, height } = c.canvas;
+      const place = () => {
+        const { width: w, height: h } = this.$still, factor = this.scale / this.still.scale, [x, y] = this.pixels(this.still.x, this.still.y);
+        const corner = [x - factor * w / 2, y - factor * h / 2].map((at) => factor === 1 ? Math.round(at) : at);
+        return [...corner, factor * w, factor * h, factor];
+      };
+      const covers = () => { const [x, y, w, h, factor] = place(); return factor < 3 && x <= 0 && y <= 0 && x + w >= width && y + h >= height; };
+      if (!this.still || !covers()) this.render();
+      const [x, y, w, h] = place();
       c.setTransform(1, 0, 0, 1, 0, 0);
-      c.clearRect(0, 0, c.canvas.width, c.canvas.height);
+      c.clearRect(0, 0, width, height);
+      c.drawImage(this.$still, x, y, w, h);
+      this.drawScale();
+    }
+    render() {
+      const { width, height } = this.$base, c = this.$still.getContext("2d"), d = this.data;
+      this.$still.width = width + 2 * Math.ceil(MARGIN * width); this.$still.height = height + 2 * Math.ceil(MARGIN * height); // and clears it
+      this.still = { x: this.x, y: this.y, scale: this.scale };
+      const [left, top] = this.margin(c), bounds = [...this.metres(-left - 20, height + top + 20), ...this.metres(width + left + 20, -top - 20)];
       this.world(c);
       if (this.shown.has("map")) this.drawMap(c);
       this.ink("ink");
       this.paths ??= this.makePaths();
       const px = this.ratio / this.scale, stroke = (path, colour, width, dash = []) => {
-        c.strokeStyle = colour; c.lineWidth = width * px; c.setLineDash(dash.map((n) => n * px)); c.stroke(path.canvas); c.setLineDash([]);
+        c.strokeStyle = colour; c.lineWidth = width * px; c.setLineDash(dash.map((n) => n * px)); path.stroke(c, this.scale, bounds); c.setLineDash([]);
       };
       c.lineJoin = "bevel"; c.lineCap = "round"; // round joins of thousands of points take twice as long
       if (this.shown.has("heat")) this.drawHeat(c);
@@ -204,7 +238,6 @@
       for (const each of this.strokes()) stroke(...each);
       this.drawAxes(c);
       this.drawMarks(c);
-      this.drawScale();
     }
     drawMap(c) {
       if (!this.image || !this.data.map) return;
@@ -254,8 +287,7 @@
         const { xx, xy, yy } = Object.fromEntries(["xx", "xy", "yy"].map((name) => [name, d.ellipses[name][k]]));
         const mean = (xx + yy) / 2, root = Math.hypot((xx - yy) / 2, xy), angle = 0.5 * Math.atan2(2 * xy, xx - yy);
         const [x, y] = this.local(d.ellipses.x[k], d.ellipses.y[k]), a = 2 * Math.sqrt(mean + root), b = 2 * Math.sqrt(Math.max(mean - root, 0));
-        paths.ellipses.moveTo(x + a * Math.cos(angle), y + a * Math.sin(angle));
-        paths.ellipses.ellipse(x, y, a, b, angle, 0, 2 * Math.PI);
+        paths.ellipses.ellipse(x, y, a, b, angle);
       }
       return paths;
     }

@@ -29,6 +29,8 @@ _VERDICTS = {
     WarningCode.LASER_MISFIT: Verdict.CHECK,
     WarningCode.EXTRINSICS_DISAGREE: Verdict.CHECK,
     WarningCode.EXTRINSICS_UNDECIDED: Verdict.CHECK,
+    WarningCode.SCANS_FROZEN: Verdict.CHECK,
+    WarningCode.SCAN_STAMPS_STUCK: Verdict.CHECK,
     WarningCode.ODOMETRY_JUMPS: Verdict.CHECK,
     WarningCode.CLOCK_OFFSET_LARGE: Verdict.CHECK,
     WarningCode.MAP_SCALE: Verdict.CHECK,

@@ -8,7 +8,7 @@ from hsloc.log import open_log
 from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.preprocessing.odometry import ContinuousOdometry
-from hsloc.preprocessing.scans import pair
+from hsloc.preprocessing.scans import ScanWatch, pair
 from hsloc.replay.engine import rarely_collected
 
 if TYPE_CHECKING:
@@ -47,7 +47,9 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
 
     with rarely_collected():
         events = _with_recorded_odometry(log.events(), result) if result.lidar_only else log.events()
-        for event in pair(ContinuousOdometry(events), deskew=result.deskewed, first=first):
+        joined = ContinuousOdometry(events)
+        watched = joined if result.lidar_only else ScanWatch(joined)
+        for event in pair(watched, deskew=result.deskewed, first=first):
             if isinstance(event, PairedScan):
                 if result.follows_scans:
                     row += 1

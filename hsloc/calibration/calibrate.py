@@ -21,6 +21,7 @@ from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.options import AUTO
 from hsloc.preprocessing.odometry import ContinuousOdometry
 from hsloc.preprocessing.scans import pair
+from hsloc.replay.clock_offset import open_as_meant
 from hsloc.replay.engine import replay
 from hsloc.replay.map_and_start import find_start, load_grid
 from hsloc.slam.laser_odometry import with_laser_odometry
@@ -88,7 +89,8 @@ def calibrate(request: RunRequest, progress: Callable[[int, float], None] | None
     as `open_log`, MapError for a map or a start that cannot be used.
     """
     paths, options = request.logs, request.reading()
-    first = open_log(paths, options)
+    first, chosen, of_log = open_as_meant(request, lidar_only=True)
+    options = replace(chosen, time_offset=options.time_offset)
     summary = first.summary
     topics = (summary.scan_topic or "").split(",")
     if len(topics) > 1:
@@ -130,7 +132,7 @@ def calibrate(request: RunRequest, progress: Callable[[int, float], None] | None
         offset_s -= float(now.values[6])
         if settled or not seen.is_swept:
             break
-    warnings = (*summary.warnings, *of_map)
+    warnings = (*summary.warnings, *of_log, *of_map)
     return LogCalibration(topic, now, offset_s, nominal, summary, number, warnings, options.wheel_size())
 
 

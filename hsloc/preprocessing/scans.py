@@ -24,6 +24,7 @@ import numpy as np
 from hsloc.model.events import Heading, Odometry, PairedScan, Scan, Truth
 from hsloc.model.pose2 import IDENTITY, Pose2, relative_poses
 from hsloc.model.trajectory import Trajectory
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -50,6 +51,16 @@ Scans of n lasers are merged within (n - 1) / n of the slowest laser's period pl
 (n - 1) / n of it always contain a scan of each. Internal: it follows from how drivers stamp."""
 _USUAL_PERIOD_NS, _LONGEST_PERIOD_NS = 100_000_000, 400_000_000
 """A laser's period before it is known, and its maximum. Internal: 2D lidars turn at 5 to 40 Hz."""
+_LEAST_HITS = 20
+"""Least number of returns of a scan that can be told from others. Internal: as the front end's."""
+_MOVED_M, _MOVED_RAD = 0.05, 0.05
+"""Motion (m, rad) after which no scan is the same: several times the steps in which lidars give ranges."""
+_FROZEN_M = 0.5
+"""Way (m) without a scan from which on a result is worth a look: then odometry errs by centimetres."""
+_STUCK_SHARE = 0.5
+"""Scans with the stamp of the one before that are no chance, as a part of all."""
+_END_S, _LONGEST_END_S = 2.0, 1e6
+"""Time (s) by which topics may end apart: recorders stop one after the other; and beyond which clocks differ."""
 _SILENT_NS = 500_000_000
 """Silence after which a laser is not waited for. Internal: longer than the longest period."""
 
@@ -190,6 +201,109 @@ def merged_scans(events: Iterable[Paired]) -> Iterator[Paired]:
     for event in events:
         has_odometry = has_odometry or isinstance(event, Odometry)
         yield lasers.merge(event) if has_odometry and isinstance(event, PairedScan) else event
+
+
+class ScanWatch:
+    """Events without scans that repeat the one before while the odometry moves. To be gone through once.
+
+    A driver that hangs, or a node that publishes the last scan again, gives such scans new stamps; matched, they hold
+    the robot where it was. Real scans have noise, and none is the same from another place. Afterwards `warnings` also
+    gives whether stamps of scans stand still, and whether scans or odometry end early.
+    """
+
+    def __init__(self, events: Iterable[Event], topic: str | None = None) -> None:
+        self._events = events
+        self._topic = topic or "the scans"
+        self._last: dict[str, Scan] = {}
+        self._since: dict[str, Pose2 | None] = {}
+        """Where the odometry was at the first of the scans that are alike, by the laser's frame."""
+        self._pose: Pose2 | None = None
+        self._left_out = self._stuck = self._scans = 0
+        self._first_s = self._frozen_m = 0.0
+        self._start_ns: int | None = None
+        self._ends: dict[type, tuple[int, Pose2 | None]] = {}
+
+    def __iter__(self) -> Iterator[Event]:
+        for event in self._events:
+            if isinstance(event, Scan):
+                self._start_ns = event.stamp_ns if self._start_ns is None else self._start_ns
+                self._scans += 1
+                self._ends[Scan] = (event.stamp_ns, self._pose)
+                if self._is_repeated(event):
+                    continue
+            elif isinstance(event, Odometry):
+                self._pose = event.T_odom_base
+                self._ends[Odometry] = (event.stamp_ns, self._pose)
+            yield event
+
+    def _is_repeated(self, scan: Scan) -> bool:
+        before = self._last.get(scan.frame_id)
+        self._last[scan.frame_id] = scan
+        hits = np.isfinite(scan.ranges)
+        is_alike = before is not None and np.array_equal(scan.ranges, before.ranges, equal_nan=True)
+        if before is not None and not is_alike:
+            self._stuck += scan.stamp_ns == before.stamp_ns
+        if not is_alike or np.count_nonzero(hits) < _LEAST_HITS or np.ptp(scan.ranges[hits]) == 0.0:
+            self._since[scan.frame_id] = self._pose
+            return False
+        since = self._since[scan.frame_id]
+        if since is None or self._pose is None:
+            return False
+        step = since.between(self._pose)
+        moved_m = float(np.hypot(step.x, step.y))
+        if moved_m <= _MOVED_M and abs(step.theta) <= _MOVED_RAD:
+            return False
+        if self._left_out == 0 and self._start_ns is not None:
+            self._first_s = (scan.stamp_ns - self._start_ns) / 1e9
+        self._left_out += 1
+        self._frozen_m = max(self._frozen_m, moved_m)
+        return True
+
+    def warnings(self) -> tuple[RunWarning, ...]:
+        """What was found."""
+        found = []
+        if self._left_out:
+            frozen = self._frozen_m >= _FROZEN_M
+            found.append(
+                RunWarning(
+                    WarningCode.SCANS_FROZEN if frozen else WarningCode.SCANS_REPEATED,
+                    f"{self._left_out} of {self._scans} scans on {self._topic} repeat the one before while the "
+                    f"odometry moves (by up to {self._frozen_m:.2f} m, first at {self._first_s:.1f} s): they are left "
+                    "out, and poses follow the odometry there",
+                    "restart the lidar's driver" if frozen else "record the driver's own topic",
+                )
+            )
+        if self._scans and self._stuck > _STUCK_SHARE * self._scans:
+            found.append(
+                RunWarning(
+                    WarningCode.SCAN_STAMPS_STUCK,
+                    f"{self._stuck} of {self._scans} scans on {self._topic} have the stamp of the one before",
+                    "--stamps log takes the times at which messages were recorded",
+                )
+            )
+        return (*found, *self._of_ends())
+
+    def _of_ends(self) -> Iterator[RunWarning]:
+        if len(self._ends) < 2 or self._pose is None:
+            return
+        (scan_ns, at), (odometry_ns, _) = self._ends[Scan], self._ends[Odometry]
+        seconds = (odometry_ns - scan_ns) / 1e9
+        if seconds > _END_S and at is not None:
+            step = at.between(self._pose)
+            way = float(np.hypot(step.x, step.y))
+            if way > _FROZEN_M:
+                yield RunWarning(
+                    WarningCode.TOPICS_END_APART,
+                    f"the scans end {seconds:.1f} s before the odometry: the last poses, {way:.1f} m away, follow the "
+                    "odometry alone",
+                    "cut the log with --end, or look why the lidar stopped",
+                )
+        elif seconds < -_END_S and seconds > -_LONGEST_END_S:
+            yield RunWarning(
+                WarningCode.TOPICS_END_APART,
+                f"the odometry ends {-seconds:.1f} s before the scans, and the trajectory with it",
+                "--no-odom follows the scans to their end",
+            )
 
 
 class _Lasers:

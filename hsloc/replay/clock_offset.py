@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.log import open_log
+from hsloc.log import LONGEST_OFFSET_S, open_log
 from hsloc.model.estimate import Status
 from hsloc.options import AUTO
 from hsloc.slam.mounting_choice import with_chosen_mountings
 from hsloc.slam.time_offset import HINT_S, Headings, as_option, clock_warnings, find_offset, offsets_of_log
-from hsloc.warnings import WarningCode
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from hsloc.model.trajectory import Trajectory
     from hsloc.request import RunRequest
     from hsloc.slam.time_offset import Offset
-    from hsloc.warnings import RunWarning
 
 KNOWN = (WarningCode.CLOCK_OFFSET, WarningCode.CLOCK_OFFSET_LARGE, WarningCode.CLOCK_OFFSET_APPLIED)
 """Warnings of a run that has looked for the offset."""
@@ -39,11 +38,22 @@ def open_as_meant(
     """The log, and how it is read: with the right one of several mountings, and the offset of its scans if asked for.
 
     Otherwise that is estimated only where log times hint at it: smaller ones show in the result. `time_offset` is known
-    from a run before.
+    from a run before. Stamps of different epochs give way to the log's times.
     """
     front_end = request.config.graph_mapper.front_end
-    log = open_log(request.logs, request.reading())
-    reading, warnings = with_chosen_mountings(log, request.logs, request.reading(), front_end)
+    plain, of_epochs = request.reading(), list[RunWarning]()
+    log = open_log(request.logs, plain)
+    apart_s = abs(log.summary.clocks_apart_s)
+    if apart_s > LONGEST_OFFSET_S and plain.time_offset is None:
+        text = (
+            f"the stamps of scans and odometry are {apart_s:.0f} s apart, of different epochs: the times at which "
+            "messages were recorded are used in their place"
+        )
+        of_epochs = [RunWarning(WarningCode.CLOCKS_APART, text, "put the clocks of lidar and base right")]
+        plain = replace(plain, stamps="log")
+        log = open_log(request.logs, plain)
+    reading, of_mountings = with_chosen_mountings(log, request.logs, plain, front_end)
+    warnings = (*of_epochs, *of_mountings)
     looks = time_offset is None and not lidar_only
     automatic = looks and request.read.time_offset == AUTO
     apart = looks and abs(log.summary.clocks_apart_s) > HINT_S and request.read.time_offset is None
@@ -54,7 +64,7 @@ def open_as_meant(
         warnings = (*warnings, *(warning for _, warning in clock_warnings(found, removed=automatic)))
     if time_offset is not None:
         reading = replace(reading, time_offset=time_offset)
-    return (log if reading == request.reading() else open_log(request.logs, reading)), reading, warnings
+    return (log if reading == plain else open_log(request.logs, reading)), reading, warnings
 
 
 def matched_headings(scans: ScanDiagnostics, odometry: Trajectory, trajectory: Trajectory) -> tuple[Headings, Headings]:

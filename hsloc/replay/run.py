@@ -18,6 +18,7 @@ from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.model.trajectory import Trajectory
 from hsloc.preprocessing.odometry import ContinuousOdometry, OdometryWatch, UnusableOdometry
+from hsloc.preprocessing.scans import ScanWatch
 from hsloc.replay.clock_offset import ClockEvidence, clock_offsets, open_as_meant
 from hsloc.replay.engine import rarely_collected, replay
 from hsloc.replay.map_and_start import find_map, find_start, first_odometry, load_state, require_map, resumed
@@ -235,10 +236,14 @@ def _run_with(
     prepared = time.perf_counter()
     history = RunHistory(request.config.localiser.smoothing_model() if localise else None)
     events = ContinuousOdometry(_events(request, log, lidar_only, localise), log.summary.odom_topic)
+    watch = ScanWatch(events, log.summary.scan_topic)
+    watched = events if lidar_only else watch
     # Turns that were joined of segments are known beam by beam; a whole turn is deskewed if the user asks for it.
     deskew = request.read.deskew or (log.summary.segments > 1 and not lidar_only)
     with rarely_collected():
-        for event, estimate in replay(_reported(log, events, history, progress), estimator, deskew=deskew, first=first):
+        for event, estimate in replay(
+            _reported(log, watched, history, progress), estimator, deskew=deskew, first=first
+        ):
             history.add(event, estimate)
     replayed = time.perf_counter()
     is_cut = request.read.start_s is not None or request.read.end_s is not None
@@ -273,7 +278,7 @@ def _run_with(
         grid=require_map(grid),
         diagnostics=_diagnostics(history, mapping),
         losses=log.losses,
-        warnings=(*log.summary.warnings, *warnings, *events.warnings()),
+        warnings=(*log.summary.warnings, *warnings, *events.warnings(), *watch.warnings()),
         seconds=seconds,
         mode="localise" if localise else "slam",
         mapping=mapping,

@@ -371,7 +371,7 @@ class LogSession:
     def _warn_of_clocks(self) -> None:
         self._clocks_apart_s = 0.0
         odom = self._first_link if self.odom is None else (self.odom.log_time_ns, self.odom.stamp_ns)
-        if odom is None or not odom[1]:
+        if odom is None or not odom[1] or self.options.stamps == "log":
             return
         for topic, first in self.scans.items():
             if first is None or not first.stamp_ns:

@@ -36,11 +36,15 @@ _MAX_UNNAMED = 1000
 
 
 class LogFile(NamedTuple):
-    """A file to read, its kind (`mcap`, `db3`, `bag` or `text`), and the name that people know it by."""
+    """A file to read, its kind (`mcap`, `db3`, `bag` or `text`), and the name that people know it by.
+
+    With `is_cut` its packing was damaged or ended too early, and the file holds what came before.
+    """
 
     path: Path
     kind: str
     shown: Path
+    is_cut: bool = False
 
 
 class Scratch:
@@ -132,8 +136,11 @@ def _of_file(path: Path, scratch: Scratch, shown: Path, layers: int = 0) -> list
             return [LogFile(path, "text", shown)]
         if layers == _MAX_LAYERS:
             raise LogFormatError(f"{shown}: is packed more than {_MAX_LAYERS} times; unpack it first")
-        found = unpack(path, head, scratch.folder)
-        return expand(found, scratch, shown) if found.is_dir() else _of_file(found, scratch, shown, layers + 1)
+        found, is_cut = unpack(path, head, scratch.folder)
+        if found.is_dir():
+            return expand(found, scratch, shown)
+        inside = _of_file(found, scratch, shown, layers + 1)
+        return [file._replace(is_cut=file.is_cut or is_cut) for file in inside]
     kind = kind_of(head)
     if not kind:
         raise LogFormatError(f"{shown}: {_why_no_log(path, head)}")
@@ -193,7 +200,8 @@ MAX_TOTAL_RATIO = 100
 FREE_UNPACKED_BYTES = 4 << 30
 """Bytes that a packed log may unpack to: 100 times its size, and in any case 4 GiB."""
 _MAX_MEMBERS = 1000
-_BLOCK = 1 << 20
+_BLOCK, _SMALL_BLOCK = 1 << 20, 1 << 12
+"""Bytes that are unpacked at a time, and where the packing is damaged: what is read with the damage is lost."""
 _PACKED_ENDINGS = (".gz", ".zst", ".zstd", ".bz2", ".xz", ".lz4", ".zip", ".tar", ".tgz")
 _BROKEN = (EOFError, gzip.BadGzipFile, zlib.error, lzma.LZMAError, zipfile.BadZipFile, tarfile.TarError, ValueError)
 
@@ -222,26 +230,39 @@ def unpacked_head(path: Path, head: bytes) -> bytes:
         return b""
 
 
-def unpack(path: Path, head: bytes, folder: Path) -> Path:
+class _DamagedPacking(LogFormatError):
+    """What is packed is damaged or ends too early."""
+
+
+def unpack(path: Path, head: bytes, folder: Path) -> tuple[Path, bool]:
     """Unpack a file into `folder`: the file that was packed, or a folder with the files of the archive.
 
-    Raises LogFormatError for what is damaged or unpacks to too much, and LogError where there is no space for it.
+    Also whether a log was cut off where its packing is damaged. Raises LogFormatError for what is damaged otherwise or
+    unpacks to too much, and LogError where there is no space for it.
     """
     allowed = max(FREE_UNPACKED_BYTES, MAX_TOTAL_RATIO * path.stat().st_size)
     target = Path(tempfile.mkdtemp(dir=folder)) / plain_name(path)
     try:
         if head.startswith(_ZIP):
-            return _unpack_zip(path, target, allowed)
-        with _opened(path, head) as stream, target.open("wb") as out:
-            _copy(stream, out, path, allowed)
+            return _unpack_zip(path, target, allowed), False
+        try:
+            with _opened(path, head) as stream, target.open("wb") as out:
+                copied = _copy(stream, out, path, allowed)
+                is_cut = copied < _stated_size(head)  # zstd raises nothing where the end is missing.
+            if is_cut and not copied:
+                raise _damaged(path, "nothing of it is whole")
+        except (*_BROKEN, _DamagedPacking):
+            if not _is_salvaged(path, head, target):
+                raise
+            return target, True
         with target.open("rb") as file:
             inner = file.read(_HEAD_BYTES)
         if not _is_tar(inner):
-            return target
+            return target, is_cut
         archive = target.rename(target.with_name(target.name + ".packed"))
         found = _unpack_tar(archive, target.with_suffix(""), path, allowed)
         archive.unlink()
-        return found
+        return found, False
     except _BROKEN as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
         raise _damaged(path, reason) from error
@@ -261,7 +282,7 @@ def _is_tar(head: bytes) -> bool:
 
 
 def _damaged(path: Path, reason: object) -> LogFormatError:
-    return LogFormatError(f"{path}: its compression is damaged or ends too early ({reason})")
+    return _DamagedPacking(f"{path}: its compression is damaged or ends too early ({reason})")
 
 
 @contextmanager
@@ -291,6 +312,26 @@ def _opened(path: Path, head: bytes) -> Iterator[BinaryIO]:
     else:
         with path.open("rb") as plain:
             yield plain
+
+
+def _stated_size(head: bytes) -> int:
+    """How many bytes a file that is packed by zstd says that it holds; 0 where it does not say."""
+    if not head.startswith(ZSTD):
+        return 0
+    import zstandard
+
+    return int(max(zstandard.frame_content_size(head), 0))
+
+
+def _is_salvaged(path: Path, head: bytes, target: Path) -> bool:
+    """Whether what can be unpacked before the damage looks like a log; it is then in `target`."""
+    try:
+        with _opened(path, head) as stream, target.open("wb") as out:
+            while block := stream.read(_SMALL_BLOCK):
+                out.write(block)
+    except (*_BROKEN, _DamagedPacking):
+        pass
+    return target.stat().st_size >= _HEAD_BYTES and kind_of(_head(target)) != ""
 
 
 def _copy(stream: IO[bytes], out: BinaryIO, path: Path, allowed: int) -> int:

@@ -148,10 +148,21 @@ def open_log(paths: Path | str | Sequence[Path | str], options: ReadOptions | No
     if "text" in kinds:
         if len(files) > 1:
             raise LogFormatError(f"{files[0].shown}: text logs are read one at a time; convert them first")
-        return Log(_text_source(files[0], options), options, originals, scratch)
+        return Log(_noted(_text_source(files[0], options), files), options, originals, scratch)
     from hsloc.log.session.message_source import RosSource
 
-    return Log(RosSource([_container(file) for file in files], options), options, originals, scratch)
+    source = RosSource([_container(file) for file in files], options)
+    return Log(_noted(source, files), options, originals, scratch)
+
+
+def _noted(source: Source, files: Sequence[LogFile]) -> Source:
+    """The source, with what its packing lost among its losses."""
+    losses = source.losses_at_opening
+    for file in files:
+        if file.is_cut:
+            losses.note(f"{file.shown}: its compression is damaged or ends too early: it was read as far as it goes")
+            losses.truncated_files = max(losses.truncated_files, 1)
+    return source
 
 
 def is_log(path: Path) -> bool:

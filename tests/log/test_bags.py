@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import gzip
 import shutil
 from typing import TYPE_CHECKING
 
 import log_formats
+import numpy as np
 import pytest
+import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from log_builders import describe, write_run
+from mcap.records import Channel
 from rosbags.rosbag2 import StoragePlugin
 
 from hsloc.errors import HslocError, LogFormatError
@@ -83,6 +87,35 @@ def test_a_cut_bag_is_one_line(tmp_path: Path, bag1: Path) -> None:
     with pytest.raises(LogFormatError, match=r"cut\.bag: cannot be read as a ROS 1 bag") as caught:
         open_log(path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_bag_without_its_index_is_read_as_far_as_it_goes(tmp_path: Path, mcap: Path) -> None:
+    whole = log_formats.bag1(mcap, tmp_path / "whole.bag", chunk_bytes=2000)
+    expected = list(map(describe, open_log(whole).events()))
+    path = tmp_path / "cut.bag"
+    path.write_bytes(whole.read_bytes()[: whole.stat().st_size * 2 // 3])
+    log = open_log(path)
+    found = list(map(describe, log.events()))
+    assert 0.4 * len(expected) < len(found) < len(expected)
+    assert found == expected[: len(found)]
+    assert log.losses.truncated_files == 1
+    assert "whole chunks are read" in " ".join(log.losses.reasons)
+
+
+@pytest.mark.parametrize("packed", ["run.mcap.gz", "run.mcap.zst"])
+def test_a_packed_log_that_was_cut_is_read_as_far_as_it_goes(tmp_path: Path, mcap: Path, packed: str) -> None:
+    # Noise on another topic, the last fifth of which is cut off.
+    items, noise = list(log_formats.messages(mcap)), np.random.default_rng(0).bytes(500_000)
+    channel = Channel(id=9, topic="/noise", message_encoding="raw", metadata={}, schema_id=0)
+    items.append((items[0][0], channel, items[-1][2] + 1, noise))
+    content = log_formats.write(tmp_path / "mixed.mcap", items, chunk_size=1000).read_bytes()
+    path = tmp_path / packed
+    data = gzip.compress(content) if packed.endswith("gz") else zstandard.compress(content)
+    path.write_bytes(data[: len(data) * 4 // 5])
+    log = open_log(path)
+    assert list(map(describe, log.events())) == list(map(describe, open_log(mcap).events()))
+    assert log.losses.truncated_files == 1
+    assert any("as far as it goes" in reason for reason in log.losses.reasons)
 
 
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])

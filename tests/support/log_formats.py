@@ -110,9 +110,10 @@ def ros1_mcap(source: Path, target: Path) -> Path:
     return write(target, items(), source)
 
 
-def bag1(source: Path, target: Path) -> Path:
+def bag1(source: Path, target: Path, chunk_bytes: int = 1 << 20) -> Path:
     """As a ROS 1 bag, compressed."""
     compressed = Writer1(target)
+    compressed.chunk_threshold = chunk_bytes
     compressed.set_compression(Writer1.CompressionFormat.LZ4)
     with AnyReader([source]) as reader, compressed as writer:
         connections: dict[str, Any] = {}

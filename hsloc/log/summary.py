@@ -315,7 +315,7 @@ class Losses:
             ("messages without stamp; the log's time was taken", self.stamps_zero),
             ("messages without stamp were dropped", self.stamps_zero_dropped),
             (
-                "orientations are quaternions of zeros: left out between others, else taken as heading 0",
+                "orientations are quaternions of zeros or of z alone: left out between others, else taken as heading 0",
                 self.orientations_unset,
             ),
         )

@@ -8,8 +8,12 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from math import acos, atan2, hypot, sqrt
+from typing import TYPE_CHECKING
 
 from hsloc.model import Pose2
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +200,19 @@ class FrameTree:
         for frame in frames:
             total = self._links[frame][1] @ total
         return total
+
+
+_UNIT = 1e-3
+"""Error of the length of a quaternion that was written with few digits."""
+
+
+def states_rotation(quaternion: Sequence[float]) -> bool:
+    """Whether a quaternion (x, y, z, w) states a rotation: not where it was never filled, or z alone was.
+
+    With w = 0 the robot would look straight back, which no robot does all the time; then z is 1 or -1.
+    """
+    x, y, z, w = quaternion
+    return bool(x or y or w) or abs(abs(z) - 1.0) <= _UNIT
 
 
 def differ(first: tuple[str, Transform3], second: tuple[str, Transform3]) -> bool:

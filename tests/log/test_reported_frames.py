@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -197,12 +198,13 @@ def test_a_start_pose_in_the_frame_of_the_odometry_is_moved_or_left_out(tmp_path
         assert any("frame odom" in str(warning) for warning in found.summary.warnings)
 
 
-def test_orientations_of_zeros_are_counted(tmp_path: Path, plain: Path) -> None:
+@pytest.mark.parametrize("quaternion", [bytes(32), struct.pack("<4d", 0.0, 0.0, 0.3, 0.0)], ids=["zeros", "z alone"])
+def test_orientations_that_were_never_filled_are_counted(tmp_path: Path, plain: Path, quaternion: bytes) -> None:
     def zeroed(number: int, name: str, data: bytes) -> bytes:
         if name != definitions.ODOMETRY or not (number < 40 or 80 < number < 84):
             return data
         pose = len(data) - 680
-        return data[: pose + 24] + bytes(32) + data[pose + 56 :]
+        return data[: pose + 24] + quaternion + data[pose + 56 :]
 
     items = [(s, c, t, zeroed(n, s.name, data)) for n, (s, c, t, data) in enumerate(log_formats.messages(plain))]
     log = open_log(log_formats.write(tmp_path / "zeros.mcap", items))

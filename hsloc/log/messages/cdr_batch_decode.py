@@ -15,6 +15,7 @@ import numpy as np
 
 from hsloc.log.messages import decode, definitions
 from hsloc.log.messages.decode import NANOSECONDS
+from hsloc.log.transforms import states_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -47,7 +48,7 @@ class PoseColumns(NamedTuple):
     theta: list[float]
     covariances: Sequence[NDArray[np.float64] | None]
     has_headings: bool = True
-    """Whether no quaternion consists of zeros."""
+    """Whether each quaternion states a rotation."""
 
 
 def odometry(payloads: Sequence[Payload], *, covariances: bool = True) -> PoseColumns | None:
@@ -96,7 +97,8 @@ def _poses(rows: NDArray[np.void], covariances: Sequence[NDArray[np.float64] | N
     # Not numpy's arctan2, whose last bit depends on the processor.
     theta = list(map(atan2, sines.tolist(), cosines.tolist()))
     stamps = rows["seconds"].astype(np.int64) * NANOSECONDS + rows["nanoseconds"]
-    has_headings = bool(((qx != 0.0) | (qy != 0.0) | (qz != 0.0) | (qw != 0.0)).all())
+    unset = (qx == 0.0) & (qy == 0.0) & (qw == 0.0)
+    has_headings = not any(not states_rotation((0.0, 0.0, z, 0.0)) for z in qz[unset].tolist())
     return PoseColumns(stamps, x, y, theta, covariances, has_headings)
 
 

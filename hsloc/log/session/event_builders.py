@@ -14,7 +14,7 @@ from hsloc.log.range_codes import NoReturnCode
 from hsloc.log.session.ordering import Arrivals
 from hsloc.log.session.scan_geometry import ScanFixes, ScanSurvey, TurnAssembler
 from hsloc.log.session.transform_topics import is_map_frame
-from hsloc.log.transforms import Transform3
+from hsloc.log.transforms import Transform3, states_rotation
 from hsloc.model import IDENTITY, Heading, Odometry, Pose2, Scan, Truth, wrap_angle
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     Stamped = tuple[TopicClock, Event]
 
+_NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 _LONGEST_S = 1.0
 """A velocity holds for this long (s) at most: publishers that fall silent do so when the robot stands."""
 GAP_METRES = 0.3
@@ -228,7 +229,7 @@ class OdometryFeed:
         pose = message.pose if self._T_child_base is None else message.pose @ self._T_child_base
         if self.is_truth:
             return ((self._clock, Truth(stamp, pose)),)
-        has_heading = any(getattr(message, "quaternion", (1.0,)))
+        has_heading = states_rotation(getattr(message, "quaternion", _NO_ROTATION))
         if not has_heading:
             self._losses.orientations_unset[self.topic] += 1
         if self._gaps.is_gap(message.pose, has_heading):
@@ -357,7 +358,7 @@ class TransformFeed:
         if self._odometry is not None:
             stamp = self._odometry.stamp(link.stamp_ns, log_time_ns)
             if stamp is not None:
-                has_heading = any(link.transform.rotation)
+                has_heading = states_rotation(link.transform.rotation)
                 if not has_heading:
                     self._losses.orientations_unset[self.topic] += 1
                 if not self._gaps.is_gap(pose, has_heading):

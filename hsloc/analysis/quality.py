@@ -8,7 +8,7 @@ import numpy as np
 
 from hsloc.localisation.states import localisation_reasons
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
-from hsloc.replay.clock_offset import KNOWN, is_matched, matched_headings
+from hsloc.replay.clock_offset import KNOWN, is_lost, is_matched, matched_headings
 from hsloc.slam.time_offset import Headings, clock_warnings, drift_warning, find_drift, find_offset, offsets_of_log
 from hsloc.trajectory_io.tum import NS_PER_S
 from hsloc.warnings import RunWarning, WarningCode
@@ -112,12 +112,12 @@ def offset_warnings(result: Result) -> list[RunWarning]:
         matched = is_matched(result.diagnostics)
         scans = Headings.of(stamps[matched], result.mapping.scan_poses[matched, 2])
         turned = Headings.of(odometry.stamps_ns, odometry.poses[:, 2])
-        is_lost = bool(2 * np.count_nonzero(matched) < len(matched))
+        lost = is_lost(result.diagnostics)
     else:
         scans, turned = matched_headings(result.diagnostics, odometry, result.trajectory)
-        is_lost = False  # then the run itself has looked for them
+        lost = False  # then the run itself has looked for them
     offset = find_offset(scans, turned)
-    if not (offset.is_significant or is_lost):
+    if not (offset.is_significant or lost):
         drift = find_drift(scans, turned, offset.seconds)
         return [drift_warning(result.summary.scan_topic or "the scans", drift)] if drift else []
     # Poses are weighed with the odometry, which hides a part of the offset: the scans alone show the whole of it.

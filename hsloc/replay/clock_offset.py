@@ -84,6 +84,12 @@ def is_matched(scans: ScanDiagnostics) -> NDArray[np.bool_]:
     return np.isin(scans.status, (Status.MATCHED.value, Status.RELOCALISED.value))
 
 
+def is_lost(scans: ScanDiagnostics) -> bool:
+    """Whether most scans that were to be matched found no match; those the motion gate passed over were not to be."""
+    passed_over = np.count_nonzero(np.isin(scans.status, (Status.PREDICTED.value,)))
+    return 2 * int(np.count_nonzero(is_matched(scans))) < len(scans.status) - int(passed_over)
+
+
 @dataclass(frozen=True, slots=True)
 class ClockEvidence:
     """What the result of a localiser shows of the clocks.
@@ -102,9 +108,8 @@ class ClockEvidence:
         cls, scans: ScanDiagnostics, odometry: Trajectory, trajectory: Trajectory, localised: NDArray[np.bool_]
     ) -> ClockEvidence:
         """Of a localiser's result with odometry; `localised` (n,) says which of its poses are."""
-        matched = is_matched(scans)
         offset = find_offset(*matched_headings(scans, odometry, trajectory))
-        return cls(offset, float(localised.mean()), 2 * int(np.count_nonzero(matched)) < len(matched))
+        return cls(offset, float(localised.mean()), is_lost(scans))
 
     @property
     def hints(self) -> bool:

@@ -125,6 +125,8 @@ class WarningCode(StrEnum):
     """The map is larger or smaller than what the lidar measures: the resolution in its YAML may be wrong."""
     LASER_MISFIT = "laser_misfit"
     """The scans of one laser fit the map far worse than those of another."""
+    EXTRINSICS_WRONG = "extrinsics_wrong"
+    """The steps between matches and those of the odometry agree only if the laser is mounted elsewhere than stated."""
     EXTRINSICS_DISAGREE = "extrinsics_disagree"
     """Two lasers, each matched alone, disagree about the pose of the base: a mounting is wrong."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import degrees, hypot
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +28,7 @@ _MAX_WITHOUT_PLACE = 0.5
 """Fraction of scans without a place from which on the poses of the others are not to be trusted."""
 _VERDICTS = {
     WarningCode.LASER_MISFIT: Verdict.CHECK,
+    WarningCode.EXTRINSICS_WRONG: Verdict.CHECK,
     WarningCode.EXTRINSICS_DISAGREE: Verdict.CHECK,
     WarningCode.EXTRINSICS_UNDECIDED: Verdict.CHECK,
     WarningCode.SCANS_FROZEN: Verdict.CHECK,
@@ -46,7 +48,7 @@ _FAILING = {"failed": (Verdict.FAILED,), "check": (Verdict.FAILED, Verdict.CHECK
 
 
 def quality_warnings(result: Result) -> list[RunWarning]:
-    """Localisation: the map has another scale than the lidar; or most scans were rejected or left the pose open.
+    """Localisation: the map has another scale, the laser another mounting, or most scans left the pose open.
 
     A pose found once may then be a chance fit. Mapping: single scans that are beside their place.
     """
@@ -54,14 +56,14 @@ def quality_warnings(result: Result) -> list[RunWarning]:
         return _stray_warnings(result.mapping, result)
     if result.mode != "localise":
         return []
-    of_scale = _scale_warnings(result)
+    of_sensor = [*_scale_warnings(result), *_mounting_warnings(result)]
     without, scans = int(_without_place(result).sum()), len(result.diagnostics)
     if without <= _MAX_WITHOUT_PLACE * scans:
-        return of_scale
+        return of_sensor
     share = _share(result)
     meaning = "every pose is a guess" if share == 0.0 else f"the {100 * share:.0f} % localised poses may be wrong"
     return [
-        *of_scale,
+        *of_sensor,
         RunWarning(
             WarningCode.SCANS_WITHOUT_PLACE,
             f"{without} of {scans} scans found no place on the map, so {meaning}",
@@ -96,6 +98,23 @@ def _scale_warnings(result: Result) -> list[RunWarning]:
             f"the map is {100 * abs(scale.value - 1.0):.1f} % {size} than the lidar measures: scale {scale.value:.4f} "
             f"+- {scale.sigma:.4f}, so poses are off by {abs(scale.value - 1.0):.3f} m per metre from the map's corner",
             f"if the ranges are right, set resolution: {cell / scale.value:.5g} in the map's YAML (it is {cell:g})",
+        )
+    ]
+
+
+def _mounting_warnings(result: Result) -> list[RunWarning]:
+    found = result.mounting_error
+    if found is None or not found.is_significant or len(result.summary.lasers) != 1:
+        return []
+    (laser,) = result.summary.lasers
+    error, (x, y, yaw) = found.error, found.sigma
+    right = error @ laser.T_base_laser
+    return [
+        RunWarning(
+            WarningCode.EXTRINSICS_WRONG,
+            f"scans and odometry agree if the laser is {hypot(error.x, error.y):.3f} +- {hypot(x, y):.3f} m and "
+            f"{degrees(error.theta):.1f} +- {degrees(yaw):.1f} deg from where it is stated, and so are the poses",
+            f"measure it, or hsloc calibrate; --laser-pose {right.x:.3f},{right.y:.3f},{right.theta:.4f}",
         )
     ]
 

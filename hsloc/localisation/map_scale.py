@@ -87,15 +87,15 @@ class MapScale:
         """Whether poses far from the map's corner may be wrong by the scale: it need not be beyond doubt for that."""
         return abs(self.value - 1.0) > max(_DOUBTED_SIGMAS * self.sigma, _LEAST)
 
-    def position_errors(self, poses: F64) -> F64:
-        """Errors (n, 2) in x and y of poses (n, 3) that come from the scale (m): the cells grow from the corner.
+    def pose_errors(self, poses: F64) -> F64:
+        """Errors (n, 3) of poses (n, 3) that come from the scale (m, m, 0): the cells grow from the corner.
 
         0 where the scale is not doubted.
         """
-        if not self.is_doubted:
-            return np.zeros((len(poses), 2))
-        largest = abs(self.value - 1.0) + self.sigma
-        errors: F64 = largest * np.abs(poses[:, :2] - self.corner)
+        errors = np.zeros((len(poses), 3))
+        if self.is_doubted:
+            largest = abs(self.value - 1.0) + self.sigma
+            errors[:, :2] = largest * np.abs(poses[:, :2] - self.corner)
         return errors
 
 

@@ -75,14 +75,15 @@ class StateRows:
         return np.array([state is State.LOCALISED for state in self.state], dtype=np.bool_)
 
 
-def with_position_errors(rows: StateRows, errors: F64, reason: str) -> StateRows:
-    """The rows with further errors (n, 2) of x and y (m); where they exceed what is localised a pose is predicted.
+def with_pose_errors(rows: StateRows, errors: F64, reason: str) -> StateRows:
+    """The rows with further errors (n, 3) in m, m, rad; where they exceed what is localised a pose is predicted.
 
-    They are known in size and no standard deviations: beside 2.5 of those they have to stay within 0.25 m.
+    They are known in size and no standard deviations: beside 2.5 of those they have to stay within 0.25 m and 5 deg.
     """
-    noise, sigma = rows.sigma[:, :2].max(axis=1), rows.sigma.copy()
-    sigma[:, :2] = np.hypot(sigma[:, :2], errors)
-    vague = rows.is_localised() & (np.hypot(*errors.T) > _WITHIN * (MAX_SIGMA - noise))
+    noise, sigma = rows.sigma[:, :2].max(axis=1), np.hypot(rows.sigma, errors)
+    is_far = np.hypot(errors[:, 0], errors[:, 1]) > _WITHIN * (MAX_SIGMA - noise)
+    is_turned = errors[:, 2] > _WITHIN * (MAX_SIGMA_ANGLE - rows.sigma[:, 2])
+    vague = rows.is_localised() & (is_far | is_turned)
     states = tuple(State.PREDICTED if each else state for each, state in zip(vague, rows.state, strict=True))
     reasons = tuple(reason if each else before for each, before in zip(vague, rows.reason, strict=True))
     return replace(rows, state=states, sigma=sigma, reason=reasons)

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
     from hsloc.localisation.localiser import Localiser
     from hsloc.localisation.map_scale import MapScale
+    from hsloc.localisation.mounting_error import MountingError
     from hsloc.localisation.states import StateRows
     from hsloc.log import Log, LogSummary, Losses, ReadOptions
     from hsloc.matching.likelihood_field import LikelihoodField
@@ -75,7 +76,8 @@ class Result:
     `true_grid` is the one that the log carries, if any. `likelihood` is the field that was matched on, of a given map.
     `states` are the states of the poses of a localiser that weighs evidence; `localised` are those in this state,
     `tracked` the poses that were not searched for, whether their scans fit or not.
-    `map_scale` is the size of a given map by what the lidar measures, `ambiguities` where several places of it fit.
+    `map_scale` is the size of a given map by what the lidar measures, `mounting_error` where the only laser is by the
+    odometry, from where it is said to be, `ambiguities` where several places of it fit.
     With `lidar_only` no odometry of the log was used: a localiser's `odometry` is then that of the scans. `deskewed`
     says whether the beams were moved to where the robot was when each was measured.
     """
@@ -99,6 +101,7 @@ class Result:
     states: StateRows | None = None
     tracked: NDArray[np.bool_] | None = None
     map_scale: MapScale | None = None
+    mounting_error: MountingError | None = None
     ambiguities: tuple[Ambiguity, ...] = ()
     lidar_only: bool = False
     deskewed: bool = False
@@ -287,6 +290,7 @@ def _run_with(
         states=states,
         tracked=tracked,
         map_scale=scale,
+        mounting_error=history.mounting_error() if localise else None,
         ambiguities=history.ambiguities(states),
         lidar_only=lidar_only,
         deskewed=deskew,

@@ -15,7 +15,8 @@ from hsloc.localisation.kalman_filter import (
     predict_covariance,
     smooth_matches,
 )
-from hsloc.localisation.states import StateLog, with_position_errors
+from hsloc.localisation.mounting_error import mounting_error
+from hsloc.localisation.states import StateLog, with_pose_errors
 from hsloc.model.estimate import ScanDiagnostics, State, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
 from hsloc.model.pose2 import Pose2, compose_poses
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
     from hsloc.localisation.map_scale import MapScale
     from hsloc.localisation.motion_models import MotionModel
+    from hsloc.localisation.mounting_error import MountingError
     from hsloc.localisation.states import StateRows
     from hsloc.model.certificate import Certificate
     from hsloc.model.estimate import Ambiguity, Estimate
@@ -46,6 +48,7 @@ class RunHistory:
         self._anchor_states: list[int] = []
         self._smoothed: SmoothedMatches | None = None
         self._track_ended = True
+        self._frames: set[str] = set()
         self._odometry_stamps = array("q")
         self._odometry = array("d")
         self._poses = array("d")
@@ -80,6 +83,7 @@ class RunHistory:
             self._truth_stamps.append(event.stamp_ns)
             self._truth.extend((truth.x, truth.y, truth.theta))
         elif estimate is not None:
+            self._frames.add(event.scan.frame_id)
             self._add_scan(estimate)
             self._anchor(event, estimate)
 
@@ -177,7 +181,8 @@ class RunHistory:
     def states(self, scale: MapScale | None = None) -> StateRows | None:
         """The state of each pose of the trajectory in hindsight; None for an estimator that weighs no evidence.
 
-        Where the map has another `scale` than the lidar, poses are as uncertain as that makes them.
+        Where the map has another `scale` than the lidar, or the laser is mounted elsewhere than stated, poses are as
+        uncertain as that makes them.
         """
         if len(self._states) == 0:
             return None
@@ -185,10 +190,18 @@ class RunHistory:
         covariances = dict(zip(self._anchor_states, smoothed.covariances, strict=True))
         between = bridge_variances(self.odometry().poses, self._anchors, smoothed.motion)
         rows = self._states.at_odometry(len(self._odometry_stamps), covariances, between)
-        if scale is None or not scale.is_doubted:
-            return rows
-        errors = scale.position_errors(self.trajectory()[0].poses)
-        return with_position_errors(rows, errors, f"the scale of the map is {scale.value:.3f} +- {scale.sigma:.3f}")
+        if scale is not None and scale.is_doubted:
+            reason = f"the scale of the map is {scale.value:.3f} +- {scale.sigma:.3f}"
+            rows = with_pose_errors(rows, scale.pose_errors(self.trajectory()[0].poses), reason)
+        mounting = self.mounting_error()
+        if mounting is not None and mounting.is_significant:
+            errors = mounting.pose_errors(self.trajectory()[0].poses)
+            rows = with_pose_errors(rows, errors, "the laser is mounted elsewhere than stated")
+        return rows
+
+    def mounting_error(self) -> MountingError | None:
+        """How far the laser is from where it is said to be; None where that is not known, or with several lasers."""
+        return mounting_error(self._anchors) if len(self._frames) == 1 else None
 
     def ambiguities(self, states: StateRows | None) -> tuple[Ambiguity, ...]:
         """Between which places the run does not decide, and when; `states` are those of its poses."""

@@ -65,9 +65,9 @@ def test_scans_of_one_place_count_once() -> None:
 def test_positions_are_off_by_their_distance_from_the_corner() -> None:
     poses = np.array([(1.0, 2.0, 0.0), (11.0, -8.0, 1.0)])
     significant = MapScale(1.02, 0.001, (1.0, 2.0))
-    np.testing.assert_allclose(significant.position_errors(poses), [(0.0, 0.0), (0.21, 0.21)])
+    np.testing.assert_allclose(significant.pose_errors(poses), [(0.0, 0.0, 0.0), (0.21, 0.21, 0.0)])
     doubted = MapScale(1.02, 0.009, (1.0, 2.0))
     assert doubted.is_doubted
     assert not doubted.is_significant
-    np.testing.assert_allclose(doubted.position_errors(poses)[1], (0.29, 0.29))
-    np.testing.assert_array_equal(MapScale(1.02, 0.011).position_errors(poses), np.zeros((2, 2)))
+    np.testing.assert_allclose(doubted.pose_errors(poses)[1], (0.29, 0.29, 0.0))
+    np.testing.assert_array_equal(MapScale(1.02, 0.011).pose_errors(poses), np.zeros((2, 3)))

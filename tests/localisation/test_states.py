@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hsloc.export.results_folder import STATES_HEADER, write_states
-from hsloc.localisation.states import StateLog, StateRows, localisation_reasons, with_position_errors
+from hsloc.localisation.states import StateLog, StateRows, localisation_reasons, with_pose_errors
 from hsloc.model import Estimate, Evidence, Pose2, State, Status, Trajectory
 from hsloc.model.estimate import LikelyPlace
 from hsloc.model.verdict import Verdict, verdict_of
@@ -156,8 +156,9 @@ def test_states_csv_has_a_line_for_each_pose(tmp_path: Path) -> None:
 
 def test_poses_on_a_map_of_a_wrong_scale_are_predicted_where_the_error_matters() -> None:
     states = judged(*(estimate(k) for k in range(4)))
-    errors = np.array([(0.0, 0.0), (0.15, 0.0), (0.15, 0.15), (0.3, 0.0)] * 2)
-    found = with_position_errors(states, errors, "the scale")
-    assert [state is State.LOCALISED for state in found.state] == [True, True, False, False] * 2
+    errors = np.array([(0.0, 0.0, 0.0), (0.15, 0.0, 0.0), (0.15, 0.15, 0.0), (0.3, 0.0, 0.0)] * 2)
+    errors[4:6, 2] = np.radians((4.0, 4.5))
+    found = with_pose_errors(states, errors, "the scale")
+    assert [state is State.LOCALISED for state in found.state] == [True, True, False, False, True, False, False, False]
     assert found.reason[3] == "the scale"
     np.testing.assert_allclose(found.sigma[2], (np.hypot(0.02, 0.15), np.hypot(0.02, 0.15), 0.005))

@@ -1,0 +1,113 @@
+"""How far the laser is from where it is said to be, by the steps between matches and those of the odometry.
+
+A laser that is mounted elsewhere by `X` (x, y, yaw in the base frame) puts each match there: `M = B X` in place of the
+base's pose `B`. While the robot drives straight on, a wrong yaw looks like driving aslant; while it turns, a wrong
+place looks like a step aside. A step of the odometry `S` is seen as `X^-1 S X`; to first order what is seen less the
+odometry is `k S_t + (R(S_theta) - 1) (x, y) + yaw (S_y, -S_x)`, linear in `X` and in the odometry's scale `k`. The same
+equations as in Censi et al. (T-RO 2013), about the mounting that is stated. `hsloc calibrate` finds more, from the
+scans alone; this takes no further match, and shows whether that is worth while.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import hypot, radians
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.model.pose2 import Pose2, relative_poses, wrap_angles
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from hsloc.localisation.kalman_filter import Anchor
+
+    F64 = NDArray[np.float64]
+
+_FEWEST = 40
+"""Steps below which nothing is said: about 8 m."""
+_BLOCKS = 10
+"""Parts of the run whose errors count as independent of each other: what odometry gets wrong lasts for many steps."""
+_LEAST_TURNED = 6.0
+"""Rotation to the side to which less is turned (rad): to one side alone, slip looks like another place of the laser."""
+_LONGEST_M = 1.0
+"""Steps that are longer hold refused scans (m)."""
+_MIN_SIGMAS = 4.0
+"""Minimum ratio of an error to its standard deviation: once in 16,000 runs under Gaussian errors."""
+_LEAST_M, _LEAST_RAD = 0.05, radians(2.0)
+"""Smaller errors are not reported: a ruler and an eye do no better."""
+
+
+@dataclass(frozen=True, slots=True)
+class MountingError:
+    """The laser is at `error @ mounting` where `mounting` is stated; standard deviations in m, m, rad."""
+
+    error: Pose2
+    sigma: tuple[float, float, float]
+
+    @property
+    def is_displaced(self) -> bool:
+        """Whether the place is wrong beyond doubt, and by enough to matter."""
+        size = hypot(self.error.x, self.error.y)
+        return size > max(_LEAST_M, _MIN_SIGMAS * hypot(*self.sigma[:2]))
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether the yaw is wrong beyond doubt, and by enough to matter."""
+        return abs(self.error.theta) > max(_LEAST_RAD, _MIN_SIGMAS * self.sigma[2])
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether place or yaw are."""
+        return self.is_displaced or self.is_turned
+
+    def pose_errors(self, poses: F64) -> F64:
+        """What it makes of poses (n, 3) on a map, as absolute errors (n, 3) in m, m, rad; 0 where not significant."""
+        errors = np.zeros((len(poses), 3))
+        if self.is_displaced:
+            c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+            errors[:, 0] = np.abs(c * self.error.x - s * self.error.y)
+            errors[:, 1] = np.abs(s * self.error.x + c * self.error.y)
+        if self.is_turned:
+            errors[:, 2] = abs(self.error.theta)
+        return errors
+
+
+def mounting_error(anchors: Sequence[Anchor]) -> MountingError | None:
+    """By the matches of a run with one laser; None where they say too little."""
+    if len(anchors) <= _FEWEST:
+        return None
+    odometry = np.array([anchor.T_odom_base.to_array() for anchor in anchors])
+    matched = np.array([anchor.T_map_base.to_array() for anchor in anchors])
+    step, seen = relative_poses(odometry[:-1], odometry[1:]), relative_poses(matched[:-1], matched[1:])
+    usable = ~np.array([anchor.begins for anchor in anchors[1:]]) & (np.hypot(step[:, 0], step[:, 1]) < _LONGEST_M)
+    step, seen = step[usable], seen[usable]
+    turned = wrap_angles(step[:, 2])
+    if len(step) < _FEWEST or min(turned[turned > 0.0].sum(), -turned[turned < 0.0].sum()) < _LEAST_TURNED:
+        return None
+    c, s = np.cos(turned), np.sin(turned)
+    along = np.stack((step[:, 0], c - 1.0, -s, step[:, 1]), axis=1)
+    aside = np.stack((step[:, 1], s, c - 1.0, -step[:, 0]), axis=1)
+    rows, apart = np.stack((along, aside), axis=1), seen[:, :2] - step[:, :2]  # (n, 2, 4) and (n, 2)
+    values = np.zeros(4)
+    for _ in range(5):
+        residual = apart - rows @ values
+        scale = np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-4)
+        weight = 1.0 / scale**2 / (1.0 + ((residual / scale) ** 2).sum(axis=1, keepdims=True) / 4.0)
+        information = np.einsum("nip,ni,niq->npq", rows, weight, rows)
+        vectors = np.einsum("nip,ni,ni->np", rows, weight, apart)
+        values = np.linalg.solve(information.sum(axis=0) + 1e-6 * np.eye(4), vectors.sum(axis=0))
+    block = np.arange(len(step)) * _BLOCKS // len(step)
+    total, sums = information.sum(axis=0) + 1e-6 * np.eye(4), vectors.sum(axis=0)
+    without = np.array(
+        [
+            np.linalg.solve(total - information[block == k].sum(axis=0), sums - vectors[block == k].sum(axis=0))
+            for k in range(_BLOCKS)
+        ]
+    )
+    sigma = np.sqrt((_BLOCKS - 1) / _BLOCKS * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
+    x, y, yaw = values[1:].tolist()
+    return MountingError(Pose2(x, y, yaw), (float(sigma[1]), float(sigma[2]), float(sigma[3])))

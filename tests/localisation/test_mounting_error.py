@@ -1,0 +1,50 @@
+"""The mounting of a laser is found from the steps between matches and those of the odometry, with its uncertainty."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hsloc.localisation.kalman_filter import Anchor
+from hsloc.localisation.mounting_error import mounting_error
+from hsloc.model.pose2 import IDENTITY, Pose2
+
+
+def drive(wrong_by: Pose2, seed: int, left: float = 0.5) -> list[Anchor]:
+    """200 matches 0.2 m apart, each with 5 mm and 2 mrad of noise; the odometry has 1 % of scale and noise, too."""
+    rng = np.random.default_rng(seed)
+    pose, odometry, anchors = Pose2(3.0, 4.0, 1.0), IDENTITY, []
+    for k in range(200):
+        turn = 0.2 if rng.random() < left else -0.2
+        turn *= float(k % 3 != 0)
+        noise = rng.normal(0.0, 1.0, 6) * (0.005, 0.005, 0.002, 0.004, 0.0, 0.004)
+        seen = (pose @ wrong_by).to_array() + noise[:3]
+        anchors.append(Anchor(k, odometry, Pose2.from_array(seen), np.eye(3), begins=k == 0))
+        pose = pose @ Pose2(0.2, 0.0, turn)
+        odometry = odometry @ Pose2(0.202 + float(noise[3]), 0.0, turn + float(noise[5]))
+    return anchors
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_laser_that_is_mounted_elsewhere_is_found(seed: int) -> None:
+    found = mounting_error(drive(Pose2(0.08, -0.06, 0.05), seed))
+    assert found is not None
+    assert found.is_significant
+    apart = found.error.to_array() - (0.08, -0.06, 0.05)
+    assert (np.abs(apart) < 4.0 * np.array(found.sigma) + 1e-3).all()
+    errors = found.pose_errors(np.array([(0.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2.0)]))
+    np.testing.assert_allclose(errors, [(0.08, 0.06, 0.05), (0.06, 0.08, 0.05)], atol=0.025)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_laser_that_is_where_it_is_said_to_be_is_not_reported(seed: int) -> None:
+    found = mounting_error(drive(IDENTITY, seed))
+    assert found is not None
+    assert not found.is_significant
+    assert not found.pose_errors(np.ones((2, 3))).any()
+
+
+def test_few_matches_and_turns_to_one_side_say_nothing() -> None:
+    assert mounting_error(drive(IDENTITY, 0)[:40]) is None
+    assert mounting_error(drive(Pose2(0.2, 0.0, 0.0), 0, left=1.0)) is None
+    assert mounting_error([]) is None

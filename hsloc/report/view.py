@@ -83,7 +83,7 @@ def view_of(parts: ReportParts, data: ReportData | None = None) -> ReportView:
         "points": None if parts.points is None else _columns(x=parts.points[:, 0], y=parts.points[:, 1]),
         "lost": [[_round(begin), _round(end)] for begin, end in data.lost],
         "scans": _scans(parts, data.start_ns),
-        "marks": [] if scans is None else _marks(scans),
+        "marks": [*([] if scans is None else _marks(scans)), *_places_to_check(parts.metrics)],
         "loops": loops,
         "graph": None if parts.mapping is None else graph_view(parts.mapping.graph),
         "ellipses": _ellipses(parts, data.start_ns),
@@ -215,6 +215,18 @@ def _marks(scans: Scans) -> list[dict[str, Any]]:
             reasons = [scans.reason[row] for row in rows]
             found.append({"status": str(status), "label": STATUS_WORDS[status], **marks, "reason": reasons})
     return found
+
+
+def _places_to_check(metrics: RunMetrics | None) -> list[dict[str, Any]]:
+    """Where the reasons of the verdict were found."""
+    reasons = [] if metrics is None else metrics.verdict_reasons
+    found = [(*place, reason.text) for reason in reasons for place in reason.places]
+    found = found[_every(len(found), MOST_MARKS)]
+    if not found:
+        return []
+    x, y, texts = zip(*found, strict=True)
+    columns = _columns(x=np.array(x), y=np.array(y))
+    return [{"status": "to_check", "label": "places to check", "t": [None] * len(x), **columns, "reason": list(texts)}]
 
 
 def _loops(mapping: MappingResult, start_ns: int) -> dict[str, Any]:

@@ -274,7 +274,7 @@ def _slips(r: Recorded) -> Reason | None:
         return None
     runs = _joined(r.stretches.ends[weak])
     sigma = float(r.stretches.sigma[weak].max())
-    text = f"the wheels slipped in {len(runs)} stretch(es) in which the scans know the motion to {sigma:.2f} m only"
+    text = f"the wheels slipped in {len(runs)} stretch(es) in which the scans fix the motion to {sigma:.2f} m only"
     return _reason(r, "slip", text, runs, failed=False)
 
 
@@ -287,7 +287,7 @@ def _unobserved(r: Recorded) -> Reason | None:
     runs = _joined(r.stretches.ends[weak])
     sigma = float(r.stretches.sigma[weak].max())
     text = (
-        f"in {len(runs)} stretch(es) the scans know the motion to {sigma:.2f} m only: "
+        f"in {len(runs)} stretch(es) the scans fix the motion to {sigma:.2f} m only: "
         "the position along them rests on the odometry, and a slip would not be noticed"
     )
     return _reason(r, "unobserved", text, runs, failed=False)

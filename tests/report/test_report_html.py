@@ -251,6 +251,17 @@ def test_places_between_which_a_run_does_not_decide_are_drawn(run: dict[str, Any
     assert {text.get_text() for text in axes.texts} >= {label for each in found for label in each["labels"]}
 
 
+def test_places_of_the_reasons_of_a_verdict_are_marked(run: dict[str, Any]) -> None:
+    reasons = (
+        VerdictReason(Verdict.CHECK, "slip", "a slip", places=((1.0, 2.0), (3.0, 4.0))),
+        VerdictReason(Verdict.CHECK, "x", "all"),
+    )
+    view, _ = view_of(ReportParts(title="", **run | {"metrics": replace(run["metrics"], verdict_reasons=reasons)}))
+    mark = view["marks"][-1]
+    assert (mark["status"], mark["x"], mark["y"]) == ("to_check", [1.0, 3.0], [2.0, 4.0])
+    assert mark["reason"] == ["a slip", "a slip"]
+
+
 def test_without_a_pose_times_begin_with_the_first_scan(run: dict[str, Any]) -> None:
     diagnostics = run["diagnostics"]
     overlay = ScanOverlay(

@@ -17,7 +17,8 @@ globalThis.listenToView = (view) => {
     const [x, y] = view.metres(px, py), k = nearest(px, py), path = view.data.trajectory;
     const words = [`${(x + view.ox).toFixed(2)}, ${(y + view.oy).toFixed(2)} m`];
     if (k !== null) words.push(`${path.t[k].toFixed(1)} s, ${path.states[path.state[k]].replaceAll("_", " ")}`);
-    const start = place(px, py);
+    const start = place(px, py), reason = view.reasonAt(px, py);
+    if (reason) words.push(reason);
     if (start) words.push("click: run again, with the start that leads to this place");
     view.$over.classList.toggle("rv-hit", Boolean(start));
     if (view.measure?.length) { const [a, b = [x, y]] = view.measure; words.push(`distance ${globalThis.lengthText(Math.hypot(b[0] - a[0], b[1] - a[1]))}`); }

@@ -4,7 +4,8 @@
   const STATES = { localised: "blue", predicted: "sky", ambiguous: "orange", off_map: "vermillion", lost: "purple" };
   // Viridis at eight places (S. van der Walt and N. Smith, 2015): even in lightness, readable for the colour-blind.
   const SCALE = ["#440154", "#46327e", "#365c8d", "#277f8e", "#1fa187", "#4ac16d", "#a0da39", "#fde725"];
-  const MARKS = { rejected: "✕", no_returns: "▼", relocalised: "★" };
+  const MARKS = { rejected: "✕", no_returns: "▼", relocalised: "★", to_check: "⚠\uFE0E" };
+  const MARK_PX = { relocalised: 20, to_check: 24 };
   const PLACE = [[13, 0], [-9, 8], [-5, 0], [-9, -8]]; // an arrow, in pixels
   const PIECE = 256, THIN_PX = 0.5; // points or ellipses that are stroked at once; points that are closer (pixels) are joined
   const HEAT_M = 0.3, HEAT_CELLS = 240; // where the scale ends; cells along the longer side of the extent
@@ -60,7 +61,7 @@
       this.least = least; this.made = made;
       return made;
     }
-    // What lies in [x0, y0, x1, y1], at so many pixels a metre.
+    // What lies in [x0, y0, x1, y1] (m); `scale` in pixels a metre.
     stroke(c, scale, [x0, y0, x1, y1]) {
       for (const piece of this.pieces(THIN_PX / 2 ** Math.ceil(Math.log2(scale)))) {
         if (piece.x1 >= x0 && piece.x0 <= x1 && piece.y1 >= y0 && piece.y0 <= y1) c.stroke(piece.path);
@@ -194,14 +195,28 @@
         c.fillStyle = this.ink("ink"); c.fillText(text, ...at);
       }
     },
+    markInk: (mark) => ["rejected", "to_check"].includes(mark.status) ? "vermillion" : "orange",
+    // The reason of the verdict that was found at a pixel.
+    reasonAt(px, py) {
+      for (const mark of this.data.marks) if (mark.status === "to_check" && this.shown.has(mark.status)) for (const k of mark.t.keys()) {
+        const [x, y] = this.pixels(...this.local(mark.x[k], mark.y[k]));
+        if (Math.hypot(px - x, py - y) < 14 * this.ratio) return mark.reason[k];
+      }
+      return null;
+    },
     drawMarks(c) {
       this.flat(c);
       c.textAlign = "center"; c.textBaseline = "middle";
       for (const mark of this.data.marks) {
         if (!this.shown.has(mark.status)) continue;
-        c.font = `${(mark.status === "relocalised" ? 20 : 12) * this.ratio}px system-ui, sans-serif`;
-        c.fillStyle = this.ink(mark.status === "rejected" ? "vermillion" : "orange");
-        for (const k of mark.t.keys()) c.fillText(MARKS[mark.status], ...this.pixels(...this.local(mark.x[k], mark.y[k])));
+        c.font = `${(MARK_PX[mark.status] ?? 12) * this.ratio}px system-ui, sans-serif`;
+        c.fillStyle = this.ink(this.markInk(mark));
+        c.strokeStyle = this.ink("halo"); c.lineWidth = 4 * this.ratio;
+        for (const k of mark.t.keys()) {
+          const at = this.pixels(...this.local(mark.x[k], mark.y[k]));
+          if (mark.status === "to_check") c.strokeText(MARKS[mark.status], ...at);
+          c.fillText(MARKS[mark.status], ...at);
+        }
       }
       const path = this.data.trajectory, n = path.x.length, end = (k, name, colour) => {
         const [px, py] = this.pixels(...this.local(path.x[k], path.y[k])), r = 6 * this.ratio;

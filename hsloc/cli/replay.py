@@ -105,8 +105,9 @@ def _warn(result: Result, warnings: tuple[RunWarning, ...], arguments: argparse.
     candidates = result.summary.reference_candidates
     if result.reference is None and candidates:
         print(f"hsloc: the log has poses to compare with: --truth-topic {' or '.join(candidates)}", file=sys.stderr)
-    for line in result.losses.lines():
+    lines = result.losses.lines()
+    for line in lines:
         print(f"hsloc: log: {line}", file=sys.stderr)
-    if arguments.verbose:
+    if arguments.verbose or not lines:
         for reason in result.losses.reasons:
             print(f"hsloc: log: {reason}", file=sys.stderr)

@@ -117,6 +117,9 @@ def test_a_log_of_clouds_is_read_as_scans(tmp_path: Path) -> None:
         open_log(path, ReadOptions(require_odometry=False))
     with pytest.raises(ConfigError, match="two heights"):
         open_log(path, ReadOptions(require_odometry=False, slice="1"))
+    above = open_log(path, ReadOptions(require_odometry=False, slice="20,21"))
+    assert list(above.events())
+    assert "no point between 20 and 21 m" in " ".join(above.losses.reasons)
     log = open_log(path, ReadOptions(require_odometry=False, slice="0.2,1.0"))
     scans = [event for event in log.events() if isinstance(event, Scan)]
     assert [scan.stamp_ns for scan in scans] == stamps

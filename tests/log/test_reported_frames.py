@@ -217,3 +217,16 @@ def test_orientations_that_were_never_filled_are_counted(tmp_path: Path, plain: 
 def replace_losses(losses: Losses) -> Losses:
     """The losses but for the count of unset orientations."""
     return replace(losses, orientations_unset=Losses().orientations_unset)
+
+
+def test_of_two_robots_the_odometry_of_the_chosen_scans_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "two.mcap"
+    with LogWriter(path) as log:
+        for number in range(5):
+            for robot in ("a", "b"):
+                log.odometry(START + number * SECOND, Pose2(float(number), 0.0, 0.0), topic=f"/{robot}/odom")
+                log.scan(make_scan(START + number * SECOND), topic=f"/{robot}/scan")
+    assert open_log(path, ReadOptions(scan_topic="/b/scan")).summary.odom_topic == "/b/odom"
+    with pytest.raises(TopicError, match="they are of several robots") as caught:
+        open_log(path)
+    assert "take all" not in str(caught.value)

@@ -143,7 +143,9 @@ def alignment(data: Payload) -> int:
     if found is None:
         name = _ENCAPSULATIONS.get(identifier)
         if name:
-            raise ValueError(f"encoded as {name}, which is not read; record it as CDR, as ROS 2 does by default")
+            raise ValueError(
+                f"encoded as {name}, which is not read; play it with the middleware that wrote it and record it as CDR"
+            )
         raise ValueError(f"it begins with the bytes {bytes(data[:4]).hex(' ') or 'of nothing'}, which is no CDR")
     return found
 

@@ -97,7 +97,7 @@ def decoder_for(channel: Channel, warnings: list[RunWarning] | None = None) -> D
         except Undecodable:
             if bytes(data[:_LONGEST_MAGIC]).startswith(STREAMS):  # CDR begins with a zero, JSON with a brace.
                 return plain(_unpacked(bytes(data)))
-            if bytes(data[:1]) == b"{" and channel.message_encoding == "cdr":
+            if bytes(data[:1]) == b"{" and _ENCODINGS.get(channel.message_encoding.lower()) == "cdr":
                 return _guarded(from_objects.json_decoder(FROM_OBJECT[canonical_type(channel.typename)]))(data)
             raise
 
@@ -148,7 +148,10 @@ def _ros_decoder(channel: Channel, warnings: list[RunWarning] | None) -> Decoder
 def column_decoder_for(channel: Channel) -> ColumnDecoder | None:
     """A decoder of many messages with poses at once; None where the channel's are decoded one by one."""
     typename = canonical_type(channel.typename)
-    if channel.message_encoding != "cdr" or foxglove.is_foxglove(channel) or not _is_known(channel, typename):
+    if foxglove.is_foxglove(channel):
+        return None
+    channel = _normalised(channel)
+    if channel.message_encoding != "cdr" or not _is_known(channel, typename):
         return None
     return columns.BY_HAND.get(typename)
 

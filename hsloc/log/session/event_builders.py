@@ -152,6 +152,7 @@ class CloudFeed:
     """sensor_msgs/PointCloud2 to Scan: what a slice of the cloud shows."""
 
     typename = definitions.POINT_CLOUD2
+    _is_noted = False
 
     def __init__(self, clock: TopicClock, mountings: Extrinsics, losses: Losses, heights: tuple[float, float]) -> None:
         """`heights` above the base (m) between which points are taken."""
@@ -169,6 +170,8 @@ class CloudFeed:
             return ()
         T_base_lidar = self._mountings.in_space(message.frame_id)
         found = slice_of(message, T_base_lidar, *self._heights)
+        if len(message.points) and not np.isfinite(found.ranges).any():
+            self._note_empty(message, T_base_lidar)
         x, y, _ = T_base_lidar.translation
         scan = Scan(
             stamp,
@@ -182,6 +185,21 @@ class CloudFeed:
             message.frame_id,
         )
         return ((self._clock, scan),)
+
+    def _note_empty(self, message: CloudMessage, T_base_lidar: Transform3) -> None:
+        """Say once how high the points are, where none lies in the slice."""
+        if self._is_noted:
+            return
+        self._is_noted = True
+        heights = [
+            T_base_lidar.rotate(point)[2] for point in message.points[:: max(len(message.points) // 500, 1)].tolist()
+        ]
+        low, high = (float(value) + T_base_lidar.translation[2] for value in np.nanpercentile(heights, (5, 95)))
+        wanted = "{:g} and {:g}".format(*self._heights)
+        self._losses.note(
+            f"{self.topic}: a cloud has no point between {wanted} m above the base; its points are {low:.2f} to "
+            f"{high:.2f} m high: choose others with --slice LOW,HIGH"
+        )
 
 
 class HeadingGaps:

@@ -86,6 +86,9 @@ def choose_topics(
         others = [c for c in channels if c.topic != choice.truth and not is_truth_name(c.topic)]
         named = options.odom_topic is not None
         rank, candidates = _odometry_candidates(channels if named else others, options)
+        own = {namespace(topic) for topic in choice.scans}
+        near = [topic for topic in candidates if {namespace(topic)} == own != {""}]
+        candidates = near if len(near) == 1 and not named else candidates  # of several robots the one with these scans
         if not named and tf_has_odometry and rank > Rank.TRANSFORMS:
             choice.odom = TF
         elif not named and candidates and (says := _kind_on(others, candidates[0]).says):
@@ -242,7 +245,7 @@ def _pick(
     what = {"scan": "scan", "odom": "odometry"}[kind]
     if candidates:
         text = f"{where}: {len(candidates)} {what} topics ({', '.join(candidates[:_LISTED])})"
-        warning = RunWarning(WarningCode.TOPIC_AMBIGUOUS, text, _remedy_of_several(kind, flag, candidates))
+        warning = RunWarning(WarningCode.TOPIC_AMBIGUOUS, text, _remedy_of_several(kind, flag, candidates, channels))
     else:
         text = f"{where}: no {what} topic ({typename}); the log holds {listed(channels)}"
         warning = RunWarning(WarningCode.TOPIC_MISSING, text, _remedy_of_none(kind, channels, options))
@@ -252,13 +255,16 @@ def _pick(
     return None
 
 
-def _remedy_of_several(kind: str, flag: str, candidates: Sequence[str]) -> str:
+def _remedy_of_several(kind: str, flag: str, candidates: Sequence[str], channels: Sequence[Channel]) -> str:
     remedy = f"choose with {flag} {candidates[0]}"
     if kind == "odom":
         return remedy
     made = next(((a, b) for a in candidates for b in candidates if b.startswith(f"{a}_")), None)
     if made is not None:
         return f"{remedy}; {made[1]} may be made of {made[0]}, and no laser of its own"
+    robots = {namespace(topic) for topic in of_type(channels, definitions.ODOMETRY) if not is_truth_name(topic)}
+    if len({namespace(topic) for topic in candidates} & (robots - {""})) > 1:
+        return f"{remedy}; they are of several robots, whose odometry has the same namespaces"
     return f"{remedy}, or take all with {flag} {','.join(candidates[:_LISTED])}"
 
 

@@ -162,7 +162,7 @@ def scored(
     found, evidence = _localised(drive, grid, field, start, rng, is_wrong)
     if evidence.hints:
         offset = estimate_offset(drive, config.graph_mapper.front_end, np.random.default_rng(0))
-        if offset.is_significant:
+        if offset.is_certain:
             by = round((offset.seconds - offset.half_sweep_s) * 1e9)
             moved = [replace(each, stamp_ns=each.stamp_ns - by) if isinstance(each, Scan) else each for each in drive]
             moved.sort(key=lambda event: event.stamp_ns)

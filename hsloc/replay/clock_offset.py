@@ -126,10 +126,11 @@ class ClockEvidence:
 def clock_offsets(request: RunRequest, reading: ReadOptions, *, deskew: bool) -> tuple[dict[str, Offset], str | None]:
     """The offsets (s) by topic that the scans of a log, as it was read, show by themselves, and what removes them.
 
-    That is a value of `--time-offset`; None where there is no offset to be removed, and where the user has given one.
+    That is a value of `--time-offset`; None where there is no offset that is certain, and where the user has given one.
     `deskew` says whether the scans of the run are.
     """
     # Poses are weighed with the odometry, which hides a part of the offset: the scans alone show the whole of it.
     found = offsets_of_log(request.logs, reading, request.config.graph_mapper.front_end)
     is_given = request.read.time_offset is not None or bool(request.reading().offsets_s())
-    return found, None if is_given else as_option(found, deskew=deskew)
+    certain = {topic: offset for topic, offset in found.items() if offset.is_certain}
+    return found, None if is_given else as_option(certain, deskew=deskew)

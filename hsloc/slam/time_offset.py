@@ -56,6 +56,9 @@ _CORRELATED_S = 0.5
 """Time (s) over which rotations are correlated: longer than the noise of a scan, shorter than a turn."""
 SIGNIFICANT = 4.0
 """Minimum ratio of an offset to its standard deviation; under Gaussian errors once in 16,000 runs."""
+_CERTAIN = 10.0
+"""The same for an offset that is removed without being asked for: odometry that is 20 times noisier than usual shows
+offsets of 4 to 6 standard deviations where there are none, as its errors last for a turn."""
 HINT_S = 0.15
 """Difference of stamps and log times between scans and odometry (s) from which on the offset is estimated before a run:
 drivers and networks delay messages by less."""
@@ -84,6 +87,11 @@ class Offset(NamedTuple):
     def is_significant(self) -> bool:
         """Whether it is neither chance nor too small to matter."""
         return isfinite(self.sigma) and abs(self.seconds) > max(SIGNIFICANT * self.sigma, SMALLEST_S)
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it may be removed without being asked for: it is far from chance, and the same all the time."""
+        return self.is_significant and abs(self.seconds) > _CERTAIN * self.sigma and not self.drift_s
 
 
 UNKNOWN = Offset(0.0, float("inf"))

@@ -20,6 +20,7 @@ from hsloc.slam.front_end import FrontEndParameters
 from hsloc.slam.time_offset import (
     UNKNOWN,
     Headings,
+    Offset,
     as_option,
     clock_warnings,
     estimate_offset,
@@ -59,6 +60,13 @@ def test_the_offset_is_found_and_its_interval_holds(offset: float, noise: float)
 
 def test_sound_stamps_raise_no_word() -> None:
     assert sum(find_offset(*headings(seed, 0.0, 0.003)).is_significant for seed in range(100)) == 0
+
+
+def test_only_offsets_far_from_chance_are_removed_unasked() -> None:
+    assert Offset(0.167, 0.003).is_certain
+    assert not Offset(0.054, 0.012).is_certain
+    assert not Offset(0.167, 0.003, drift_s=0.2).is_certain
+    assert not UNKNOWN.is_certain
 
 
 def test_a_robot_that_does_not_turn_does_not_determine_it() -> None:

@@ -31,8 +31,6 @@ MOST_BEAMS = 4
 _NEXT_BUT_ONE = 1.4
 """Least distance of a point to the beam next but one to its own, in distances between two beams there. Internal: the
 sine of one and a half angles; less than that for beams up to 20 degrees apart."""
-_DIRECTIONS = 16
-"""Sectors of the normals among which hits are chosen. Internal: walls of one direction in each, 22.5 degrees."""
 SAME_FACE = 0.7
 """Minimum cosine between the normals of one wall in two scans. Internal: 45 degrees, faces differ by 90 or 180."""
 THROUGH = 0.25
@@ -194,42 +192,6 @@ def bearing(y: float, x: float) -> float:
     if x < 0.0:
         angle = pi - angle
     return -angle if y < 0.0 else angle
-
-
-@njit(cache=True, nogil=True)
-def choose_hits(normals: F32, most: int, chosen: I32) -> int:
-    """Choose about `most` hits that have a surfel, evenly by the directions of their walls; returns how many.
-
-    In a corridor nearly all hits lie on its two sides, and only a handful, on door frames and at its end, fix
-    the position along it: of a frequent direction every n-th hit is taken, of a rare one all (normal-space
-    sampling, Rusinkiewicz and Levoy 2001). Writes the rows into `chosen`, in ascending order.
-    """
-    n = len(normals)
-    counts = np.zeros(_DIRECTIONS, dtype=np.int64)
-    direction = np.full(n, -1, dtype=np.int64)
-    for i in range(n):
-        nx = np.float64(normals[i, 0])
-        ny = np.float64(normals[i, 1])
-        if nx != 0.0 or ny != 0.0:
-            direction[i] = int((bearing(ny, nx) / (2.0 * pi) + 1.0) * _DIRECTIONS) % _DIRECTIONS
-            counts[direction[i]] += 1
-    # The quota: the largest that no more than `most` hits in all are within.
-    quota = 1
-    while quota < n and np.minimum(counts, quota + 1).sum() <= most:
-        quota += 1
-    taken = 0
-    passed = np.zeros(_DIRECTIONS, dtype=np.int64)
-    for i in range(n):
-        k = direction[i]
-        if k < 0:
-            continue
-        keep = min(counts[k], quota)
-        # The j-th of a direction is kept where j * keep / counts steps over a whole number.
-        if (passed[k] + 1) * keep // counts[k] > passed[k] * keep // counts[k]:
-            chosen[taken] = i
-            taken += 1
-        passed[k] += 1
-    return taken
 
 
 # Inlined: called, these three would make `pair_terms` a fifteenth slower.

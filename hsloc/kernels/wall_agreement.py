@@ -1,11 +1,11 @@
-"""How well scans agree on walls, as they are and displaced: whether another place fits as well.
+"""How well scans agree on walls, as they are and displaced: whether another place fits as well; and by which hits.
 
 Points are looked up in the other scan as in `hsloc.kernels.point_to_line.pair_terms`.
 """
 
 from __future__ import annotations
 
-from math import cos, sin, sqrt
+from math import cos, pi, sin, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +18,7 @@ from hsloc.kernels.point_to_line import (
     THROUGH,
     ScanArrays,
     beam_towards,
+    bearing,
     ends_around,
     nearest_hit,
 )
@@ -25,8 +26,49 @@ from hsloc.kernels.point_to_line import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    F32 = NDArray[np.float32]
     F64 = NDArray[np.float64]
+    I32 = NDArray[np.int32]
     I64 = NDArray[np.int64]
+
+_DIRECTIONS = 16
+"""Sectors of the normals among which hits are chosen. Internal: walls of one direction in each, 22.5 degrees."""
+
+
+@njit(cache=True, nogil=True)
+def choose_hits(normals: F32, most: int, chosen: I32) -> int:
+    """Choose about `most` hits that have a surfel, evenly by the directions of their walls; returns how many.
+
+    In a corridor nearly all hits lie on its two sides, and only a handful, on door frames and at its end, fix
+    the position along it: of a frequent direction every n-th hit is taken, of a rare one all (normal-space
+    sampling, Rusinkiewicz and Levoy 2001). Writes the rows into `chosen`, in ascending order.
+    """
+    n = len(normals)
+    counts = np.zeros(_DIRECTIONS, dtype=np.int64)
+    direction = np.full(n, -1, dtype=np.int64)
+    for i in range(n):
+        nx = np.float64(normals[i, 0])
+        ny = np.float64(normals[i, 1])
+        if nx != 0.0 or ny != 0.0:
+            direction[i] = int((bearing(ny, nx) / (2.0 * pi) + 1.0) * _DIRECTIONS) % _DIRECTIONS
+            counts[direction[i]] += 1
+    # The quota: the largest that no more than `most` hits in all are within.
+    quota = 1
+    while quota < n and np.minimum(counts, quota + 1).sum() <= most:
+        quota += 1
+    taken = 0
+    passed = np.zeros(_DIRECTIONS, dtype=np.int64)
+    for i in range(n):
+        k = direction[i]
+        if k < 0:
+            continue
+        keep = min(counts[k], quota)
+        # The j-th of a direction is kept where j * keep / counts steps over a whole number.
+        if (passed[k] + 1) * keep // counts[k] > passed[k] * keep // counts[k]:
+            chosen[taken] = i
+            taken += 1
+        passed[k] += 1
+    return taken
 
 
 @njit(cache=True, nogil=True)

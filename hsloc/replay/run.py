@@ -16,7 +16,6 @@ from hsloc.kernels.cache import compilation_reported
 from hsloc.matching.window import Window
 from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
-from hsloc.model.trajectory import Trajectory
 from hsloc.preprocessing.odometry import ContinuousOdometry, OdometryWatch, UnusableOdometry
 from hsloc.preprocessing.scans import ScanWatch
 from hsloc.replay.clock_offset import ClockEvidence, clock_offsets, open_as_meant
@@ -48,6 +47,7 @@ if TYPE_CHECKING:
     from hsloc.model.events import Event
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.model.pose2 import Pose2
+    from hsloc.model.trajectory import Trajectory
     from hsloc.replay.engine import Estimator
     from hsloc.slam.map_state import MapState
     from hsloc.slam.result import MappingResult
@@ -264,7 +264,7 @@ def _run_with(
         seconds["finish"] = time.perf_counter() - replayed
     elif isinstance(estimator, PointMapper):
         grid = estimator.grid()
-    trajectory, localised = history.trajectory() if mapping is None else _mapped(history, mapping)
+    trajectory, localised = history.trajectory() if mapping is None else history.mapped(mapping)
     scale = None if localiser is None else localiser.map_scale
     states = history.states(scale) if localise else None
     tracked = localised
@@ -303,15 +303,6 @@ def _lost(log: Log) -> str:
     """What could not be read, as the end of a message; empty where all could."""
     lost = [*log.losses.lines(), *log.losses.reasons]
     return f": {'; '.join(lost)}" if lost else ""
-
-
-def _mapped(history: RunHistory, mapping: MappingResult) -> tuple[Trajectory, NDArray[np.bool_]]:
-    """The trajectory as it is known at the end: at the odometry messages, or at the scans if there are none."""
-    stamps = history.odometry().stamps_ns
-    poses = mapping.odometry_poses
-    if len(stamps) == 0:
-        stamps, poses = history.diagnostics().stamps_ns, mapping.scan_poses
-    return Trajectory(stamps, poses), np.ones(len(stamps), dtype=np.bool_)
 
 
 def _diagnostics(history: RunHistory, mapping: MappingResult | None) -> ScanDiagnostics:

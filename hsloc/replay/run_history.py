@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from hsloc.localisation.states import StateRows
     from hsloc.model.certificate import Certificate
     from hsloc.model.estimate import Ambiguity, Estimate
+    from hsloc.slam.result import MappingResult
 
     F64 = NDArray[np.float64]
 
@@ -206,6 +207,13 @@ class RunHistory:
     def ambiguities(self, states: StateRows | None) -> tuple[Ambiguity, ...]:
         """Between which places the run does not decide, and when; `states` are those of its poses."""
         return () if states is None or State.AMBIGUOUS not in states.state else self._states.ambiguities()
+
+    def mapped(self, mapping: MappingResult) -> tuple[Trajectory, NDArray[np.bool_]]:
+        """The trajectory on a built map: at the odometry messages, or at the scans if there are none."""
+        stamps, poses = self.odometry().stamps_ns, mapping.odometry_poses
+        if len(stamps) == 0:
+            stamps, poses = self.diagnostics().stamps_ns, mapping.scan_poses
+        return Trajectory(stamps, poses), np.ones(len(stamps), dtype=np.bool_)
 
     def diagnostics(self) -> ScanDiagnostics:
         """One row for each scan; covariances are those of the smoothed poses where these are smoothed."""

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.point_to_line import ScanArrays, choose_hits, fit_surfels, list_beams
+from hsloc.kernels.point_to_line import ScanArrays, fit_surfels, list_beams
+from hsloc.kernels.wall_agreement import choose_hits
 from hsloc.model.events import Scan
 from hsloc.model.pose2 import Pose2
 

@@ -39,6 +39,7 @@ def commands(path: Path) -> list[str]:
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recordings: Path) -> Path:
     (tmp_path / "recordings").symlink_to(recordings, target_is_directory=True)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)  # processes that are started are not traced, either
     return tmp_path
 
 

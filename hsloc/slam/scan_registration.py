@@ -9,7 +9,7 @@ import numpy as np
 
 from hsloc.kernels.point_to_line import ScanArrays
 from hsloc.kernels.registration import Prior, RegistrationParameters, Scene, register
-from hsloc.kernels.wall_agreement import choose_hits
+from hsloc.kernels.surfels import choose_hits
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.slam.keyscans import KeyScan
 

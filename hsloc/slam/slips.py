@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.registration import composed_motions, window_motions
-from hsloc.kernels.wall_agreement import displaced_agreement
+from hsloc.kernels.registration import composed_motions, displaced_agreement, window_motions
 from hsloc.model.pose2 import wrap_angles
 from hsloc.slam.marginals import information_of_a_point
 

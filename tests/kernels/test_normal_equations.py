@@ -13,9 +13,8 @@ from hsloc.kernels.normal_equations import (
     add_inverse_term,
     add_relative_term,
     path_lengths,
-    relative,
 )
-from hsloc.kernels.point_to_line import Term
+from hsloc.kernels.point_to_line import Term, relative
 from hsloc.model.pose2 import relative_poses
 from hsloc.slam.sparse_solver import BlockSystem
 

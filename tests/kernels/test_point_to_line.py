@@ -8,7 +8,8 @@ import pytest
 from room_scans import DEGREE, pair_term, room_scan, terms
 
 from hsloc.kernels.point_to_line import bearing
-from hsloc.kernels.wall_agreement import choose_hits, displaced_agreement
+from hsloc.kernels.registration import displaced_agreement
+from hsloc.kernels.surfels import choose_hits
 from hsloc.model import Pose2, Scan
 from hsloc.slam.keyscans import KeyScan, KeyScans
 

@@ -143,7 +143,10 @@ def test_true_poses_are_truth(tmp_path: Path) -> None:
     assert log.summary.truth_topic == "TRUEPOS"
 
 
-def test_broken_lines_are_counted_and_passed_over(tmp_path: Path) -> None:
+@pytest.mark.parametrize("room", [64 << 20, 1500])
+def test_broken_lines_are_counted_and_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int) -> None:
+    """The lines of a log are kept, or read each time if they take too much memory: that makes no difference."""
+    monkeypatch.setattr("hsloc.log.text.source.MAX_KEPT_BYTES", room)
     lines = [
         odom("1"),
         flaser("1", [1.0] * 180),
@@ -156,10 +159,16 @@ def test_broken_lines_are_counted_and_passed_over(tmp_path: Path) -> None:
         "FLASER 99999999999 1",
         flaser("1", [1.0] * 180).replace("1.0", "abc", 1),
     ]
-    log = open_log(write(tmp_path / "log.clf", lines))
-    assert len(list(log.events())) == 2
-    assert log.losses.undecodable_messages == {"ODOM": 4, "FLASER": 4}
-    assert log.losses.data_lost
+    path = write(tmp_path / "log.clf", lines)
+    log = open_log(path)
+    for _ in range(2):
+        assert len(list(log.events())) == 2
+        assert log.losses.undecodable_messages == {"ODOM": 4, "FLASER": 4}
+        assert len(log.losses.reasons) == 8
+        assert log.losses.data_lost
+    assert log.verify().undecodable_messages == log.losses.undecodable_messages
+    path.write_text(odom("1") + "\n")
+    assert len(list(log.events())) == (2 if room > 1500 else 1)
 
 
 def test_a_gzip_that_ends_too_early(tmp_path: Path) -> None:

@@ -1,4 +1,8 @@
-"""Logs that are lines of text: CARMEN and Wean, plain or gzipped, read twice, never held in memory."""
+"""Logs that are lines of text: CARMEN and Wean, plain or gzipped.
+
+They are surveyed, read, and read once more for the report. What the lines of a small log say is kept from the first
+reading; a large one is read each time, so that memory does not grow with it.
+"""
 
 from __future__ import annotations
 
@@ -32,6 +36,11 @@ MAX_TOTAL_RATIO = 100
 FREE_UNPACKED_BYTES = 64 << 20
 """Bytes that a gzipped log may unpack to: 100 times its size, and in any case 64 MiB. Lines of numbers shrink 4 to 20
 times; a small file that unpacks to gigabytes would keep a reader busy for hours."""
+MAX_KEPT_BYTES = 64 << 20
+"""Memory for parsed lines; a log that takes more is read from the file each time."""
+_BYTES_OF_A_LINE = 1000
+"""Memory of a parsed line beside its numbers, at most: of a scan with its pose, each value an object."""
+_BYTES_OF_A_WORD = 4
 _BYTES_TO_KNOW = 1 << 20
 _LINES_TO_KNOW = 200
 
@@ -95,10 +104,33 @@ class TextSource:
         self._rule = RangeRule()
         self._code = NoReturnCode()
         self._laser_lines_count = False
+        self._kept: list[tuple[str, Line]] = []
+        self._kept_losses: Losses | None = None
         self.losses_at_opening = Losses()
         self.summary = self._survey()
 
     def _parsed(self, losses: Losses) -> Iterator[tuple[str, Line]]:
+        if self._kept_losses is None:
+            return self._parsed_file(losses)
+        losses.add(self._kept_losses)
+        return iter(self._kept)
+
+    def _kept_lines(self) -> Iterator[tuple[str, Line]]:
+        """The lines of the file, which are kept if there is room for all of them."""
+        losses, room = Losses(), MAX_KEPT_BYTES
+        for keyword, line in self._parsed_file(losses):
+            if room > 0:
+                numbers = 0 if line.scan is None else len(line.scan.ranges)
+                numbers += 0 if line.scan is None or line.scan.intensities is None else len(line.scan.intensities)
+                room -= _BYTES_OF_A_LINE + _BYTES_OF_A_WORD * numbers
+                self._kept.append((keyword, line))
+                if room <= 0:
+                    self._kept = []
+            yield keyword, line
+        if room > 0:
+            self._kept_losses = losses
+
+    def _parsed_file(self, losses: Losses) -> Iterator[tuple[str, Line]]:
         keywords, parse = self._format.keywords, self._format.parse
         for words in _lines(self._path, losses):
             if words[0] not in keywords:
@@ -152,7 +184,7 @@ class TextSource:
         latest = 0
         first_scan: Scan | None = None
         scan_keyword = ""
-        for keyword, line in self._parsed(Losses()):
+        for keyword, line in self._kept_lines():
             for event in line:
                 if event is not None:
                     first_ns = event.stamp_ns if first_ns is None else first_ns
@@ -267,6 +299,6 @@ class TextSource:
     def verify(self) -> Losses:
         """Read every line."""
         losses = Losses()
-        for _ in self._parsed(losses):
+        for _ in self._parsed_file(losses):
             pass
         return losses

@@ -1,0 +1,150 @@
+"""A scan prepared for `hsloc.kernels.point_to_line`: hits, pieces of wall around them, and which are compared."""
+
+from __future__ import annotations
+
+from math import atan2, cos, pi, sin, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+from hsloc.kernels.point_to_line import bearing
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    F32 = NDArray[np.float32]
+    F64 = NDArray[np.float64]
+    I32 = NDArray[np.int32]
+
+_MOST_NEIGHBOURS = 16
+"""Maximum number of hits on each side of a hit. Internal: bounds the time where beams are dense."""
+_DIRECTIONS = 16
+"""Sectors of the normals among which hits are chosen. Internal: walls of one direction in each, 22.5 degrees."""
+
+
+@njit(cache=True, nogil=True)
+def list_beams(ranges: F32, limits: F32, beams: I32, hit_of_beam: I32, clean: F32) -> int:
+    """Write the beams that hit to `beams` (n,), for each beam its hit or -1, and `clean` ranges; returns how many hit.
+
+    A hit is within the `limits` (2,), both included. Of the others those without a return stay infinite; what is
+    invalid becomes NaN.
+    """
+    count = 0
+    for k in range(len(ranges)):
+        value = ranges[k]
+        is_hit = np.isfinite(value) and limits[0] <= value <= limits[1]
+        hit_of_beam[k] = count if is_hit else -1
+        clean[k] = value if is_hit or value == np.inf else np.float32(np.nan)
+        if is_hit:
+            beams[count] = k
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def fit_surfels(
+    points: F32, beams: I32, spacing: float, radius: float, normals: F32, centroids: F32, origin: F64
+) -> None:
+    """Fit a line to the hits around each hit; writes unit `normals` towards `origin` (the laser) and `centroids`.
+
+    The neighbours are those within `radius` metres, and at least two on either side, as long as the wall goes on:
+    no gap between two beams longer than a wall seen at a grazing angle would leave (`spacing` is the angle between
+    beams in rad). A hit without a straight neighbourhood gets the normal (0, 0).
+    """
+    n = len(points)
+    for i in range(n):
+        normals[i, 0] = normals[i, 1] = np.float32(0.0)
+        centroids[i] = points[i]
+        x0 = np.float64(points[i, 0])
+        y0 = np.float64(points[i, 1])
+        count = 1
+        sx = 0.0
+        sy = 0.0
+        sxx = 0.0
+        sxy = 0.0
+        syy = 0.0
+        for direction in (-1, 1):
+            k = i
+            for step in range(_MOST_NEIGHBOURS):
+                k += direction
+                if k < 0 or k >= n or abs(beams[k] - beams[k - direction]) > 2:
+                    break
+                px = np.float64(points[k, 0])
+                py = np.float64(points[k, 1])
+                qx = np.float64(points[k - direction, 0])
+                qy = np.float64(points[k - direction, 1])
+                depth = sqrt((px - origin[0]) ** 2 + (py - origin[1]) ** 2)
+                gap = sqrt((px - qx) ** 2 + (py - qy) ** 2)
+                if gap > min(0.1 + 4.0 * spacing * depth, 0.8):
+                    break
+                dx = px - x0
+                dy = py - y0
+                if step >= 2 and dx * dx + dy * dy > radius * radius:
+                    break
+                count += 1
+                sx += dx
+                sy += dy
+                sxx += dx * dx
+                sxy += dx * dy
+                syy += dy * dy
+        if count < 4:
+            continue
+        mx = sx / count
+        my = sy / count
+        cxx = sxx / count - mx * mx
+        cxy = sxy / count - mx * my
+        cyy = syy / count - my * my
+        half = 0.5 * (cxx + cyy)
+        root = sqrt(0.25 * (cxx - cyy) ** 2 + cxy * cxy)
+        smaller = max(half - root, 0.0)
+        larger = half + root
+        if larger <= 1e-6 or smaller > 0.03 * 0.03 or smaller > 0.08 * larger:
+            continue
+        # The normal is the eigenvector of the smaller eigenvalue: turned by a right angle from the larger one's.
+        angle = 0.5 * atan2(2.0 * cxy, cxx - cyy)
+        nx = -sin(angle)
+        ny = cos(angle)
+        if nx * (origin[0] - x0) + ny * (origin[1] - y0) < 0.0:
+            nx = -nx
+            ny = -ny
+        normals[i, 0] = nx
+        normals[i, 1] = ny
+        centroids[i, 0] = x0 + mx
+        centroids[i, 1] = y0 + my
+
+
+@njit(cache=True, nogil=True)
+def choose_hits(normals: F32, most: int, chosen: I32) -> int:
+    """Choose about `most` hits that have a surfel, evenly by the directions of their walls; returns how many.
+
+    In a corridor nearly all hits lie on its two sides, and only a handful, on door frames and at its end, fix
+    the position along it: of a frequent direction every n-th hit is taken, of a rare one all (normal-space
+    sampling, Rusinkiewicz and Levoy 2001). Writes the rows into `chosen`, in ascending order.
+    """
+    n = len(normals)
+    counts = np.zeros(_DIRECTIONS, dtype=np.int64)
+    direction = np.full(n, -1, dtype=np.int64)
+    for i in range(n):
+        nx = np.float64(normals[i, 0])
+        ny = np.float64(normals[i, 1])
+        if nx != 0.0 or ny != 0.0:
+            direction[i] = int((bearing(ny, nx) / (2.0 * pi) + 1.0) * _DIRECTIONS) % _DIRECTIONS
+            counts[direction[i]] += 1
+    # The quota: the largest that no more than `most` hits in all are within.
+    quota = 1
+    while quota < n and np.minimum(counts, quota + 1).sum() <= most:
+        quota += 1
+    taken = 0
+    passed = np.zeros(_DIRECTIONS, dtype=np.int64)
+    for i in range(n):
+        k = direction[i]
+        if k < 0:
+            continue
+        keep = min(counts[k], quota)
+        # The j-th of a direction is kept where j * keep / counts steps over a whole number.
+        if (passed[k] + 1) * keep // counts[k] > passed[k] * keep // counts[k]:
+            chosen[taken] = i
+            taken += 1
+        passed[k] += 1
+    return taken

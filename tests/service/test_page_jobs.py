@@ -155,16 +155,19 @@ def test_a_page_goes_on_when_the_server_was_restarted(make_live: Callable[..., L
 def test_an_idle_page_pulls_almost_nothing(make_live: Callable[..., Live], open_page: Callable[..., Any]) -> None:
     live = make_live()
     with live.client() as client:
-        for seed in range(12):
+        for seed in range(4):
             submit(client, seed=seed, config={"hide": {"budget": 250 + seed}})
         for job in client.get("/v1/jobs").json()["jobs"]:
             wait(client, job["id"], 60.0)
     page = open_page(live.url)
-    page.wait_for_function("() => document.querySelectorAll('#jobs [data-state=succeeded]').length === 12")
-    page.wait_for_timeout(3500)
+    page.wait_for_function("() => document.querySelectorAll('#jobs [data-state=succeeded]').length === 4")
+    with page.expect_response(lambda answer: answer.status == 304):
+        pass
     answers: list[Any] = []
     page.on("response", lambda answer: answers.append(answer))
-    page.wait_for_timeout(7000)
+    for _ in range(2):
+        with page.expect_response("**"):
+            pass
     assert len(answers) >= 2
     assert {answer.status for answer in answers} == {304}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import degrees, hypot
+from math import degrees, hypot, isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -109,10 +109,11 @@ def _mounting_warnings(result: Result) -> list[RunWarning]:
     (laser,) = result.summary.lasers
     error, (x, y, yaw) = found.error, found.sigma
     right = error @ laser.T_base_laser
+    place = f"{hypot(error.x, error.y):.3f} +- {hypot(x, y):.3f} m and " if isfinite(x) else ""
     return [
         RunWarning(
             WarningCode.EXTRINSICS_WRONG,
-            f"scans and odometry agree if the laser is {hypot(error.x, error.y):.3f} +- {hypot(x, y):.3f} m and "
+            f"scans and odometry agree if the laser is {place}"
             f"{degrees(error.theta):.1f} +- {degrees(yaw):.1f} deg from where it is stated, and so are the poses",
             f"measure it, or hsloc calibrate; --laser-pose {right.x:.3f},{right.y:.3f},{right.theta:.4f}",
         )

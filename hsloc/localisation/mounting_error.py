@@ -11,7 +11,7 @@ scans alone; this takes no further match, and shows whether that is worth while.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import hypot, radians
+from math import hypot, inf, radians
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,8 +31,8 @@ _FEWEST = 40
 """Steps below which nothing is said: about 8 m."""
 _BLOCKS = 10
 """Parts of the run whose errors count as independent of each other: what odometry gets wrong lasts for many steps."""
-_LEAST_TURNED = 6.0
-"""Rotation to the side to which less is turned (rad): to one side alone, slip looks like another place of the laser."""
+_LEAST_OTHER_SIDE = 0.1
+"""Part of the rotation that goes to the other side, at least: to one side alone, slip looks like another place."""
 _LONGEST_M = 1.0
 """Steps that are longer hold refused scans (m)."""
 _MIN_SIGMAS = 4.0
@@ -43,7 +43,10 @@ _LEAST_M, _LEAST_RAD = 0.05, radians(2.0)
 
 @dataclass(frozen=True, slots=True)
 class MountingError:
-    """The laser is at `error @ mounting` where `mounting` is stated; standard deviations in m, m, rad."""
+    """The laser is at `error @ mounting` where `mounting` is stated; standard deviations in m, m, rad.
+
+    Those of the place are infinite where nearly all turns go to one side.
+    """
 
     error: Pose2
     sigma: tuple[float, float, float]
@@ -86,8 +89,10 @@ def mounting_error(anchors: Sequence[Anchor]) -> MountingError | None:
     usable = ~np.array([anchor.begins for anchor in anchors[1:]]) & (np.hypot(step[:, 0], step[:, 1]) < _LONGEST_M)
     step, seen = step[usable], seen[usable]
     turned = wrap_angles(step[:, 2])
-    if len(step) < _FEWEST or min(turned[turned > 0.0].sum(), -turned[turned < 0.0].sum()) < _LEAST_TURNED:
+    if len(step) < _FEWEST:
         return None
+    other_side = min(turned[turned > 0.0].sum(), -turned[turned < 0.0].sum())
+    is_one_sided = other_side <= _LEAST_OTHER_SIDE * np.abs(turned).sum()
     c, s = np.cos(turned), np.sin(turned)
     along = np.stack((step[:, 0], c - 1.0, -s, step[:, 1]), axis=1)
     aside = np.stack((step[:, 1], s, c - 1.0, -step[:, 0]), axis=1)
@@ -110,4 +115,6 @@ def mounting_error(anchors: Sequence[Anchor]) -> MountingError | None:
     )
     sigma = np.sqrt((_BLOCKS - 1) / _BLOCKS * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     x, y, yaw = values[1:].tolist()
+    if is_one_sided:
+        return MountingError(Pose2(0.0, 0.0, yaw), (inf, inf, float(sigma[3])))
     return MountingError(Pose2(x, y, yaw), (float(sigma[1]), float(sigma[2]), float(sigma[3])))

@@ -78,11 +78,12 @@ class StateRows:
 def with_pose_errors(rows: StateRows, errors: F64, reason: str) -> StateRows:
     """The rows with further errors (n, 3) in m, m, rad; where they exceed what is localised a pose is predicted.
 
-    They are known in size and no standard deviations: beside 2.5 of those they have to stay within 0.25 m and 5 deg.
+    They are known in size and no standard deviations: beside 2.5 of those they have to stay within 0.25 m. In heading
+    the root of both squares has to stay within 5 deg: the innovations of the same error have raised its deviation.
     """
     noise, sigma = rows.sigma[:, :2].max(axis=1), np.hypot(rows.sigma, errors)
     is_far = np.hypot(errors[:, 0], errors[:, 1]) > _WITHIN * (MAX_SIGMA - noise)
-    is_turned = errors[:, 2] > _WITHIN * (MAX_SIGMA_ANGLE - rows.sigma[:, 2])
+    is_turned = np.hypot(errors[:, 2], _WITHIN * rows.sigma[:, 2]) > _WITHIN * MAX_SIGMA_ANGLE
     vague = rows.is_localised() & (is_far | is_turned)
     states = tuple(State.PREDICTED if each else state for each, state in zip(vague, rows.state, strict=True))
     reasons = tuple(reason if each else before for each, before in zip(vague, rows.reason, strict=True))

@@ -44,7 +44,11 @@ def test_a_laser_that_is_where_it_is_said_to_be_is_not_reported(seed: int) -> No
     assert not found.pose_errors(np.ones((2, 3))).any()
 
 
-def test_few_matches_and_turns_to_one_side_say_nothing() -> None:
+def test_few_matches_say_nothing_and_turns_to_one_side_only_the_yaw() -> None:
     assert mounting_error(drive(IDENTITY, 0)[:40]) is None
-    assert mounting_error(drive(Pose2(0.2, 0.0, 0.0), 0, left=1.0)) is None
     assert mounting_error([]) is None
+    found = mounting_error(drive(Pose2(0.2, 0.0, 0.05), 0, left=1.0))
+    assert found is not None
+    assert not found.is_displaced
+    assert found.is_turned
+    assert found.error.theta == pytest.approx(0.05, abs=0.01)

@@ -157,7 +157,7 @@ def test_states_csv_has_a_line_for_each_pose(tmp_path: Path) -> None:
 def test_poses_on_a_map_of_a_wrong_scale_are_predicted_where_the_error_matters() -> None:
     states = judged(*(estimate(k) for k in range(4)))
     errors = np.array([(0.0, 0.0, 0.0), (0.15, 0.0, 0.0), (0.15, 0.15, 0.0), (0.3, 0.0, 0.0)] * 2)
-    errors[4:6, 2] = np.radians((4.0, 4.5))
+    errors[4:6, 2] = np.radians((4.5, 5.0))
     found = with_pose_errors(states, errors, "the scale")
     assert [state is State.LOCALISED for state in found.state] == [True, True, False, False, True, False, False, False]
     assert found.reason[3] == "the scale"

@@ -176,9 +176,8 @@ class BagContainer(_Bag):
 
 _BAG_MAGIC, _BAG_HEADER_BYTES = b"#ROSBAG V2.0\n", 4096
 _MOST_HEADER, _MOST_CHUNK = 1 << 20, 1 << 28
-"""Largest header and chunk (bytes) that are believed: recorders write chunks of 768 kB."""
+"""Largest header and chunk (bytes) that are believed: recorders write chunks of 768 kB. Operations of the records:"""
 _MESSAGE, _INDEX_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = b"\x02", b"\x03", b"\x04", b"\x05", b"\x06", b"\x07"
-"""Operations of the records of a bag."""
 
 
 def _reindex(source: Path, target: Path) -> int:
@@ -361,7 +360,8 @@ class Db3Container(_Bag):
     def _read_topics(self, connection: sqlite3.Connection) -> None:
         tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
-            raise LogFormatError(f"{self.path}: an SQLite database without the tables of a ROS 2 bag")
+            cut = "; its write-ahead log (-wal) ends before the first commit" * self._is_copy
+            raise LogFormatError(f"{self.path}: an SQLite database without the tables of a ROS 2 bag{cut}")
         definitions: dict[str, tuple[str, str]] = {}
         if "message_definitions" in tables:
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +22,7 @@ from hsloc.slam.marginals import all_edges, marginal_covariances, observed_terms
 from hsloc.slam.occupancy_mapper import build_grid
 from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
 from hsloc.slam.result import MappingQuality, MappingResult
-from hsloc.slam.slips import compare_with_odometry, without_slips
+from hsloc.slam.slips import compare_with_odometry, held_by_the_rest, without_slips
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,12 +30,13 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
+    from hsloc.kernels.normal_equations import PairTerms
     from hsloc.kernels.point_to_line import ScanArrays
     from hsloc.slam.keyscans import KeyScans
     from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_session import MapSession, Tie
     from hsloc.slam.parameters import GraphMapperParameters, Resume
-    from hsloc.slam.slips import Stretches
+    from hsloc.slam.slips import Held, Stretches
     from hsloc.slam.trajectory_correction import EventLog
 
     F64 = NDArray[np.float64]
@@ -45,6 +46,8 @@ _UNSETTLED_M = 0.01
 """Another pass is made if 1 of 100 keyscans moved farther than this [m] in the last round: a fifth of a cell."""
 _CONTRADICTED = 3.0
 """Residual [standard deviations] in the finished map from which on a loop contradicts it."""
+_MOST_REPAIRS = 3
+"""Times that odometry is taken out and the map refined again: by the scans, by the rest of the map, and once more."""
 _RESIDUAL_SCANS = 400
 """Scans whose residuals are measured. Internal: a sample for the metrics, no pose depends on it."""
 
@@ -98,15 +101,9 @@ def finish_session(
     edges = Edges.concatenate([gathered.steps, loop_edges])
     arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
     refined, passes = _refine(poses, arrays, edges, parameters, lambda part: report(0.5 + 0.4 * part))
-    observed = observed_terms(refined)
-    stretches = compare_with_odometry(refined, gathered.steps, arrays, observed)
-    if parameters.use_odometry and stretches.contradicted.any():
-        steps = without_slips(gathered.steps, stretches.slipped(len(gathered.steps)))
-        gathered = replace(gathered, steps=steps)
-        edges = Edges.concatenate([steps, loop_edges])
-        refined, more = _refine(refined.poses, arrays, edges, _near_the_end(parameters), _silent, refined)
-        passes += more
-        observed = observed_terms(refined)
+    repaired = _without_slips(refined, gathered, loop_edges, arrays, parameters)
+    refined, observed, edges = repaired.refined, repaired.observed, repaired.edges
+    gathered, passes = replace(gathered, steps=repaired.steps), passes + repaired.passes
     covariances = marginal_covariances(refined, observed, edges)
     grid = build_grid(refined.poses, gathered.scans, parameters.occupancy)
     report(1.0)
@@ -130,12 +127,66 @@ def finish_session(
         quality=_quality(refined, covariances, passes, loops, loop_edges, grid, gathered.scans, track.anchored),
         calibration=calibration,
         state=_state(gathered, refined.poses, loop_edges, grid, parameters),
-        evidence=weigh(_recorded(gathered, refined, loops, stretches, parameters.use_odometry)),
+        evidence=weigh(_recorded(gathered, refined, loops, repaired, parameters.use_odometry)),
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Repaired:
+    """A refined map, its terms and edges, with the odometry `steps` as weighed at last, and what is known of slips."""
+
+    refined: Registration
+    observed: PairTerms
+    edges: Edges
+    steps: Edges
+    stretches: Stretches
+    held: Held
+    passes: int
+
+
+def _without_slips(
+    refined: Registration,
+    gathered: MapSession,
+    loop_edges: Edges,
+    scans: ScanArrays,
+    parameters: GraphMapperParameters,
+) -> _Repaired:
+    """Take the weight from odometry that is contradicted and refine again, until no more is.
+
+    The rest of the map is asked when none is left that the scans of a stretch tell of by themselves.
+    """
+    steps, passes = gathered.steps, 0
+    slipped, known = np.zeros(len(steps), dtype=np.bool_), np.zeros(0)
+    for repairs_left in range(_MOST_REPAIRS if parameters.use_odometry else 0, -1, -1):
+        edges = Edges.concatenate([steps, loop_edges])
+        if slipped.any():
+            near_the_end = _near_the_end(parameters)
+            refined, more = _refine(refined.poses, scans, edges, near_the_end, _silent, refined)
+            passes += more
+        observed = observed_terms(refined)
+        stretches = compare_with_odometry(refined, steps, scans, observed)
+        if len(known):
+            # Odometry without weight contradicts nothing any more.
+            stretches = replace(stretches, normalised=np.maximum(stretches.normalised, known))
+        held = None
+        if repairs_left == 0 or not (stretches.slipped(len(steps)) & ~slipped).any():
+            held = held_by_the_rest(refined, observed, edges, gathered.steps, stretches)
+            stretches = held.marked(stretches)
+        known, more_slipped = stretches.normalised, slipped | stretches.slipped(len(steps))
+        if held is not None and (repairs_left == 0 or (more_slipped == slipped).all()):
+            break
+        slipped = more_slipped
+        steps = without_slips(gathered.steps, slipped)
+    assert held is not None  # the last round asks
+    return _Repaired(refined, observed, edges, steps, stretches, held, passes)
+
+
 def _recorded(
-    gathered: MapSession, refined: Registration, loops: list[Loop], stretches: Stretches, use_odometry: bool
+    gathered: MapSession,
+    refined: Registration,
+    loops: list[Loop],
+    repaired: _Repaired,
+    use_odometry: bool,
 ) -> Recorded:
     reference = gathered.places.reference
     ends = np.array([(reference[loop.first], reference[loop.second]) for loop in loops], dtype=np.int64).reshape(-1, 2)
@@ -165,7 +216,8 @@ def _recorded(
         loops=accepted,
         torn=ends[[loop.reason.startswith(TORN) for loop in loops]][chi > _CONTRADICTED],
         no_return_share=float(np.isposinf(ranges).sum()) / measured,
-        stretches=stretches,
+        stretches=repaired.stretches,
+        held=repaired.held,
     )
 
 

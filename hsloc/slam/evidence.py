@@ -9,17 +9,19 @@ contradicted, stretches driven without seeing a wall.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import erfc
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from hsloc.model.pose2 import relative_poses, wrap_angles
 from hsloc.model.verdict import spans_of
+from hsloc.slam.slips import STRETCHES_DEEP
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hsloc.slam.slips import Stretches
+    from hsloc.slam.slips import Held, Stretches
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
@@ -82,7 +84,7 @@ class Recorded:
     `pairs` (m, 2) of keyscans that see the same walls, with `counts` (m, 5) as in `kernels.point_to_line.pair_terms`.
     `loops` (k, 2) are pairs of keyscans that accepted loops join, `torn` (j, 2) those of loops that were contradicted
     by the others, and are by the finished map. `no_return_share` is the part of the beams that met nothing. `stretches`
-    are what the scans alone say of the motion along short parts of the path.
+    are what the scans alone say of the motion along short parts of the path, `held` what the rest of the map does.
     """
 
     stamps_ns: I64
@@ -97,6 +99,7 @@ class Recorded:
     torn: I64
     no_return_share: float
     stretches: Stretches
+    held: Held
 
     def lengths(self) -> F64:
         """Metres to each keyscan from the one before."""
@@ -151,15 +154,20 @@ _ODOMETRY_TURN = 0.5
 _WEAK_M = 0.125
 """Standard deviation [m] of the motion by the scans from which on a slip of half a metre, the largest that wheels were
 seen to make in a second, would not be noticed: as noticed counts what has 4 standard deviations (`slips`)."""
-_LEAST_MARGIN = 0.03
-"""Margin (`Stretches.margin`) from which on a displaced stretch would be noticed after all. In random worlds (seeds
-1000 to 1038 of benchmarks/map_league.py) one of 82 weak stretches that were wrong has more, and none 0.05; of 888 right
-ones, most along bare walls, a tenth has."""
+_HARM_M = 0.25
+"""Displacement [m] of a part of the map from which on it is wrong: a doorway is missed by a quarter of its width."""
+_SLIPS_M = np.linspace(_HARM_M, 1.0, 16)
+"""Displacements [m] by slips, each as likely: to the largest that wheels were seen to make in a stretch."""
+_LIKELY = 0.01
+"""Expected number of slips that nothing shows, in the whole map, from which on it has to be looked at: a map that is
+called good has a hidden slip in one case of a hundred at most, if slips are as frequent there as where they show."""
 _BLIND_M = 2.0
 """A step longer than this [m], and than five times the usual one, was driven without enough returns."""
 _BLIND_SHARE = 0.1
 _NO_RETURN_SHARE = 0.4
 """On five real logs at most 0.03 of the beams meet nothing, cut to 4 m 0.27; where they erased walls 0.52 and more."""
+_MOST_OF_IT = 0.9
+"""Share of the expected slips whose stretches are named."""
 _MOST_NAMED = 20
 """Places named in a reason, at most."""
 
@@ -268,34 +276,60 @@ def _against_odometry(r: Recorded, bridged: Bools) -> Reason | None:
 
 
 def _slips(r: Recorded) -> Reason | None:
-    """Slips of the wheels where the scans hardly say how long they were."""
-    weak = r.stretches.contradicted & _hidden(r.stretches)
-    if not weak.any():
+    """Slips of the wheels of which neither the scans nor the rest of the map say how long they were."""
+    slipped = r.stretches.contradicted[r.held.stretches]
+    # The odometry was left out there: what is left is the uncertainty of all else.
+    harmful = _off(r.held.sigma[slipped])
+    if _number(harmful) < _LIKELY:
         return None
-    runs = _joined(r.stretches.ends[weak])
-    sigma = float(r.stretches.sigma[weak].max())
+    runs, sigma = _most_likely(r, slipped, harmful)
     text = f"the wheels slipped in {len(runs)} stretch(es) in which the scans fix the motion to {sigma:.2f} m only"
     return _reason(r, "slip", text, runs, failed=False)
 
 
 def _unobserved(r: Recorded) -> Reason | None:
-    """Stretches in which a slip would not be noticed: plain corridors, long halls."""
-    held = r.stretches.visits_sigma < 0.5 * _WEAK_M
-    weak = ~r.stretches.contradicted & _hidden(r.stretches) & ~held
-    if not weak.any():
+    """Stretches in which a slip would not be noticed: plain corridors, long halls that nothing else measures."""
+    slipped = r.stretches.contradicted
+    # How often wheels slip in this log is known where it shows (Laplace's rule of succession).
+    slips = len(_joined(r.stretches.ends[slipped]))
+    seen = _number((~slipped & ~r.stretches.hidden).astype(np.float64))
+    prior = (slips + 1.0) / (seen + slips + 2.0)
+    quiet = ~slipped[r.held.stretches]
+    difference = r.held.difference[quiet]
+    sigma2 = r.held.sigma[quiet] ** 2 + r.held.odometry_sigma[quiet] ** 2
+    displaced = difference[:, None] - np.concatenate((_SLIPS_M, -_SLIPS_M))
+    # By how much more likely the difference is with a slip than without.
+    ratio = np.exp(0.5 * (difference[:, None] ** 2 - displaced**2) / sigma2[:, None]).mean(axis=1)
+    harmful = prior * ratio / (1.0 - prior + prior * ratio)
+    if r.odometry is None:
+        harmful = _off(r.held.sigma[quiet])
+    if _number(harmful) < _LIKELY:
         return None
-    runs = _joined(r.stretches.ends[weak])
-    sigma = float(r.stretches.sigma[weak].max())
+    runs, sigma = _most_likely(r, quiet, harmful)
     text = (
-        f"in {len(runs)} stretch(es) the scans fix the motion to {sigma:.2f} m only: "
+        f"in {len(runs)} stretch(es) the scans and the rest of the map fix the motion to {sigma:.2f} m only: "
         "the position along them rests on the odometry, and a slip would not be noticed"
     )
     return _reason(r, "unobserved", text, runs, failed=False)
 
 
-def _hidden(stretches: Stretches) -> Bools:
-    """Stretches (m,) in which a slip would not be noticed: no wall fixes the motion, and displaced it fits as well."""
-    return (stretches.sigma > _WEAK_M) & (stretches.margin < _LEAST_MARGIN)
+def _off(sigma: F64) -> F64:
+    """Probability (h,) that a motion with such standard deviations (m) is off by what does harm."""
+    return np.array([erfc(_HARM_M / (2.0**0.5 * one)) for one in sigma.tolist()])
+
+
+def _number(stretches: F64) -> float:
+    """Their sum as a number of stretches that do not overlap."""
+    return float(stretches.sum()) / STRETCHES_DEEP
+
+
+def _most_likely(r: Recorded, of_held: Bools, harmful: F64) -> tuple[list[tuple[int, int]], float]:
+    """Runs of the stretches that count most, in all but a tenth of what is expected, and their largest sigma (m)."""
+    order = np.argsort(-harmful, kind="stable")
+    before = np.cumsum(harmful[order]) - harmful[order]
+    chosen = np.sort(order[before < _MOST_OF_IT * harmful.sum()])
+    numbers = np.flatnonzero(of_held)[chosen]
+    return _joined(r.stretches.ends[r.held.stretches[numbers]]), float(r.held.sigma[numbers].max())
 
 
 def _joined(ends: I64) -> list[tuple[int, int]]:

@@ -17,9 +17,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.kernels.normal_equations import Equations, add_edges
 from hsloc.kernels.registration import composed_motions, displaced_agreement, window_motions
-from hsloc.model.pose2 import wrap_angles
+from hsloc.model.pose2 import relative_poses, wrap_angles
+from hsloc.slam.joint_registration import normal_equations
 from hsloc.slam.marginals import information_of_a_point
+from hsloc.slam.pose_graph import Edges, anchored
+from hsloc.slam.sparse_solver import BlockSystem
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,15 +31,17 @@ if TYPE_CHECKING:
     from hsloc.kernels.normal_equations import PairTerms
     from hsloc.kernels.point_to_line import ScanArrays
     from hsloc.slam.joint_registration import Registration
-    from hsloc.slam.pose_graph import Edges
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
 _STEPS = 20
-"""Steps of a stretch: longer than a slip, and short enough that the odometry says something."""
-_EVERY = 5
-"""Steps from the beginning of one stretch to that of the next."""
+"""Steps of a stretch, at most."""
+_LONGEST_M = 2.5
+"""Way [m] from which on a stretch ends before: longer than wheels slip in one go, a second or two at walking pace, and
+short enough that scans before and after see the same walls, and that the odometry says something."""
+STRETCHES_DEEP = 4
+"""Stretches that lie over each step."""
 _CONTRADICTION = 4.0
 """Normalised difference from which on the two contradict each other. Of some 50,000 stretches of simulated drives none
 without a slip reaches 3, and most slips have 5 to 60."""
@@ -48,12 +54,14 @@ _DISPLACEMENTS = np.concatenate((np.arange(-24, -4), np.arange(5, 25))) * 0.05
 """Displacements [m] that are tried: from a quarter of a metre, beyond the gate, up to 1.2 m."""
 _HERE = np.array((-0.1, -0.05, 0.0, 0.05, 0.1))
 """Displacements [m] that count as none."""
+_LEAST_MARGIN = 0.03
+"""Margin (`Stretches.margin`) from which on a displaced stretch would be noticed after all. In random worlds (seeds
+1000 to 1038 of benchmarks/map_league.py) one of 82 weak stretches that were wrong has more, and none 0.05; of 888 right
+ones, most along bare walls, a tenth has."""
 _COMPARED = 4
-"""Keyscans before and after a stretch that are held against each other, every third."""
-_OTHER_VISIT = 30
-"""Keyscans before or after a stretch from which on others are of another visit."""
-_AT_AN_END = 6
-"""Keyscans at an end of a stretch that other visits may hold."""
+"""Keyscans before and after a stretch that are held against each other, up to every third."""
+_NEAR = 30
+"""Keyscans from one to another up to which a pair is of one visit."""
 _SLIPPED = np.diag((0.1**2, 0.1**2, 0.1**2))
 """Covariance (m^2, rad^2) that is added to each step of such a stretch: as much as the step is long."""
 
@@ -66,8 +74,7 @@ class Stretches:
     odometry, in the frame of the first, `normalised` (m,) its length in standard deviations. `sigma` (m,) is the
     standard deviation (m) of the scans' motion in its worst direction. `margin` (m,) is by how much more of the points
     of the scans before and after agree with the motion as found than with any that is displaced in that direction, a
-    ratio; 1 where the scans fix the motion. `visits_sigma` (m,) is the standard deviation (m) in that direction at
-    which scans of other visits hold the ends of the stretch, the worse of the two; infinite without such.
+    ratio; 1 where the scans fix the motion. `axis` (m, 2) is that direction, in the map.
     """
 
     ends: I64
@@ -75,7 +82,12 @@ class Stretches:
     normalised: F64
     sigma: F64
     margin: F64
-    visits_sigma: F64
+    axis: F64
+
+    @property
+    def hidden(self) -> NDArray[np.bool_]:
+        """Those (m,) whose own scans do not tell a slip: no wall fixes the motion, and displaced it fits as well."""
+        return (self.sigma > _HARDLY_M) & (self.margin < _LEAST_MARGIN)
 
     @property
     def contradicted(self) -> NDArray[np.bool_]:
@@ -96,10 +108,7 @@ def compare_with_odometry(refined: Registration, steps: Edges, scans: ScanArrays
     `observed` are the terms of `marginals.observed_terms`.
     """
     covariances: F64 = np.asarray(np.linalg.inv(steps.information), dtype=np.float64)
-    begin = np.arange(0, max(len(refined.poses) - _STEPS, 0), _EVERY)
-    joints = np.concatenate(([0], np.cumsum(covariances[:, 0, 0] > _LEFT_OUT)))
-    begin = begin[joints[begin + _STEPS] == joints[begin]]
-    ends = np.column_stack((begin, begin + _STEPS)).astype(np.int64)
+    ends = _ends(steps, covariances[:, 0, 0] > _LEFT_OUT)
     seen, driven = np.empty((2, len(ends), 3))
     seen_covariance, driven_covariance, known_covariance = np.empty((3, len(ends), 3, 3))
     of_a_point = information_of_a_point(refined)
@@ -112,44 +121,36 @@ def compare_with_odometry(refined: Registration, steps: Edges, scans: ScanArrays
     normalised = np.sqrt(np.maximum((difference * weighed).sum(axis=1), 0.0))
     variances, axes = np.linalg.eigh(known_covariance[:, :2, :2])
     sigma = np.sqrt(np.maximum(variances[:, -1], 0.0))
-    margin, visits_sigma = np.ones(len(ends)), np.full(len(ends), np.inf)
-    weak = np.flatnonzero(sigma > _HARDLY_M)
-    h = observed.information
-    across = h[:, :2, :2] - h[:, :2, 2:] * h[:, 2:, :2] / np.maximum(h[:, 2:, 2:], 1e-9)
-    for k in weak.tolist():
-        heading = refined.poses[ends[k, 0], 2]
-        c, s = np.cos(heading), np.sin(heading)
-        axis = np.array(((c, -s), (s, c))) @ axes[k, :, -1]
-        margin[k] = _margin(refined, scans, ends[k], axis)
-        visits_sigma[k] = (of_a_point * _held_by_visits(refined, across, ends[k], axis)) ** -0.5
-    return Stretches(ends, difference, normalised, sigma, margin, visits_sigma)
+    headings = refined.poses[ends[:, 0], 2]
+    c, s, weakest = np.cos(headings), np.sin(headings), axes[:, :, -1]
+    axis = np.column_stack((c * weakest[:, 0] - s * weakest[:, 1], s * weakest[:, 0] + c * weakest[:, 1]))
+    margin = np.ones(len(ends))
+    for k in np.flatnonzero(sigma > _HARDLY_M).tolist():
+        margin[k] = _margin(refined, scans, ends[k], axis[k])
+    return Stretches(ends, difference, normalised, sigma, margin, axis)
 
 
-def _held_by_visits(refined: Registration, across: F64, ends: I64, axis: F64) -> float:
-    """Information (points) along `axis` (2,), in the map, by which other visits hold either end: the smaller.
-
-    `across` (k, 2, 2) is that of the pairs in x and y, in the frame of their first, whatever the heading.
-    """
-    first, last = ends.tolist()
-    i, j = refined.pairs.T
-    held = []
-    for begin, end in ((first - _AT_AN_END, first), (last, last + _AT_AN_END)):
-        early = (j >= begin) & (j <= end) & (i < first - _OTHER_VISIT)
-        late = (i >= begin) & (i <= end) & (j > last + _OTHER_VISIT)
-        pairs = np.flatnonzero(early | late)
-        heading = refined.poses[i[pairs], 2]
-        c, s = np.cos(heading), np.sin(heading)
-        along = np.column_stack((c * axis[0] + s * axis[1], c * axis[1] - s * axis[0]))
-        held.append(float(np.einsum("mi,mij,mj->", along, across[pairs], along)))
-    return max(min(held), 1e-12)
+def _ends(steps: Edges, joints: NDArray[np.bool_]) -> I64:
+    """First and last keyscans (m, 2) of stretches, none of which leads over one of the `joints` (n - 1,)."""
+    way = np.concatenate(([0.0], np.cumsum(np.hypot(steps.measured[:, 0], steps.measured[:, 1]))))
+    last = np.minimum(np.searchsorted(way, way + _LONGEST_M), np.arange(len(way)) + _STEPS)
+    before = np.concatenate(([0], np.cumsum(joints)))
+    ends, first = [], 0
+    while last[first] < len(way):
+        if before[last[first]] == before[first]:
+            ends.append((first, last[first]))
+        first += max((last[first] - first) // STRETCHES_DEEP, 1)
+    return np.array(ends, dtype=np.int64).reshape(-1, 2)
 
 
 def _margin(refined: Registration, scans: ScanArrays, ends: I64, axis: F64) -> float:
     """Agreement across a stretch as found, less the best agreement displaced along `axis` (2,) in the map."""
     first, last = ends.tolist()
-    reach = 3 * _COMPARED
-    before = np.arange(max(first - reach + 3, 0), first + 1, 3)
-    after = np.arange(last, min(last + reach - 2, len(refined.poses)), 3)
+    # As far apart as the stretches begin: every third keyscan where these are dense.
+    every = max((last - first) * 3 // _STEPS, 1)
+    reach = every * _COMPARED
+    before = np.arange(max(first - reach + every, 0), first + 1, every)
+    after = np.arange(last, min(last + reach - every + 1, len(refined.poses)), every)
     tried = np.concatenate((_HERE, _DISPLACEMENTS))[:, None] * axis
     agreement = np.empty(len(tried))
     displaced_agreement(refined.poses, (before, after), tried, scans, refined.gate, refined.scale, agreement)
@@ -161,3 +162,140 @@ def without_slips(steps: Edges, slipped: NDArray[np.bool_]) -> Edges:
     information = steps.information.copy()
     information[slipped] = np.linalg.inv(np.linalg.inv(steps.information[slipped]) + _SLIPPED)
     return replace(steps, information=information)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Held:
+    """What the rest of the map says of the motion along hidden stretches, their own odometry left out.
+
+    `stretches` (h,) are their numbers. `sigma` (h,) is the standard deviation (m) of the motion in the direction that
+    their own scans do not fix, `difference` (h,) how much farther (m) the odometry went in it, and `odometry_sigma`
+    (h,) the standard deviation (m) of that.
+    """
+
+    stretches: I64
+    sigma: F64
+    difference: F64
+    odometry_sigma: F64
+
+    @property
+    def normalised(self) -> F64:
+        """The differences (h,) in standard deviations."""
+        return np.asarray(np.abs(self.difference) / np.hypot(self.sigma, self.odometry_sigma), dtype=np.float64)
+
+    def marked(self, stretches: Stretches) -> Stretches:
+        """The stretches, those that contradict the odometry by this among the others that do."""
+        normalised = stretches.normalised.copy()
+        normalised[self.stretches] = np.maximum(normalised[self.stretches], self.normalised)
+        return replace(stretches, normalised=normalised)
+
+
+def held_by_the_rest(
+    refined: Registration, observed: PairTerms, edges: Edges, steps: Edges, stretches: Stretches
+) -> Held:
+    """The motions along hidden stretches by all that holds them but their own odometry.
+
+    `edges` are those of the graph, of which the first n - 1 are the odometry as weighed; `steps` are the same as
+    recorded. Of scans in hidden stretches nothing is believed in their direction: bare walls agree wherever they are.
+    """
+    chosen = np.flatnonzero(stretches.hidden)
+    ends, axes = stretches.ends[chosen], stretches.axis[chosen]
+    sigma, difference, odometry_sigma = np.empty((3, len(chosen)))
+    if len(chosen) == 0:
+        return Held(chosen, sigma, difference, odometry_sigma)
+    poses, pairs = refined.linearised_at, np.concatenate((refined.pairs, edges.pairs))
+    terms, of_a_point = _without_hidden(refined, observed, stretches), information_of_a_point(refined)
+    diagonal, off_diagonal, right = normal_equations(poses, refined.pairs, terms, of_a_point, edges)
+    system, held = BlockSystem(len(poses), pairs[:, 0], pairs[:, 1]), anchored(diagonal)
+    moved = system.solve(held, off_diagonal, -right)
+    wanted = np.unique(np.concatenate([np.arange(first, last + 1) for first, last in ends.tolist()]))
+    blocks = system.inverse_near(held, off_diagonal, wanted, _STEPS)
+    driven, driven_covariance = np.empty((len(ends), 3)), np.empty((len(ends), 3, 3))
+    covariances: F64 = np.asarray(np.linalg.inv(steps.information), dtype=np.float64)
+    composed_motions(steps.measured, covariances, ends, driven, driven_covariance)
+    for k, (first, last) in enumerate(ends.tolist()):
+        own = slice(first, last)
+        chain = Edges(edges.pairs[own] - first, edges.measured[own], edges.information[own], edges.scale[own])
+        # The other information on these poses is what is known of them less what their own odometry says.
+        known = np.linalg.inv(_joint(blocks[np.searchsorted(wanted, first) :][: last + 1 - first]))
+        local, matrix, gradient = poses[first : last + 1], *_dense(poses[first : last + 1], chain)
+        left = known - matrix
+        shift = np.linalg.solve(left, known @ moved[first : last + 1].reshape(-1) + gradient)
+        rest = local + shift.reshape(-1, 3)
+        axis, between = axes[k], local[-1, :2] - local[0, :2]
+        by = np.zeros(len(shift))
+        by[:2], by[-3:-1], by[2] = -axis, axis, axis[0] * between[1] - axis[1] * between[0]
+        sigma[k] = np.sqrt(max(float(by @ np.linalg.solve(left, by)), 0.0))
+        c, s = np.cos(local[0, 2]), np.sin(local[0, 2])
+        along = np.array((c * axis[0] + s * axis[1], c * axis[1] - s * axis[0]))
+        difference[k] = along @ (driven[k] - relative_poses(rest[:1], rest[-1:])[0])[:2]
+        odometry_sigma[k] = np.sqrt(along @ driven_covariance[k, :2, :2] @ along)
+    return Held(chosen, sigma, difference, odometry_sigma)
+
+
+def _joint(blocks: F64) -> F64:
+    """The matrix (3 n, 3 n) of blocks (n, n, 3, 3), of which those on the diagonal and right of it are there.
+
+    In row k the first is that on the diagonal.
+    """
+    n = len(blocks)
+    matrix = np.zeros((3 * n, 3 * n))
+    for k in range(n):
+        row = blocks[k, : n - k].transpose(1, 0, 2).reshape(3, -1)
+        matrix[3 * k : 3 * k + 3, 3 * k :] = row
+        matrix[3 * k :, 3 * k : 3 * k + 3] = row.T
+    return matrix
+
+
+def _dense(poses: F64, edges: Edges) -> tuple[F64, F64]:
+    """Information (3 n, 3 n) and gradient (3 n,) of edges between `poses` (n, 3) that follow each other."""
+    n = len(poses)
+    blocks, diagonal, right = np.empty((n - 1, 3, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3))
+    scale = edges.scale
+    add_edges(poses, edges.pairs, edges.measured, edges.information, scale, Equations(diagonal, blocks, right))
+    matrix = np.zeros((n, 3, n, 3))
+    at = np.arange(n)
+    matrix[at, :, at] = diagonal
+    matrix[at[:-1], :, at[1:]] = blocks
+    matrix[at[1:], :, at[:-1]] = blocks.transpose(0, 2, 1)
+    return matrix.reshape(3 * n, 3 * n), right.reshape(-1)
+
+
+def _without_hidden(refined: Registration, observed: PairTerms, stretches: Stretches) -> PairTerms:
+    """Terms of the pairs without what they say in the direction of hidden stretches.
+
+    These are pairs of one visit with both scans in such a stretch, and pairs of two visits with a scan of which all
+    stretches are hidden. The others keep the pose at which their own points agree best.
+    """
+    hidden = np.flatnonzero(stretches.hidden)
+    ends, n = stretches.ends[hidden], len(refined.poses)
+    i, j = refined.pairs.T
+    of_scan = np.full(n, -1)
+    for k in hidden.tolist():
+        first, last = stretches.ends[k]
+        of_scan[first : last + 1] = k
+    for first, last in stretches.ends[~stretches.hidden].tolist():
+        of_scan[first : last + 1] = -1
+    # Of the stretches around a pair that which begins last before it is shifted least.
+    of_pair = np.full(len(i), -1)
+    near = j - i <= _NEAR
+    begun = np.searchsorted(ends[:, 0], i, side="right") - 1
+    for back in range(STRETCHES_DEEP + 1):
+        k = np.maximum(begun - back, 0)
+        inside = near & (begun >= back) & (ends[k, 1] >= j) & (of_pair < 0)
+        of_pair[inside] = hidden[k[inside]]
+    visits = ~near
+    of_pair[visits] = np.maximum(of_scan[i[visits]], of_scan[j[visits]])
+    m = np.flatnonzero(of_pair >= 0)
+    information, before = observed.information.copy(), refined.terms.information
+    added = 1e-9 * np.trace(before, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
+    offset = np.linalg.solve(before + added, refined.terms.gradient[:, :, None])
+    gradient = (information @ offset)[:, :, 0]
+    heading, axis = refined.linearised_at[i[m], 2], stretches.axis[of_pair[m]]
+    c, s = np.cos(heading), np.sin(heading)
+    along = np.column_stack((c * axis[:, 0] + s * axis[:, 1], c * axis[:, 1] - s * axis[:, 0], np.zeros(len(m))))
+    held = np.einsum("mij,mj->mi", information[m], along)
+    share = held / np.maximum((along * held).sum(axis=1), 1e-12)[:, None]
+    information[m] -= held[:, :, None] * share[:, None, :]
+    gradient[m] -= share * (along * gradient[m]).sum(axis=1)[:, None]
+    return observed._replace(information=information, gradient=gradient)

@@ -6,8 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hsloc.kernels.normal_equations import Evaluated, PairTerms
 from hsloc.slam.evidence import Recorded, nothing_seen, weigh
-from hsloc.slam.slips import Stretches
+from hsloc.slam.joint_registration import Registration
+from hsloc.slam.pose_graph import Edges
+from hsloc.slam.slips import Held, Stretches, held_by_the_rest
 
 N = 200
 
@@ -34,30 +37,72 @@ def lap() -> Recorded:
         torn=np.zeros((0, 2), dtype=np.int64),
         no_return_share=0.1,
         stretches=stretches(np.full(3, 0.01), np.ones(3)),
+        held=held(),
     )
 
 
 def stretches(sigma: np.ndarray, normalised: np.ndarray) -> Stretches:
-    """Three stretches, of which the first two overlap."""
-    ends = np.array([(40, 60), (45, 65), (120, 140)])
-    return Stretches(ends, np.zeros((3, 3)), normalised, sigma, np.zeros(3), np.full(3, np.inf))
+    """A hundred stretches of which the first two of three overlap; the others are beyond doubt."""
+    ends = np.array([(40, 60), (45, 65), (120, 140), *((150, 170) for _ in range(97))])
+    sigma, normalised = (np.concatenate((values, np.full(97, 0.01))) for values in (sigma, normalised))
+    return Stretches(ends, np.zeros((100, 3)), normalised, sigma, np.zeros(100), np.tile((1.0, 0.0), (100, 1)))
+
+
+def held(*stretches: tuple[int, float, float]) -> Held:
+    """Of some stretches: number, standard deviation of the rest of the map, difference to the odometry."""
+    numbers, sigma, difference = np.array(stretches).reshape(-1, 3).T
+    return Held(numbers.astype(int), sigma, difference, np.full(len(sigma), 0.03))
 
 
 def test_slips_and_stretches_in_which_none_would_be_detected_are_named(lap: Recorded) -> None:
-    sigma, normalised = np.array((0.02, 0.15, 0.02)), np.array((9.0, 6.0, 12.0))
-    (reason,) = weigh(replace(lap, stretches=stretches(sigma, normalised))).reasons
+    slipped = stretches(np.array((0.02, 0.15, 0.02)), np.array((9.0, 6.0, 12.0)))
+    loose = replace(lap, stretches=slipped, held=held((1, 0.3, 0.0)))
+    (reason,) = weigh(loose).reasons
     assert reason.code == "slip"
     assert reason.times_s == ((44.0, 65.0),), "only where the scans hardly know the motion"
-    assert codes(replace(lap, stretches=stretches(0.5 * sigma, normalised))) == ("good", [])
-    (reason,) = weigh(replace(lap, stretches=stretches(np.array((0.2, 0.3, 0.2)), np.ones(3)))).reasons
+    assert codes(replace(loose, held=held((1, 0.05, 0.0)))) == ("good", []), "the rest of the map tells how far it was"
+    hidden = stretches(np.array((0.2, 0.3, 0.2)), np.ones(3))
+    weak = replace(lap, stretches=hidden, held=held((0, 0.5, 0.0), (1, 0.4, 0.0), (2, 0.5, 0.0)))
+    (reason,) = weigh(weak).reasons
     assert reason.code == "unobserved"
     np.testing.assert_allclose(reason.times_s, ((39.0, 65.0), (119.0, 140.0)))
-    hidden = stretches(np.array((0.2, 0.3, 0.2)), np.ones(3))
-    assert codes(replace(lap, stretches=replace(hidden, margin=np.full(3, 0.1)))) == ("good", []), "displaced fits less"
-    held = replace(hidden, visits_sigma=np.full(3, 0.02))
-    assert codes(replace(lap, stretches=held)) == ("good", []), "other visits hold both ends"
-    contradicted = replace(held, normalised=np.full(3, 9.0))
-    assert codes(replace(lap, stretches=contradicted))[1] == ["slip"], "a visit may be of a place that looks alike"
+    firm = replace(weak, held=held((0, 0.05, 0.0), (1, 0.05, 0.02), (2, 0.05, -0.05)))
+    assert codes(firm) == ("good", []), "loops bind both ends"
+    assert codes(replace(firm, held=held((0, 0.05, 0.2), (1, 0.05, 0.2))))[1] == ["unobserved"], "and a slip is likely"
+    assert codes(replace(firm, odometry=None)) == ("good", [])
+    assert codes(replace(weak, odometry=None))[1] == ["unobserved"]
+
+
+def test_what_loops_say_of_a_stretch_leaves_out_its_own_odometry_and_the_scans_of_a_bare_corridor() -> None:
+    """Forty steps of 0.1 m; scans agree to a millimetre, a loop from first to last is known to 2 cm, and one of the
+    stretches is bare: 0.3 m too far by the odometry."""
+    n = 41
+    poses = np.column_stack((0.1 * np.arange(n), np.zeros((n, 2))))
+    chain = np.column_stack((np.arange(n - 1), np.arange(1, n)))
+    measured = np.tile((0.1, 0.0, 0.0), (n - 1, 1))
+    measured[10, 0] += 0.3
+    information = np.tile(np.diag((1e4, 1e4, 1e6)), (n - 1, 1, 1))
+    steps = Edges(chain, measured, information, np.full(n - 1, np.inf))
+    loop = Edges(np.array([(0, n - 1)]), np.array([(4.0, 0.0, 0.0)]), np.diag((2500.0, 2500.0, 1e6))[None], np.ones(1))
+    agreed = np.tile(np.diag((1e4, 1e4, 1e4)), (n - 1, 1, 1))
+    terms = PairTerms(agreed, np.zeros((n - 1, 3)), np.ones((n - 1, 5)), agreed)
+    evaluated = Evaluated(np.zeros((n - 1, 3)), np.zeros((n - 1, 3)))
+    refined = Registration(poses, chain, terms, poses, 1.0, 0.15, 0.05, 1, 0.0, evaluated)
+    ends = np.array([(5, 25), (15, 35)])
+    bare = Stretches(
+        ends, np.zeros((2, 3)), np.ones(2), np.array((0.2, 0.01)), np.zeros(2), np.tile((1.0, 0.0), (2, 1))
+    )
+    found = held_by_the_rest(refined, terms, Edges.concatenate([steps, loop]), steps, bare)
+    np.testing.assert_array_equal(found.stretches, [0])
+    # The loop, and twenty steps of a centimetre each and of the scans outside.
+    assert 0.02 < found.sigma[0] < 0.06
+    assert found.difference[0] == pytest.approx(0.3, abs=0.02)
+    assert found.normalised[0] > 4.0
+    assert found.marked(bare).contradicted.tolist() == [True, False]
+    open_end = held_by_the_rest(refined, terms, steps, steps, bare)
+    assert open_end.sigma[0] > 1.0, "nothing else leads across"
+    none = held_by_the_rest(refined, terms, steps, steps, replace(bare, margin=np.ones(2)))
+    assert len(none.stretches) == 0
 
 
 def codes(recorded: Recorded) -> tuple[str, list[str]]:
@@ -120,7 +165,7 @@ def test_a_slip_that_the_scans_measured_step_by_step_is_no_doubt(
         pairs=np.vstack((lap.pairs, np.column_stack((steps, steps + 1)))),
         counts=np.vstack((lap.counts, counts)),
         stretches=Stretches(
-            np.array([(110, 190)]), np.zeros((1, 3)), np.array((9.0,)), np.array((sigma,)), np.zeros(1), np.zeros(1)
+            np.array([(110, 190)]), np.zeros((1, 3)), np.array((9.0,)), np.array((sigma,)), np.zeros(1), np.ones((1, 2))
         ),
     )
     assert codes(slipped)[1] == expected

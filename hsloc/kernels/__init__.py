@@ -1,5 +1,6 @@
 """Compiled kernels on arrays, the only code that numba compiles; each has a plain version in the tests."""
 
-from hsloc.kernels.cache import choose_cache
+from hsloc.kernels.cache import choose_cache, compare_all_sources
 
+compare_all_sources()
 choose_cache()

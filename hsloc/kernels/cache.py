@@ -3,20 +3,25 @@
 numba keeps them beside the sources, else in the user's cache folder, and raises where it may write to neither: a user
 without a home, or a read-only container. Then a private folder among the temporary files is used, and without that
 they are compiled again in each process.
+
+A compiled kernel contains those that it calls. numba compares the source of the kernel alone, so that after an upgrade
+it would run old code where only a called kernel has changed; here all sources count.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import stat
 import tempfile
 import warnings
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numba
-from numba.core import config, event
+from numba.core import caching, config, event
 from numba.core.dispatcher import Dispatcher
 
 if TYPE_CHECKING:
@@ -24,6 +29,8 @@ if TYPE_CHECKING:
 
 _PARENTS = ("/dev/shm",)
 """Tried after the folder of temporary files."""
+_SOURCES = Path(__file__).parent
+"""Every kernel is in this folder."""
 
 
 def choose_cache() -> None:
@@ -43,6 +50,27 @@ def choose_cache() -> None:
     )
     # The decorators ask for a cache, and numba raises where it finds no place for one.
     setattr(Dispatcher, "enable_caching", lambda _: None)  # noqa: B010
+
+
+def compare_all_sources() -> None:
+    """Let numba take a kernel from its cache only if no kernel's source has changed since."""
+    locator = caching._SourceFileBackedLocatorMixin
+    of_one_file: Callable[[Any], Any] = locator.get_source_stamp
+
+    def stamp(self: Any) -> Any:
+        found = of_one_file(self)
+        return (found, _digest(_SOURCES)) if Path(self._py_file).parent == _SOURCES else found
+
+    setattr(locator, "get_source_stamp", stamp)  # noqa: B010
+
+
+@cache
+def _digest(folder: Path) -> str:
+    """SHA-256 of all modules of a folder."""
+    found = hashlib.sha256()
+    for path in sorted(folder.glob("*.py")):
+        found.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return found.hexdigest()
 
 
 def _can_cache() -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -56,6 +57,27 @@ def test_a_folder_that_others_may_write_to_is_not_used(tmp_path: Path, monkeypat
         cache.choose_cache()
     assert not config.CACHE_DIR  # type: ignore[attr-defined]
     numba.njit(cache=True)(lambda: 0)  # no longer raises
+
+
+def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cache, "_SOURCES", tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    head = "import numba\n@numba.njit(cache=True)\n"
+    (tmp_path / "outer_kernel.py").write_text(
+        f"from inner_kernel import inner\n{head}def outer():\n    return inner()\n"
+    )
+    found = []
+    for value in (1, 20):  # of different lengths: Python's own cache looks at the size
+        (tmp_path / "inner_kernel.py").write_text(f"{head}def inner():\n    return {value}\n")
+        cache._digest.cache_clear()
+        for name in ("inner_kernel", "outer_kernel"):
+            monkeypatch.delitem(sys.modules, name, raising=False)
+        importlib.invalidate_caches()
+        found.append(importlib.import_module("outer_kernel").outer())
+    cache._digest.cache_clear()
+    assert found == [1, 20]
 
 
 def test_compilation_is_reported_and_cached_kernels_are_not() -> None:

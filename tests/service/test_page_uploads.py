@@ -42,6 +42,7 @@ def test_an_upload_survives_a_server_that_drops_it(
     with live.client() as client:
         file = client.get("/v1/files").json()["files"][0]
     assert file["sha256"] == hashlib.sha256(log.read_bytes()).hexdigest()
+    assert '"status": 503' in live.log.read_text()
     context.close()
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-import random
 import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -40,6 +39,7 @@ class UploadReceiver:
         self._files, self._settings = files, settings
         self._busy: set[str] = set()
         self._hashes: dict[str, tuple[Any, int]] = {}
+        self._to_drop = 0.5
 
     @contextmanager
     def writer(self, file_id: str) -> Iterator[None]:
@@ -73,7 +73,7 @@ class UploadReceiver:
         limit = self._settings.max_upload_bytes if row.size is None else row.size
         append = _Append(self._files, who, row, limit, self._hash(file_id, offset), checksum)
         try:
-            await append.run(body, drop=random.random() < self._settings.fault_drop_uploads)
+            await append.run(body, drop=self._drops())
         except ClientDisconnect:
             if append.safe != row.size:
                 raise
@@ -111,6 +111,14 @@ class UploadReceiver:
         row = await to_thread.run_sync(done)
         log("upload.complete", file=file_id, tenant=row.tenant, size=size)
         return row
+
+    def _drops(self) -> bool:
+        """Whether to cut this request off on purpose: a share of them, evenly, as chance may cut ten in a row."""
+        self._to_drop += self._settings.fault_drop_uploads
+        if self._to_drop < 1.0:
+            return False
+        self._to_drop -= 1.0
+        return True
 
     def forget(self, file_id: str) -> None:
         """Forget the running hash: the upload was deleted or starts again."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import importlib
+import pkgutil
 import re
 import shlex
 import subprocess
@@ -13,6 +15,7 @@ from typing import Any
 import pytest
 from paths import ROOT
 
+import hsloc
 from hsloc.cli.main import COMMANDS, build_parser, main
 from hsloc.config import Config, to_dict
 
@@ -35,8 +38,15 @@ def commands(path: Path) -> list[str]:
     return [line for line in lines if line.strip() and not line.startswith("#")]
 
 
+@pytest.fixture(scope="module")
+def every_module() -> None:
+    """All modules are imported with tracing: one that a test without tracing imports first would not count."""
+    for module in pkgutil.walk_packages(hsloc.__path__, "hsloc."):
+        importlib.import_module(module.name)
+
+
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recordings: Path) -> Path:
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recordings: Path, every_module: None) -> Path:
     (tmp_path / "recordings").symlink_to(recordings, target_is_directory=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)  # processes that are started are not traced, either

@@ -5,17 +5,24 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from room_scans import pair_term, room_scan
 
 from hsloc.kernels.normal_equations import (
     Blocks,
     Equations,
+    Evaluated,
+    PairTerms,
     add_edges,
     add_inverse_term,
+    add_pairs,
     add_relative_term,
+    evaluate_pairs,
     path_lengths,
 )
 from hsloc.kernels.point_to_line import Term, relative
+from hsloc.model import Pose2
 from hsloc.model.pose2 import relative_poses
+from hsloc.slam.keyscans import KeyScan, KeyScans
 from hsloc.slam.sparse_solver import BlockSystem
 
 
@@ -150,3 +157,59 @@ def test_path_lengths_are_those_of_dijkstra_over_chain_and_links(rng: Any) -> No
     for source in (0, 7, 29, 32):
         path_lengths(chain, links, lengths, source, found)
         np.testing.assert_allclose(found, distance[source])
+
+
+def test_terms_of_pairs_are_those_of_both_directions_and_are_kept_while_nothing_moves() -> None:
+    true = [Pose2(1.0, 1.5, 0.2), Pose2(2.5, 2.0, 0.9), Pose2(4.0, 1.5, -2.0)]
+    scans = KeyScans.from_scans([KeyScan.of(room_scan(pose)) for pose in true])
+    poses = np.array([pose.to_array() for pose in true])
+    poses[1:] += ((0.03, -0.02, 0.01), (-0.02, 0.04, -0.01))
+    pairs = np.array([[0, 1], [2, 0], [1, 2]])
+
+    def between(j: int, i: int) -> Any:
+        return relative_poses(poses[j][None], poses[i][None])[0]
+
+    def evaluate(terms: PairTerms, before: Evaluated) -> None:
+        evaluate_pairs(poses, pairs, scans.arrays(10_000), 0.3, 1e6, terms, before)
+
+    def fresh() -> tuple[PairTerms, Evaluated]:
+        matrices, vectors = np.full((2, 3, 3, 3), np.nan), np.full((3, 3, 3), np.nan)
+        return PairTerms(matrices[0], vectors[0], np.empty((3, 5)), matrices[1]), Evaluated(vectors[1], vectors[2])
+
+    terms, before = fresh()
+    evaluate(terms, before)
+    for m, (j, i) in enumerate(pairs.tolist()):
+        there, counts = pair_term(scans, i, j, between(j, i))
+        back, more = pair_term(scans, j, i, between(i, j))
+        observed = there.observed.copy()
+        add_inverse_term(between(j, i), Term(back.observed, np.zeros(3)), observed, np.zeros(3))
+        add_inverse_term(between(j, i), Term(back.information, back.gradient), there.information, there.gradient)
+        assert counts[0] > 10
+        np.testing.assert_allclose(terms.information[m], there.information, rtol=1e-9, atol=1e-6)
+        np.testing.assert_allclose(terms.gradient[m], there.gradient, rtol=1e-9, atol=1e-6)
+        np.testing.assert_allclose(terms.observed[m], observed, rtol=1e-9, atol=1e-6)
+        np.testing.assert_array_equal(terms.counts[m], counts + more)
+
+    first = terms.gradient.copy(), between(0, 1), terms.information[0].copy()
+    poses[1] += (2e-4, -1e-4, 1e-5)
+    evaluate(terms, before)
+    np.testing.assert_array_equal(terms.information[0], first[2])
+    np.testing.assert_allclose(terms.gradient[0], first[0][0] + first[2] @ (between(0, 1) - first[1]))
+    poses[1] += (0.01, 0.0, 0.0)
+    evaluate(terms, before)
+    expected, _ = again = fresh()
+    evaluate(*again)
+    for got, wanted in zip(terms, expected, strict=True):
+        np.testing.assert_array_equal(got[[0, 2]], wanted[[0, 2]])
+
+    found, by_hand = empty(3, 3), empty(3, 3)
+    found.off_diagonal[:] = np.nan
+    add_pairs(poses, pairs, terms, 4.0, found)
+    for m, (j, i) in enumerate(pairs.tolist()):
+        blocks = Blocks(
+            by_hand.diagonal[j], by_hand.off_diagonal[m], by_hand.diagonal[i], by_hand.right[j], by_hand.right[i]
+        )
+        term = Term(4.0 * terms.information[m], 4.0 * terms.gradient[m])
+        add_relative_term(poses[j], between(j, i), term, blocks, np.empty((3, 3)))
+    for got, wanted in zip(found, by_hand, strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-6)

@@ -28,7 +28,7 @@ class WarningCode(StrEnum):
     EXTRINSICS_CHOSEN = "extrinsics_chosen"
     """Several mountings of a laser are stated; the one under which scans and odometry agree is used."""
     EXTRINSICS_UNDECIDED = "extrinsics_undecided"
-    """Several mountings of a laser are stated, and the data do not tell which is right; the last is used."""
+    """Several mountings of a laser are stated, and the data do not decide which is right; the last is used."""
     TRANSFORMS_AMBIGUOUS = "transforms_ambiguous"
     """Transforms in several namespaces hold the frame of the scans; those of one are used."""
     DEFINITION_INCOMPLETE = "definition_incomplete"

@@ -243,11 +243,11 @@ def _bag_fields(header: bytes) -> dict[bytes, bytes]:
 
 def _bag_header(fields: dict[bytes, bytes]) -> bytes:
     items = [name + b"=" + value for name, value in fields.items()]
-    return b"".join(len(item).to_bytes(4, "little") + item for item in items)
+    return b"".join(_count_of(item) + item for item in items)
 
 
 def _packed(header: bytes, data: bytes) -> bytes:
-    return len(header).to_bytes(4, "little") + header + len(data).to_bytes(4, "little") + data
+    return _count_of(header) + header + _count_of(data) + data
 
 
 def _count_of(items: Sized) -> bytes:

@@ -52,7 +52,7 @@ Scans of n lasers are merged within (n - 1) / n of the slowest laser's period pl
 _USUAL_PERIOD_NS, _LONGEST_PERIOD_NS = 100_000_000, 400_000_000
 """A laser's period before it is known, and its maximum. Internal: 2D lidars turn at 5 to 40 Hz."""
 _LEAST_HITS = 20
-"""Least number of returns of a scan that can be told from others. Internal: as the front end's."""
+"""Least number of returns of a scan that differs from others. Internal: as the front end's."""
 _MOVED_M, _MOVED_RAD = 0.05, 0.05
 """Motion (m, rad) after which no scan is the same: several times the steps in which lidars give ranges."""
 _FROZEN_M = 0.5
@@ -239,11 +239,10 @@ class ScanWatch:
     def _is_repeated(self, scan: Scan) -> bool:
         before = self._last.get(scan.frame_id)
         self._last[scan.frame_id] = scan
-        hits = np.isfinite(scan.ranges)
         is_alike = before is not None and np.array_equal(scan.ranges, before.ranges, equal_nan=True)
         if before is not None and not is_alike:
             self._stuck += scan.stamp_ns == before.stamp_ns
-        if not is_alike or np.count_nonzero(hits) < _LEAST_HITS or np.ptp(scan.ranges[hits]) == 0.0:
+        if not is_alike or _is_bare(scan):
             self._since[scan.frame_id] = self._pose
             return False
         since = self._since[scan.frame_id]
@@ -345,3 +344,9 @@ class _Lasers:
         elif 0 < stamp_ns - last < _LONGEST_PERIOD_NS:
             self._period[frame] = stamp_ns - last
         self._last[frame] = stamp_ns
+
+
+def _is_bare(scan: Scan) -> bool:
+    """Whether a scan may look the same from another place: it has few returns, or all at one range."""
+    ranges = scan.ranges[np.isfinite(scan.ranges)]
+    return len(ranges) < _LEAST_HITS or bool(np.ptp(ranges) == 0.0)

@@ -86,8 +86,8 @@ def is_matched(scans: ScanDiagnostics) -> NDArray[np.bool_]:
 
 def is_lost(scans: ScanDiagnostics) -> bool:
     """Whether most scans that were to be matched found no match; those the motion gate passed over were not to be."""
-    passed_over = np.count_nonzero(np.isin(scans.status, (Status.PREDICTED.value,)))
-    return 2 * int(np.count_nonzero(is_matched(scans))) < len(scans.status) - int(passed_over)
+    tried = len(scans.status) - scans.status.count(Status.PREDICTED)
+    return bool(2 * np.count_nonzero(is_matched(scans)) < tried)
 
 
 @dataclass(frozen=True, slots=True)

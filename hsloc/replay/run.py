@@ -266,7 +266,8 @@ def _run_with(
         grid = estimator.grid()
     trajectory, localised = history.trajectory() if mapping is None else history.mapped(mapping)
     scale = None if localiser is None else localiser.map_scale
-    states = history.states(scale) if localise else None
+    mounting = history.mounting_error() if localise else None
+    states = history.states(scale, mounting) if localise else None
     tracked = localised
     if states is not None:
         localised = states.is_localised()
@@ -290,7 +291,7 @@ def _run_with(
         states=states,
         tracked=tracked,
         map_scale=scale,
-        mounting_error=history.mounting_error() if localise else None,
+        mounting_error=mounting,
         ambiguities=history.ambiguities(states),
         lidar_only=lidar_only,
         deskewed=deskew,

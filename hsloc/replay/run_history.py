@@ -179,10 +179,10 @@ class RunHistory:
             self._smoothed = smooth_matches(self._anchors, self._motion_model)
         return self._smoothed
 
-    def states(self, scale: MapScale | None = None) -> StateRows | None:
+    def states(self, scale: MapScale | None = None, mounting: MountingError | None = None) -> StateRows | None:
         """The state of each pose of the trajectory in hindsight; None for an estimator that weighs no evidence.
 
-        Where the map has another `scale` than the lidar, or the laser is mounted elsewhere than stated, poses are as
+        Where the map has another `scale` than the lidar, or the laser another `mounting` than stated, poses are as
         uncertain as that makes them.
         """
         if len(self._states) == 0:
@@ -194,7 +194,6 @@ class RunHistory:
         if scale is not None and scale.is_doubted:
             reason = f"the scale of the map is {scale.value:.3f} +- {scale.sigma:.3f}"
             rows = with_pose_errors(rows, scale.pose_errors(self.trajectory()[0].poses), reason)
-        mounting = self.mounting_error()
         if mounting is not None and mounting.is_significant:
             errors = mounting.pose_errors(self.trajectory()[0].poses)
             rows = with_pose_errors(rows, errors, "the laser is mounted elsewhere than stated")

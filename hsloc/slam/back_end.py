@@ -153,7 +153,7 @@ def _without_slips(
 ) -> _Repaired:
     """Take the weight from odometry that is contradicted and refine again, until no more is.
 
-    The rest of the map is asked when none is left that the scans of a stretch tell of by themselves.
+    The rest of the map is compared when none is left that the scans of a stretch show by themselves.
     """
     steps, passes = gathered.steps, 0
     slipped, known = np.zeros(len(steps), dtype=np.bool_), np.zeros(0)

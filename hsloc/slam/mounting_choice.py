@@ -102,7 +102,7 @@ def _choice(
         return last, _undecided(stated, names[last], str(error).rpartition(": ")[2])
     length = min(map(len, misfits))
     if length < _FEWEST:
-        return last, _undecided(stated, names[last], "the robot moves too little to tell which is right")
+        return last, _undecided(stated, names[last], "the robot moves too little to decide which is right")
     table = np.array([each[:length] for each in misfits])
     best = int(np.argmin(_bounded(table).mean(axis=1)))
     if not all(_is_better(table[best], other) for k, other in enumerate(table) if k != best):

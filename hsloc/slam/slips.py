@@ -86,7 +86,7 @@ class Stretches:
 
     @property
     def hidden(self) -> NDArray[np.bool_]:
-        """Those (m,) whose own scans do not tell a slip: no wall fixes the motion, and displaced it fits as well."""
+        """Those (m,) whose own scans do not show a slip: no wall fixes the motion, and displaced it fits as well."""
         return (self.sigma > _HARDLY_M) & (self.margin < _LEAST_MARGIN)
 
     @property

@@ -42,7 +42,7 @@ def watched(events: Sequence[Event]) -> tuple[int, list[str]]:
     ("events", "scans", "codes"),
     [
         (drive(lambda k: k), 80, []),
-        (drive(lambda k: k // 2), 80, []),  # within 5 cm: too near to tell
+        (drive(lambda k: k // 2), 80, []),  # within 5 cm: too near to decide
         (drive(lambda k: k // 3), 54, ["scans_repeated"]),
         (drive(lambda k: min(k, 40)), 42, ["scans_frozen"]),
         (drive(lambda k: min(k, 40), speed=0.0), 80, []),

@@ -60,7 +60,7 @@ def test_slips_and_stretches_in_which_none_would_be_detected_are_named(lap: Reco
     (reason,) = weigh(loose).reasons
     assert reason.code == "slip"
     assert reason.times_s == ((44.0, 65.0),), "only where the scans hardly know the motion"
-    assert codes(replace(loose, held=held((1, 0.05, 0.0)))) == ("good", []), "the rest of the map tells how far it was"
+    assert codes(replace(loose, held=held((1, 0.05, 0.0)))) == ("good", []), "the rest of the map shows how far it was"
     hidden = stretches(np.array((0.2, 0.3, 0.2)), np.ones(3))
     weak = replace(lap, stretches=hidden, held=held((0, 0.5, 0.0), (1, 0.4, 0.0), (2, 0.5, 0.0)))
     (reason,) = weigh(weak).reasons

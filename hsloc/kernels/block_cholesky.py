@@ -2,6 +2,10 @@
 
 The pattern of the factor is found once; then each matrix of that pattern costs a few operations a block. The algorithm
 is that of Davis (2005), "Algorithm 849: a concise sparse Cholesky factorization package", on blocks.
+
+Covariances are blocks of the inverse, at the places where the factor has blocks. With `A = L D L^T` the entries of
+`Z = A^-1` obey `Z = D^-1 L^-1 + (I - L^T) Z` (Takahashi, Fagan and Chin 1973; Erisman and Tinney 1975): from the last
+column to the first, each block at a place of `L` needs only such blocks.
 """
 
 from __future__ import annotations
@@ -178,3 +182,65 @@ def solve_factor(factor: Factor, x: F64) -> None:
             row = rows[p]
             for a in range(3):
                 x[k, a] -= lower[p, 0, a] * x[row, 0] + lower[p, 1, a] * x[row, 1] + lower[p, 2, a] * x[row, 2]
+
+
+@njit(cache=True, nogil=True)
+def selected_inverse(factor: Factor, lower: F64, diagonal: F64) -> None:
+    """Write the inverse's blocks at the places of the factor to `lower` (m, 3, 3), and its diagonal's (n, 3, 3)."""
+    start = factor.start
+    rows = factor.rows
+    below = factor.lower
+    n = len(diagonal)
+    place = np.full(n, -1, dtype=np.int64)
+    product = np.zeros((n, 3, 3))
+    value = np.empty((3, 3))
+    total = np.empty((3, 3))
+    for j in range(n - 1, -1, -1):
+        for q in range(start[j], start[j + 1]):
+            place[rows[q]] = q
+            product[rows[q]] = 0.0
+        # product = Z[s, s] L[s, j], s the rows of column j; Z is symmetric, and its lower half is at hand.
+        for q in range(start[j], start[j + 1]):
+            column = rows[q]
+            for a in range(3):
+                for b in range(3):
+                    value[a, b] = below[q, a, b]
+            for a in range(3):
+                for b in range(3):
+                    total[a, b] = (
+                        diagonal[column, a, 0] * value[0, b]
+                        + diagonal[column, a, 1] * value[1, b]
+                        + diagonal[column, a, 2] * value[2, b]
+                    )
+            for p in range(start[column], start[column + 1]):
+                row = rows[p]
+                at = place[row]
+                if at < 0:
+                    continue
+                for a in range(3):
+                    for b in range(3):
+                        product[row, a, b] += (
+                            lower[p, a, 0] * value[0, b] + lower[p, a, 1] * value[1, b] + lower[p, a, 2] * value[2, b]
+                        )
+                        total[a, b] += (
+                            lower[p, 0, a] * below[at, 0, b]
+                            + lower[p, 1, a] * below[at, 1, b]
+                            + lower[p, 2, a] * below[at, 2, b]
+                        )
+            for a in range(3):
+                for b in range(3):
+                    product[column, a, b] += total[a, b]
+        for a in range(3):
+            for b in range(3):
+                diagonal[j, a, b] = factor.inverse[j, a, b]
+        for q in range(start[j], start[j + 1]):
+            row = rows[q]
+            for a in range(3):
+                for b in range(3):
+                    lower[q, a, b] = -product[row, a, b]
+                    diagonal[j, a, b] += (
+                        below[q, 0, a] * product[row, 0, b]
+                        + below[q, 1, a] * product[row, 1, b]
+                        + below[q, 2, a] * product[row, 2, b]
+                    )
+            place[row] = -1

@@ -206,10 +206,16 @@ def held_by_the_rest(
     poses, pairs = refined.linearised_at, np.concatenate((refined.pairs, edges.pairs))
     terms, of_a_point = _without_hidden(refined, observed, stretches), information_of_a_point(refined)
     diagonal, off_diagonal, right = normal_equations(poses, refined.pairs, terms, of_a_point, edges)
+    # The covariances between all poses of a stretch are wanted: they are in the pattern, with zeros.
+    wanted = [first + np.column_stack(np.triu_indices(last + 1 - first)) for first, last in ends.tolist()]
+    between = np.unique(np.concatenate(wanted), axis=0)
+    between = between[between[:, 0] < between[:, 1]]
+    pairs = np.concatenate((pairs, between))
+    off_diagonal = np.concatenate((off_diagonal, np.zeros((len(between), 3, 3))))
     system, held = BlockSystem(len(poses), pairs[:, 0], pairs[:, 1]), anchored(diagonal)
     moved = system.solve(held, off_diagonal, -right)
-    wanted = np.unique(np.concatenate([np.arange(first, last + 1) for first, last in ends.tolist()]))
-    blocks = system.inverse_near(held, off_diagonal, wanted, _STEPS)
+    blocks = system.inverse_at(held, off_diagonal, np.concatenate(wanted))
+    begins = np.concatenate(([0], np.cumsum([len(each) for each in wanted])))
     driven, driven_covariance = np.empty((len(ends), 3)), np.empty((len(ends), 3, 3))
     covariances: F64 = np.asarray(np.linalg.inv(steps.information), dtype=np.float64)
     composed_motions(steps.measured, covariances, ends, driven, driven_covariance)
@@ -217,7 +223,7 @@ def held_by_the_rest(
         own = slice(first, last)
         chain = Edges(edges.pairs[own] - first, edges.measured[own], edges.information[own], edges.scale[own])
         # The other information on these poses is what is known of them less what their own odometry says.
-        known = np.linalg.inv(_joint(blocks[np.searchsorted(wanted, first) :][: last + 1 - first]))
+        known = np.linalg.inv(_joint(blocks[begins[k] : begins[k + 1]], last + 1 - first))
         local, matrix, gradient = poses[first : last + 1], *_dense(poses[first : last + 1], chain)
         left = known - matrix
         shift = np.linalg.solve(left, known @ moved[first : last + 1].reshape(-1) + gradient)
@@ -233,18 +239,13 @@ def held_by_the_rest(
     return Held(chosen, sigma, difference, odometry_sigma)
 
 
-def _joint(blocks: F64) -> F64:
-    """The matrix (3 n, 3 n) of blocks (n, n, 3, 3), of which those on the diagonal and right of it are there.
-
-    In row k the first is that on the diagonal.
-    """
-    n = len(blocks)
-    matrix = np.zeros((3 * n, 3 * n))
-    for k in range(n):
-        row = blocks[k, : n - k].transpose(1, 0, 2).reshape(3, -1)
-        matrix[3 * k : 3 * k + 3, 3 * k :] = row
-        matrix[3 * k :, 3 * k : 3 * k + 3] = row.T
-    return matrix
+def _joint(blocks: F64, n: int) -> F64:
+    """The symmetric matrix (3 n, 3 n) of its `blocks` (n (n + 1) / 2, 3, 3) on and above the diagonal, row by row."""
+    matrix = np.empty((n, 3, n, 3))
+    row, column = np.triu_indices(n)
+    matrix[column, :, row] = blocks.transpose(0, 2, 1)
+    matrix[row, :, column] = blocks
+    return matrix.reshape(3 * n, 3 * n)
 
 
 def _dense(poses: F64, edges: Edges) -> tuple[F64, F64]:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import bsr_array, csc_array, tril
+from scipy.sparse import bsr_array, csc_array
 from scipy.sparse.linalg import splu
 
-from hsloc.kernels.block_cholesky import Factor, factor_columns, factorise, solve_factor, sum_blocks
-from hsloc.kernels.normal_equations import diagonal_blocks, selected_inverse
+from hsloc.kernels.block_cholesky import Factor, factor_columns, factorise, selected_inverse, solve_factor, sum_blocks
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,10 +21,6 @@ if TYPE_CHECKING:
 MOST_BLOCKS_A_COLUMN = 200
 """Blocks in a column of the factor, on average, from which on SuperLU is used, which works on dense parts as a whole.
 With 183, 5,000 scans of 30 laps through one office, both take the same time; with 61 SuperLU takes twice as long."""
-
-
-_ROWS_AT_ONCE = 64
-"""Rows of the inverse that are solved for at once. Internal: their columns fit into memory."""
 
 
 class BlockSystem:
@@ -52,42 +47,24 @@ class BlockSystem:
 
     def solve(self, diagonal: F64, off_diagonal: F64, right: F64) -> F64:
         """The x (n, 3) of `A x = right`."""
-        if self._elimination is None:
-            self._elimination = _Elimination(self._indptr, self._indices)
-        if self._elimination.blocks > MOST_BLOCKS_A_COLUMN * self._size:
+        elimination = self._eliminated()
+        if elimination.blocks > MOST_BLOCKS_A_COLUMN * self._size:
             solution: F64 = self._factor(diagonal, off_diagonal).solve(np.ascontiguousarray(right.reshape(-1)))
             return solution.reshape(-1, 3)
-        return self._elimination.solve(self._summed(diagonal, off_diagonal), right)
+        return elimination.solve(self._summed(diagonal, off_diagonal), right)
 
     def inverse_blocks(self, diagonal: F64, off_diagonal: F64) -> F64:
         """The blocks (n, 3, 3) on the diagonal of the inverse: covariances, where the matrix is an information."""
-        factor = self._factor(diagonal, off_diagonal)
-        # Without pivoting L and U have one pattern, U = D L^T.
-        triangle = csc_array(tril(factor.L, -1))
-        triangle.sort_indices()
-        start, rows = triangle.indptr.astype(np.int64), triangle.indices.astype(np.int64)
-        lower, on_diagonal = np.zeros(len(rows)), np.zeros(3 * self._size)
-        selected_inverse(start, rows, triangle.data, factor.U.diagonal(), lower, on_diagonal)
-        blocks = np.empty((self._size, 3, 3))
-        diagonal_blocks(start, rows, lower, on_diagonal, factor.perm_c.astype(np.int64), blocks)
-        return blocks
+        return self.inverse_at(diagonal, off_diagonal, np.repeat(np.arange(self._size), 2).reshape(-1, 2))
 
-    def inverse_near(self, diagonal: F64, off_diagonal: F64, wanted: I64, reach: int) -> F64:
-        """Blocks (w, reach + 1, 3, 3) of the inverse, in the rows `wanted` (w,) from the diagonal to the right.
+    def inverse_at(self, diagonal: F64, off_diagonal: F64, places: I64) -> F64:
+        """The blocks (k, 3, 3) of the inverse in the rows and columns `places` (k, 2), which the pattern has."""
+        return self._eliminated().inverse_at(self._summed(diagonal, off_diagonal), places)
 
-        Beyond the last column they are zero.
-        """
-        factor = self._factor(diagonal, off_diagonal)
-        blocks = np.zeros((len(wanted), reach + 1, 3, 3))
-        for begin in range(0, len(wanted), _ROWS_AT_ONCE):
-            rows = wanted[begin : begin + _ROWS_AT_ONCE]
-            right = np.zeros((3 * self._size, 3 * len(rows)))
-            right[(3 * rows[:, None] + np.arange(3)).reshape(-1), np.arange(3 * len(rows))] = 1.0
-            columns = factor.solve(right).reshape(self._size, 3, len(rows), 3)
-            for k, row in enumerate(rows.tolist()):
-                near = columns[row : row + reach + 1, :, k]
-                blocks[begin + k, : len(near)] = near.transpose(0, 2, 1)
-        return blocks
+    def _eliminated(self) -> _Elimination:
+        if self._elimination is None:
+            self._elimination = _Elimination(self._indptr, self._indices)
+        return self._elimination
 
     def _summed(self, diagonal: F64, off_diagonal: F64) -> F64:
         """The blocks of the matrix, row by row."""
@@ -112,7 +89,7 @@ class _Elimination:
         rows, columns = place[np.repeat(np.arange(size), np.diff(indptr))], place[indices]
         upper = np.flatnonzero(rows < columns)
         upper = upper[np.lexsort((rows[upper], columns[upper]))]
-        self._order, self._upper = order, upper
+        self._order, self._upper, self._place = order, upper, place
         self._diagonal = np.flatnonzero(rows == columns)[order]
         self._rows = rows[upper]
         self._start = np.concatenate(([0], np.cumsum(np.bincount(columns[upper], minlength=size)))).astype(np.int64)
@@ -125,15 +102,34 @@ class _Elimination:
 
     def solve(self, blocks: F64, right: F64) -> F64:
         """The x (n, 3) of the matrix with these blocks, in the order of the pattern."""
+        factor = self._factorised(blocks)
+        x = np.ascontiguousarray(right[self._order], dtype=np.float64)
+        solve_factor(factor, x)
+        solution = np.empty_like(x)
+        solution[self._order] = x
+        return solution
+
+    def inverse_at(self, blocks: F64, places: I64) -> F64:
+        """The blocks (k, 3, 3) of the inverse in the rows and columns `places` (k, 2) of the matrix with these."""
+        factor = self._factorised(blocks)
+        lower, diagonal = np.empty_like(factor.lower), np.empty_like(factor.inverse)
+        selected_inverse(factor, lower, diagonal)
+        size = len(diagonal)
+        row, column = self._place[places.T]
+        at_entries = np.repeat(np.arange(size), np.diff(factor.start)) * size + factor.rows
+        entry = np.searchsorted(at_entries, np.minimum(row, column) * size + np.maximum(row, column))
+        below, above = row > column, row < column
+        found: F64 = diagonal[row]
+        found[below] = lower[entry[below]]
+        found[above] = lower[entry[above]].transpose(0, 2, 1)
+        return found
+
+    def _factorised(self, blocks: F64) -> Factor:
         if self._factor is None:
             rows, lower = np.empty(self.blocks, dtype=np.int64), np.empty((self.blocks, 3, 3))
             self._factor = Factor(self._start_of_factor, rows, lower, np.empty((len(self._order), 3, 3)))
         factorise(self._start, self._rows, blocks[self._upper], blocks[self._diagonal], self._parent, self._factor)
-        x = np.ascontiguousarray(right[self._order], dtype=np.float64)
-        solve_factor(self._factor, x)
-        solution = np.empty_like(x)
-        solution[self._order] = x
-        return solution
+        return self._factor
 
 
 def _minimum_degree(indptr: I64, indices: I64) -> I64:

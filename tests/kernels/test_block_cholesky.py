@@ -44,7 +44,12 @@ def test_a_ring_with_chords_that_fill_the_factor_in(rng: Any, chords: int) -> No
     for i, j, block in zip(rows, columns, off, strict=True):
         dense[i, :, j] += block
         dense[j, :, i] += block.T
-    expected = np.linalg.solve(dense.reshape(3 * n, 3 * n), right.reshape(-1)).reshape(n, 3)
-    np.testing.assert_allclose(
-        BlockSystem(n, rows, columns).solve(diagonal, off, right), expected, rtol=1e-9, atol=1e-12
-    )
+    system, matrix = BlockSystem(n, rows, columns), dense.reshape(3 * n, 3 * n)
+    expected = np.linalg.solve(matrix, right.reshape(-1)).reshape(n, 3)
+    np.testing.assert_allclose(system.solve(diagonal, off, right), expected, rtol=1e-9, atol=1e-12)
+    inverse, every = np.linalg.inv(matrix).reshape(n, 3, n, 3), np.arange(n)
+    got = system.inverse_blocks(diagonal, off)
+    np.testing.assert_allclose(got, inverse[every, :, every], rtol=1e-9, atol=1e-12)
+    for first, second in ((rows, columns), (columns, rows), (every, every)):  # in either triangle
+        got = system.inverse_at(diagonal, off, np.column_stack((first, second)))
+        np.testing.assert_allclose(got, inverse[first, :, second], rtol=1e-9, atol=1e-12)

@@ -77,7 +77,7 @@
       this.$scale = make("div", { class: "rv-scale" }, make("i"), make("span"));
       this.$tools = make("div", { class: "rv-tools" }, button("in", "+", "zoom in"), button("out", "−", "zoom out"),
         button("all", "⤢", "show all"), button("measure", "↔", "measure a distance"), button("picture", "PNG", "save the map as a picture"), button("drawing", "SVG", "save the map as a drawing"));
-      this.$frame = make("div", { class: "rv-frame" }, this.$base, this.$over, this.$place, this.$scale, this.$tools);
+      this.$frame = make("div", { class: "rv-frame" }, this.$base, this.$over, this.$place, this.$scale);
       const [x0, y0, x1, y1] = this.data.extent;
       this.$frame.style.setProperty("--rv-aspect", String(Math.min(Math.max((x1 - x0) / (y1 - y0), 0.8), 3)));
       this.$time = make("input", { type: "range", min: "0", max: String(this.data.end || 1), step: "any", value: "0", "aria-label": "time" });
@@ -96,7 +96,7 @@
       this.$layers = make("div", { class: "rv-layers" });
       this.root.classList.add("rv");
       this.$charts.classList.add("rv", "rv-charts");
-      this.root.replaceChildren(this.$frame, make("div", { class: "rv-time" }, steps, this.$time, this.$now), this.$event, this.$layers);
+      this.root.replaceChildren(this.$frame, this.$tools, make("div", { class: "rv-time" }, steps, this.$time, this.$now), this.$event, this.$layers);
       this.buildLayers();
     }
 

@@ -57,7 +57,7 @@ def print_job(summary: Mapping[str, Any]) -> None:
     """The result of a job of the service, as `print_summary` and `print_warnings` show that of a replay."""
     from hsloc.dataclass_json import from_json
     from hsloc.model.verdict import VerdictReason
-    from hsloc.report.table import Row, reason_text
+    from hsloc.report.table import Row, reason_texts
     from hsloc.warnings import RunWarning
 
     # A server of an earlier version sends warnings as text, and no figures.
@@ -68,7 +68,8 @@ def print_job(summary: Mapping[str, Any]) -> None:
     verdict = summary.get("metrics", {}).get("verdict")
     lines = [] if verdict is None else [f"verdict: {summary.get('verdict_text', verdict)}"]
     lines += [summary["headline"]] if "headline" in summary else []
-    lines += [f"  {reason_text(from_json(VerdictReason, each))}" for each in summary.get("verdict_reasons", ())]
+    reasons = [from_json(VerdictReason, each) for each in summary.get("verdict_reasons", ())]
+    lines += [f"  {each}" for each in reason_texts(reasons)]
     print_lines(lines + _table([Row(each["name"], tuple(each["values"])) for each in summary.get("figures", ())]))
 
 

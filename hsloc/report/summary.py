@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.model.estimate import Status
 from hsloc.model.verdict import Verdict
-from hsloc.report.table import Row, format_duration, format_length, format_share, reason_text, table_rows
+from hsloc.report.table import Row, format_duration, format_length, format_share, reason_texts, table_rows
 
 if TYPE_CHECKING:
     from hsloc.run_metrics import RunMetrics
@@ -64,7 +64,7 @@ class ResultSummary:
             headline=_headline(metrics),
             key_figures=tuple(key_figures[:_MOST_KEY_FIGURES]),
             figures=tuple(rows),
-            reasons=tuple(reason_text(reason) for reason in metrics.verdict_reasons),
+            reasons=tuple(reason_texts(metrics.verdict_reasons)),
             warnings=tuple(_warnings(metrics)),
             facts=tuple(_facts(metrics)),
         )

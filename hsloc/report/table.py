@@ -11,7 +11,7 @@ import numpy as np
 from hsloc.model import Status
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from hsloc.evaluation import PoseStatistics, Statistics
     from hsloc.model.verdict import VerdictReason
@@ -107,10 +107,20 @@ def _three_figures(value: float) -> str:
     return f"{value:.{decimals}f}"
 
 
+def reason_texts(reasons: Sequence[VerdictReason]) -> list[str]:
+    """The texts of the reasons; a remedy that several in a row share stands in the last of them alone."""
+    after = (*(reason.remedy for reason in reasons[1:]), "")
+    return [
+        reason_text(reason if reason.remedy != following else replace(reason, remedy=""))
+        for reason, following in zip(reasons, after, strict=False)
+    ]
+
+
 def reason_text(reason: VerdictReason) -> str:
     """What was found, when (in seconds since the first pose) and where (in the map frame), and what to do about it."""
     times = [f"{begin:.1f} to {end:.1f} s" for begin, end in reason.times[:_LISTED]]
-    places = [f"({x:.1f}, {y:.1f}) m" for x, y in reason.places[:_LISTED]]
+    # z: no minus before a zero.
+    places = [f"({x:z.1f}, {y:z.1f}) m" for x, y in reason.places[:_LISTED]]
     text = reason.text
     for words, listed, count in (("from", times, len(reason.times)), ("near", places, len(reason.places))):
         if listed:

@@ -22,7 +22,15 @@ from hsloc.model.verdict import Verdict, VerdictReason, verdict_of
 from hsloc.report.data import ReportParts
 from hsloc.report.png import report_figure
 from hsloc.report.summary import ResultSummary
-from hsloc.report.table import error_statistics, format_angle, format_length, format_share, reason_text, table_rows
+from hsloc.report.table import (
+    error_statistics,
+    format_angle,
+    format_length,
+    format_share,
+    reason_text,
+    reason_texts,
+    table_rows,
+)
 from hsloc.run_metrics import LocalisedMetrics, RunMetrics, RunTimings, schema
 from hsloc.warnings import RunWarning, WarningCode
 from hsloc_service.execution.worker import summarise
@@ -233,6 +241,10 @@ def test_the_reasons_name_places_and_times(metrics: Any) -> None:
     )
     many = replace(reason, times=((0.0, 1.0),) * 5, places=(), remedy="")
     assert reason_text(many).endswith(", from 0.0 to 1.0 s, 0.0 to 1.0 s, 0.0 to 1.0 s and 2 more")
+    assert reason_text(replace(many, times=(), places=((-0.01, 2.0),))).endswith(", near (0.0, 2.0) m")
+    several = [replace(many, text=text, times=(), remedy=remedy) for text, remedy in zip("abc", "xxy", strict=True)]
+    assert reason_texts(several) == ["a", "b; x", "c; y"]  # a shared remedy once
+    assert reason_texts([]) == []
 
 
 def test_a_job_keeps_all_warnings_of_the_run() -> None:

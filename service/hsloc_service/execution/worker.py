@@ -169,7 +169,6 @@ def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
     """The summary of a job: the figures as the reports show them, the verdict, and all warnings of the run."""
     from hsloc.dataclass_json import to_json
     from hsloc.report.summary import ResultSummary
-    from hsloc.report.table import reason_text
     from hsloc.sweep.table import figures
 
     values, summary = metrics.to_json(), ResultSummary.of(metrics)
@@ -182,7 +181,8 @@ def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
             {"name": row.label, "values": list(row.values), "numbers": list(row.numbers)} for row in summary.figures
         ],
         "verdict_reasons": [
-            {**_shortened(to_json(each)), "line": reason_text(each)[:500]} for each in metrics.verdict_reasons
+            {**_shortened(to_json(each)), "line": line[:500]}
+            for each, line in zip(metrics.verdict_reasons, summary.reasons, strict=True)
         ][:_MOST_LINES],
         "data_lost": metrics.losses.data_lost,
         "warnings": [_shortened(to_json(each)) for each in metrics.warnings][:_MOST_LINES],

@@ -54,6 +54,11 @@ class Scratch:
         self._folder: Path | None = None
 
     @property
+    def is_used(self) -> bool:
+        """Whether the folder was needed."""
+        return self._folder is not None
+
+    @property
     def folder(self) -> Path:
         """The folder. Raises LogError where none can be made."""
         if self._folder is None:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from hsloc.log.container import Container
     from hsloc.log.source import Observation, Source
+    from hsloc.log.text.source import TextSource
     from hsloc.model import Event, OccupancyGrid, Pose2
     from hsloc.model.calibration import Calibration, OdometryCorrection
 
@@ -51,7 +52,7 @@ class Log:
     @property
     def is_unpacked(self) -> bool:
         """Whether it takes disk space for files that were unpacked, as long as it lives."""
-        return self._scratch is not None
+        return self._scratch is not None and self._scratch.is_used
 
     def events(self) -> Iterator[Event]:
         """All events in a total, repeatable order (see `hsloc.log.session.ordering`), with their own header stamps.
@@ -148,7 +149,8 @@ def open_log(paths: Path | str | Sequence[Path | str], options: ReadOptions | No
     if "text" in kinds:
         if len(files) > 1:
             raise LogFormatError(f"{files[0].shown}: text logs are read one at a time; convert them first")
-        return Log(_noted(_text_source(files[0], options), files), options, originals, scratch)
+        text = _text_source(files[0], options)
+        return Log(_noted(text, files), options, originals, None if text.is_in_memory else scratch)
     from hsloc.log.session.message_source import RosSource
 
     source = RosSource([_container(file) for file in files], options)
@@ -173,7 +175,7 @@ def is_log(path: Path) -> bool:
     return first.kind != "text" or find_format(first.path) is not None
 
 
-def _text_source(file: LogFile, options: ReadOptions) -> Source:
+def _text_source(file: LogFile, options: ReadOptions) -> TextSource:
     from hsloc.log.text.source import TextSource, find_format
 
     line_format = find_format(file.path)

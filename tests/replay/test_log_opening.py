@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import gzip
+from typing import TYPE_CHECKING, Any
 
 from log_builders import SECOND, START, make_scan
 
-from hsloc.log import LogWriter
+from hsloc.analysis import second_pass
+from hsloc.log import Log, LogWriter, open_log
 from hsloc.model import Pose2
 from hsloc.replay.clock_offset import open_as_meant
+from hsloc.replay.run import run
 from hsloc.request import RunRequest
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    import pytest
 
 
 def test_stamps_of_another_epoch_give_way_to_the_times_of_the_log(tmp_path: Path) -> None:
@@ -28,3 +33,36 @@ def test_stamps_of_another_epoch_give_way_to_the_times_of_the_log(tmp_path: Path
     assert {event.stamp_ns // (1000 * SECOND) for event in log.events()} == {START // (1000 * SECOND)}
     given = RunRequest.from_values([path], {"stamps": "log"})
     assert open_as_meant(given, lidar_only=False)[1:] == (given.reading(), ())
+
+
+LINES = [
+    f"ODOM {0.01 * k:.2f} 0 0 0 0 0 {k}.0 host {k}.0\nFLASER 9 {'1 ' * 9}0 0 0 0 0 0 {k}.0 host {k}.0\n"
+    for k in range(9)
+]
+
+
+def test_a_log_is_opened_once_for_run_and_analysis_unless_that_holds_unpacked_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mcap, text = tmp_path / "a.mcap", "".join(LINES).encode()
+    with LogWriter(mcap) as writer:
+        writer.transforms(START, [("base_link", "laser", Pose2(0.0, 0.0, 0.0))], static=True)
+        for k in range(9):
+            writer.odometry(START + k * SECOND, Pose2(0.01 * k, 0.0, 0.0))
+            writer.scan(make_scan(START + k * SECOND, k))
+    contents = {"b.mcap.gz": gzip.compress(mcap.read_bytes()), "c.clf": text, "d.clf.gz": gzip.compress(text)}
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+    opened: list[str] = []
+
+    def noted(*arguments: Any) -> Log:
+        opened.append("again")
+        return open_log(*arguments)
+
+    monkeypatch.setattr(second_pass, "open_log", noted)
+    for name, times in (("a.mcap", 0), ("b.mcap.gz", 1), ("c.clf", 0), ("d.clf.gz", 0)):
+        opened.clear()
+        result = run(RunRequest(logs=(tmp_path / name,), mode="slam"))
+        assert (result.log is None) == (times == 1)
+        assert sum(posed.localised for posed in second_pass.posed_events(result)) > 0
+        assert len(opened) == times, name

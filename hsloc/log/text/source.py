@@ -109,6 +109,11 @@ class TextSource:
         self.losses_at_opening = Losses()
         self.summary = self._survey()
 
+    @property
+    def is_in_memory(self) -> bool:
+        """Whether all lines are kept, and the file is not needed any more."""
+        return self._kept_losses is not None
+
     def _parsed(self, losses: Losses) -> Iterator[tuple[str, Line]]:
         if self._kept_losses is None:
             return self._parsed_file(losses)
@@ -299,6 +304,6 @@ class TextSource:
     def verify(self) -> Losses:
         """Read every line."""
         losses = Losses()
-        for _ in self._parsed_file(losses):
+        for _ in self._parsed(losses):
             pass
         return losses

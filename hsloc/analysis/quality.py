@@ -33,6 +33,7 @@ _VERDICTS = {
     WarningCode.EXTRINSICS_UNDECIDED: Verdict.CHECK,
     WarningCode.SCANS_FROZEN: Verdict.CHECK,
     WarningCode.SCAN_STAMPS_STUCK: Verdict.CHECK,
+    WarningCode.CLOCK_SET: Verdict.CHECK,
     WarningCode.ODOMETRY_JUMPS: Verdict.CHECK,
     WarningCode.CLOCK_OFFSET_LARGE: Verdict.CHECK,
     WarningCode.MAP_SCALE: Verdict.CHECK,

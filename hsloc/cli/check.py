@@ -52,7 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
     with ProgressLine(arguments.quiet or arguments.json or arguments.no_progress) as line:
         report = check_log(log, lambda log_time: line.show("check", (log_time - start) / span))
     options, findings = _with_choices(read_options(arguments), log, report.findings)
-    offsets = _offsets(options, log)
+    # An offset is none where a clock was set in the middle.
+    offsets = {} if report.losses.clock_steps else _offsets(options, log)
     report = replace(report, findings=(*findings, *_of_clocks(offsets)))
     seconds = {topic: offset.seconds for topic, offset in offsets.items()}
     unkept = [] if profile is None else violations(profile, log.summary, report, seconds)

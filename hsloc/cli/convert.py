@@ -11,8 +11,10 @@ from hsloc.cli.progress import ProgressLine
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Sequence
 
     from hsloc.log import Conversion, LogSummary
+    from hsloc.warnings import RunWarning
 
 HELP = "convert a log to MCAP"
 EXAMPLES = """
@@ -38,6 +40,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     from hsloc.errors import OutputError
     from hsloc.log import convert_log, open_log
+    from hsloc.slam.front_end import FrontEndParameters
+    from hsloc.slam.mounting_choice import with_chosen_mountings
+    from hsloc.warnings import WarningCode
 
     target = Path(arguments.out)
     if target.exists() and not target.is_dir():
@@ -47,16 +52,27 @@ def run(arguments: argparse.Namespace) -> int:
             raise OutputError(f"{target}: exists; give --force to overwrite it, or name another file")
     options = replace(read_options(arguments), require_odometry=False)
     log = open_log(arguments.log, options)
+    chosen, of_mountings = with_chosen_mountings(log, [Path(arguments.log)], options, FrontEndParameters())
+    # Where the data do not decide, all mountings are written, for whoever reads the file.
+    decided = [
+        mounting
+        for mounting, warning in zip(reversed(chosen.mountings), reversed(of_mountings), strict=False)
+        if warning.code == WarningCode.EXTRINSICS_CHOSEN
+    ]
+    if decided:
+        log = open_log(arguments.log, replace(options, mountings=tuple(decided)))
     span = max(log.summary.end_ns - log.summary.origin_ns, 1)
     with ProgressLine(arguments.quiet or arguments.no_progress) as line:
         conversion = convert_log(
             log, target, lambda stamp: line.show("convert", (stamp - log.summary.origin_ns) / span)
         )
-    _report(arguments, log.summary, conversion)
+    _report(arguments, log.summary, (*log.summary.warnings, *of_mountings), conversion)
     return 3 if conversion.losses.data_lost else 0
 
 
-def _report(arguments: argparse.Namespace, summary: LogSummary, conversion: Conversion) -> None:
+def _report(
+    arguments: argparse.Namespace, summary: LogSummary, warnings: Sequence[RunWarning], conversion: Conversion
+) -> None:
     from json import dumps
 
     from hsloc.dataclass_json import to_json
@@ -73,7 +89,7 @@ def _report(arguments: argparse.Namespace, summary: LogSummary, conversion: Conv
             "stamps_backwards": conversion.stamps_backwards,
             "data_lost": conversion.losses.data_lost,
             "losses": losses + conversion.losses.reasons,
-            "warnings": [to_json(warning) for warning in summary.warnings],
+            "warnings": [to_json(warning) for warning in warnings],
         }
         print(dumps(values))
         return
@@ -84,7 +100,7 @@ def _report(arguments: argparse.Namespace, summary: LogSummary, conversion: Conv
         print(f"{conversion.path}: {', '.join(parts)}, from {summary.format}")
         print(f"laser: {pose_text(summary.T_base_laser)} on the base ({summary.extrinsics})")
         print(f"stamps that run backwards: {conversion.stamps_backwards}, kept as they are")
-        for warning in summary.warnings:
+        for warning in warnings:
             print(f"hsloc: warning: {warning}", file=sys.stderr)
     if not arguments.quiet or conversion.losses.data_lost:
         for line in losses + conversion.losses.reasons:

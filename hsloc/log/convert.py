@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from hsloc.errors import LogFormatError
 from hsloc.log.session.log_session import CONVERTED
 from hsloc.log.session.message_source import INITIAL_POSE
+from hsloc.log.transforms import laser_mounting
 from hsloc.log.writer import LogWriter
 from hsloc.model import IDENTITY, Heading, Odometry, Scan
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
     from hsloc.log.reader import Log
     from hsloc.log.summary import Losses
-    from hsloc.model import Event
+    from hsloc.model import Event, Pose2
 
 PROGRESS_EVERY = 500
 """Messages between two reports of progress."""
@@ -144,6 +145,17 @@ class _Conversion:
             if scan.T_base_laser == IDENTITY:
                 return frame
             frame = "laser"
-        links = [(self._base_frame, frame, scan.T_base_laser)]
-        self._writer.transforms(scan.stamp_ns, links, static=True, log_time_ns=self._log_time)
+        for pose in (*self._other_mountings(scan), scan.T_base_laser):
+            links = [(self._base_frame, frame, pose)]
+            self._writer.transforms(scan.stamp_ns, links, static=True, log_time_ns=self._log_time)
         return frame
+
+    def _other_mountings(self, scan: Scan) -> list[Pose2]:
+        """Those that the log states beside the one that was used, for whoever reads the file to decide or be warned.
+
+        One that is upside down against it would need other scans, and is left out.
+        """
+        lasers = [laser for laser in self._log.summary.lasers if laser.frame == scan.frame_id]
+        stated = [(laser.flipped, laser_mounting(each)) for laser in lasers for each in laser.alternatives]
+        poses = [mounting.T_base_laser for flipped, mounting in stated if mounting.flipped == flipped]
+        return [pose for pose in poses if pose != scan.T_base_laser]

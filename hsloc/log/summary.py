@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from hsloc.errors import ConfigError
 from hsloc.model import IDENTITY, Pose2
 from hsloc.options import AUTO, STAMPS
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
     from hsloc.log.transforms import Transform3
     from hsloc.model.calibration import Calibration
-    from hsloc.warnings import RunWarning
 
 NANOSECONDS = 1_000_000_000
 LONGEST_OFFSET_S = 1e6
@@ -249,6 +249,7 @@ REASONS_KEPT = 50
 class Losses:
     """What could not be read, counted while reading, and oddities of time that were put in order.
 
+    `clock_steps` are, by topic, the steps of the clock of its stamps (ns), with the log times (ns) after them.
     `reasons` are lines for people, at most 50 of them.
     """
 
@@ -260,6 +261,7 @@ class Losses:
     invalid_messages: Counter[str] = field(default_factory=Counter)
     stamps_backwards: Counter[str] = field(default_factory=Counter)
     stamp_jumps: Counter[str] = field(default_factory=Counter)
+    clock_steps: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
     stamps_zero: Counter[str] = field(default_factory=Counter)
     stamps_zero_dropped: Counter[str] = field(default_factory=Counter)
     orientations_unset: Counter[str] = field(default_factory=Counter)
@@ -295,11 +297,34 @@ class Losses:
         self.invalid_messages.update(other.invalid_messages)
         self.stamps_backwards.update(other.stamps_backwards)
         self.stamp_jumps.update(other.stamp_jumps)
+        for topic, steps in other.clock_steps.items():
+            self.clock_steps.setdefault(topic, []).extend(steps)
         self.stamps_zero.update(other.stamps_zero)
         self.orientations_unset.update(other.orientations_unset)
         self.stamps_zero_dropped.update(other.stamps_zero_dropped)
         for reason in other.reasons:
             self.note(reason)
+
+    def step_warnings(self, summary: LogSummary) -> tuple[RunWarning, ...]:
+        """A warning for each step of a clock in the log of a summary, with all topics that it shows on."""
+        alike: dict[tuple[float, int], list[str]] = {}
+        for topic, steps in sorted(self.clock_steps.items()):
+            alike.setdefault((round(steps[0][0] / NANOSECONDS, 1), len(steps)), []).append(topic)
+        found = []
+        for (step_s, count), topics in alike.items():
+            at_s = (min(self.clock_steps[topic][0][1] for topic in topics) - summary.start_ns) / NANOSECONDS
+            direction = "forward" if step_s > 0.0 else "back"
+            text = (
+                f"the stamps of {', '.join(topics)} step {direction} by {abs(step_s):.1f} s at {at_s:.1f} s of the log"
+                f"{f', the first of {count} steps' if count > 1 else ''}: a clock was set while it was recorded"
+            )
+            remedy = (
+                "cut the log there with --start or --end"
+                if all(topic.encoding == "text" for topic in summary.topics)
+                else "--stamps log takes the times at which messages were recorded"
+            )
+            found.append(RunWarning(WarningCode.CLOCK_SET, text, remedy))
+        return tuple(found)
 
     def copy(self) -> Losses:
         """An independent copy."""
@@ -315,7 +340,7 @@ class Losses:
             ("messages without stamp; the log's time was taken", self.stamps_zero),
             ("messages without stamp were dropped", self.stamps_zero_dropped),
             (
-                "orientations are quaternions of zeros or of z alone: left out between others, else taken as heading 0",
+                "orientations are no rotations (zeros, no w, or angles beside w = 1): left out between others",
                 self.orientations_unset,
             ),
         )

@@ -98,9 +98,15 @@ class FrameTree:
         self._links: dict[str, tuple[str, Transform3]] = {}
         self._changes: Counter[str] = Counter()
         self._statements: dict[str, list[tuple[str, Transform3]]] = {}
+        self.unturned: dict[str, tuple[float, ...]] = {}
+        """Frames whose last quaternion states no rotation, with it."""
 
     def add(self, parent: str, child: str, transform: Transform3) -> None:
         """State (or restate) a frame's pose in its parent's."""
+        if states_rotation(transform.rotation):
+            self.unturned.pop(child, None)
+        else:
+            self.unturned[child] = transform.rotation
         transform = transform.normalised()
         known = self._links.get(child)
         if known is not None and differ(known, (parent, transform)):
@@ -204,15 +210,21 @@ class FrameTree:
 
 _UNIT = 1e-3
 """Error of the length of a quaternion that was written with few digits."""
+_ROUNDED = 0.05
+"""Length of x, y and z beside which w is 1 if it was rounded to three digits."""
 
 
 def states_rotation(quaternion: Sequence[float]) -> bool:
-    """Whether a quaternion (x, y, z, w) states a rotation: not where it was never filled, or z alone was.
+    """Whether a quaternion (x, y, z, w) states a rotation: not where it or its w was never filled.
 
-    With w = 0 the robot would look straight back, which no robot does all the time; then z is 1 or -1.
+    With w = 0 the robot would look straight back, which no robot does all the time; then the others are of unit length.
+    With w = 1 it would look ahead, and they are 0: angles were written in their place where they are not.
     """
     x, y, z, w = quaternion
-    return bool(x or y or w) or abs(abs(z) - 1.0) <= _UNIT
+    if w not in (0.0, 1.0):
+        return True
+    length = sqrt(x * x + y * y + z * z)
+    return abs(length - 1.0) <= _UNIT if w == 0.0 else length <= _ROUNDED
 
 
 def differ(first: tuple[str, Transform3], second: tuple[str, Transform3]) -> bool:

@@ -28,8 +28,13 @@ if TYPE_CHECKING:
     from hsloc.request import RunRequest
     from hsloc.slam.time_offset import Offset
 
-KNOWN = (WarningCode.CLOCK_OFFSET, WarningCode.CLOCK_OFFSET_LARGE, WarningCode.CLOCK_OFFSET_APPLIED)
-"""Warnings of a run that has looked for the offset."""
+KNOWN = (
+    WarningCode.CLOCK_OFFSET,
+    WarningCode.CLOCK_OFFSET_LARGE,
+    WarningCode.CLOCK_OFFSET_APPLIED,
+    WarningCode.CLOCK_SET,
+)
+"""Warnings of a run that has looked for the offset, or that has none: it is not one where a clock was set."""
 
 
 def open_as_meant(

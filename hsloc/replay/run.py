@@ -185,8 +185,9 @@ def _run(request: RunRequest, progress: Callable[[Progress], None] | None) -> Re
             "repair its source, or name another with --odom-topic",
         )
         return _run_with(request, progress, lidar_only=True, warnings=(warning,))
-    is_corrected = any(warning.code == WarningCode.CLOCK_OFFSET_APPLIED for warning in result.warnings)
-    if result.mode != "localise" or result.lidar_only or is_corrected:
+    settled = (WarningCode.CLOCK_OFFSET_APPLIED, WarningCode.CLOCK_SET)
+    is_settled = any(warning.code in settled for warning in result.warnings)
+    if result.mode != "localise" or result.lidar_only or is_settled:
         return result
     evidence = result.clock_evidence()
     if not evidence.hints:
@@ -264,6 +265,7 @@ def _run_with(
         seconds["finish"] = time.perf_counter() - replayed
     elif isinstance(estimator, PointMapper):
         grid = estimator.grid()
+    of_steps = log.losses.step_warnings(log.summary)
     trajectory, localised = history.trajectory() if mapping is None else history.mapped(mapping)
     scale = None if localiser is None else localiser.map_scale
     mounting = history.mounting_error() if localise else None
@@ -282,7 +284,7 @@ def _run_with(
         grid=require_map(grid),
         diagnostics=_diagnostics(history, mapping),
         losses=log.losses,
-        warnings=(*log.summary.warnings, *warnings, *events.warnings(), *watch.warnings()),
+        warnings=(*log.summary.warnings, *warnings, *events.warnings(), *watch.warnings(), *of_steps),
         seconds=seconds,
         mode="localise" if localise else "slam",
         mapping=mapping,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from log_builders import SECOND, START, describe, make_scan
 
 from hsloc.log.session.ordering import KIND_ODOMETRY, KIND_SCAN, WINDOW_NS, Arrivals, Reorder, TopicClock
-from hsloc.log.summary import Losses
+from hsloc.log.summary import LogSummary, Losses
 from hsloc.model import Odometry, Pose2
 
 if TYPE_CHECKING:
@@ -105,7 +105,8 @@ def test_a_clock_that_is_set_is_counted_alike_however_messages_are_batched(size:
     arrivals = [("odometry", START + n * 20 * MS + (n >= 109) * 3600 * SECOND, START + n * 20 * MS) for n in range(300)]
     found, losses = order(arrivals, size)
     assert found == [(kind, stamp) for kind, stamp, _ in arrivals]
-    assert losses == Losses(stamp_jumps={"/odom": 2})  # type: ignore[arg-type]
+    step = 3600 * SECOND, START + 109 * 20 * MS
+    assert losses == Losses(stamp_jumps={"/odom": 2}, clock_steps={"/odom": [step]})  # type: ignore[arg-type]
 
 
 def test_a_clock_that_is_set_back_twice_at_once_makes_nothing_late() -> None:
@@ -176,3 +177,32 @@ def test_any_delays_below_the_window_come_out_sorted(data: st.DataObject) -> Non
     found, losses = order(arrivals)
     assert found == [(k, s) for s, k in sorted((s, k) for k, s, _ in arrivals)]
     assert losses == Losses()
+
+
+@pytest.mark.parametrize("size", [1, 7, 64])
+@pytest.mark.parametrize("step_s", [-15.0, -3.0, -1.2, 1.2, 3.0])
+def test_a_clock_that_was_set_is_found_on_the_topics_that_it_stamps(step_s: float, size: int) -> None:
+    step = round(step_s * SECOND)
+    arrivals = [
+        (kind, log_time - 30 * MS + (step if set_at <= number else 0), log_time)
+        for number in range(200)
+        for log_time in [START + number * 50 * MS]
+        for kind, set_at in (("odometry", 90), ("scan", 300 if step_s > 0.0 else 90))
+    ]
+    _, losses = order(arrivals, size)
+    topics = ["/odom"] if step_s > 0.0 else ["/odom", "/scan"]
+    assert losses.clock_steps == {topic: [(step, START + 90 * 50 * MS)] for topic in topics}
+    (warning,) = losses.step_warnings(LogSummary((), "mcap", start_ns=START))
+    for part in (", ".join(topics), "back" if step_s < 0.0 else "forward", f"{abs(step_s):.1f} s at 4.5 s"):
+        assert part in warning.text
+
+
+@pytest.mark.parametrize("size", [1, 64])
+def test_delays_and_gaps_are_no_steps_of_a_clock(size: int) -> None:
+    stamps = [START + number * 50 * MS for number in range(400) if not 100 <= number < 140]  # 2 s without messages
+    log_times = [stamp + 30 * MS for stamp in stamps]
+    for first, last in ((0, 30), (200, 260)):  # kept somewhere, and written together
+        log_times[first:last] = [log_times[last]] * (last - first)
+    stamps[300] -= 3 * SECOND  # a single one
+    _, losses = order([("odometry", *times) for times in zip(stamps, log_times, strict=True)], size)
+    assert losses.clock_steps == {}

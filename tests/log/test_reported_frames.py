@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from log_builders import MOUNTING, START, describe, make_scan, write_run
 
+from hsloc.cli.main import main
 from hsloc.errors import TopicError
 from hsloc.log import LogWriter, ReadOptions, check_log, convert_log, open_log
 from hsloc.log.messages import definitions
 from hsloc.log.summary import Losses
+from hsloc.log.transforms import Transform3
 from hsloc.model import OccupancyGrid, Pose2
 
 if TYPE_CHECKING:
@@ -41,7 +43,7 @@ def write_robot(
     return path
 
 
-def _add_robot(log: LogWriter, space: str, prefix: str, odom: str, topic: bool, mounting: Pose2) -> None:
+def _add_robot(log: LogWriter, space: str, prefix: str, odom: str, topic: bool, mounting: Pose2 | Transform3) -> None:
     base, laser = f"{prefix}base_link", f"{prefix}laser"
     log.transforms(START, [(base, laser, mounting)], static=True, topic=f"{space}/tf_static")
     for number in range(30):
@@ -148,6 +150,33 @@ def test_a_mounting_that_was_assumed_stays_an_assumption_after_conversion(tmp_pa
     assert before == after
 
 
+def test_mountings_between_which_nothing_decides_are_all_converted(tmp_path: Path) -> None:
+    source, target = tmp_path / "two.mcap", tmp_path / "converted.mcap"
+    with LogWriter(source) as log:
+        log.transforms(START, [("base_link", "laser", Pose2(0.18, 0.0, 0.0))], static=True)
+        _add_robot(log, "", "", "odom", True, Pose2(0.1, 0.0, 0.0))
+    assert main(["convert", str(source), str(target), "-q"]) == 0
+    (laser,) = open_log(target).summary.lasers
+    assert [transform.translation[0] for transform in laser.alternatives] == [0.18, 0.1]
+    assert_alike(laser.T_base_laser, Pose2(0.1, 0.0, 0.0))
+    options = ReadOptions(mountings=(("laser", laser.alternatives[0]),))
+    convert_log(open_log(source, options), target)
+    (laser,) = open_log(target).summary.lasers
+    assert laser.alternatives == ()
+    assert_alike(laser.T_base_laser, Pose2(0.18, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("rotation", [(0.0, 0.0, 90.0, 1.0), (0.0, 0.0, 0.0, 0.0)])
+def test_a_mounting_without_a_rotation_is_named(tmp_path: Path, rotation: tuple[float, float, float, float]) -> None:
+    path = tmp_path / "degrees.mcap"
+    with LogWriter(path) as log:
+        _add_robot(log, "", "", "odom", True, Transform3((0.1, 0.0, 0.0), rotation))
+    (warning,) = open_log(path).summary.warnings
+    assert warning.code == "extrinsics_unturned"
+    assert f"{rotation[2]:g}, {rotation[3]:g}" in warning.text
+    assert "--laser-pose" in warning.remedy
+
+
 # Frames of maps.
 
 GRID = OccupancyGrid(np.zeros((4, 6), dtype=np.int8), 0.05, Pose2(1.0, 2.0, 0.0))
@@ -198,13 +227,19 @@ def test_a_start_pose_in_the_frame_of_the_odometry_is_moved_or_left_out(tmp_path
         assert any("frame odom" in str(warning) for warning in found.summary.warnings)
 
 
-@pytest.mark.parametrize("quaternion", [bytes(32), struct.pack("<4d", 0.0, 0.0, 0.3, 0.0)], ids=["zeros", "z alone"])
-def test_orientations_that_were_never_filled_are_counted(tmp_path: Path, plain: Path, quaternion: bytes) -> None:
+@pytest.mark.parametrize(
+    "quaternion",
+    [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.3, 0.0), (0.001, 0.0, 0.3, 0.0), (0.0, 0.0, 45.0, 1.0), (0.0, 0.1, -0.4, 1.0)],
+    ids=["zeros", "z alone", "no w", "degrees", "angles"],
+)
+def test_orientations_that_were_never_filled_are_counted(
+    tmp_path: Path, plain: Path, quaternion: tuple[float, ...]
+) -> None:
     def zeroed(number: int, name: str, data: bytes) -> bytes:
         if name != definitions.ODOMETRY or not (number < 40 or 80 < number < 84):
             return data
         pose = len(data) - 680
-        return data[: pose + 24] + quaternion + data[pose + 56 :]
+        return data[: pose + 24] + struct.pack("<4d", *quaternion) + data[pose + 56 :]
 
     items = [(s, c, t, zeroed(n, s.name, data)) for n, (s, c, t, data) in enumerate(log_formats.messages(plain))]
     log = open_log(log_formats.write(tmp_path / "zeros.mcap", items))

@@ -327,3 +327,14 @@ def test_a_gzip_that_unpacks_to_a_thousand_times_its_size_is_refused(tmp_path: P
     assert path.stat().st_size < 1 << 20
     with pytest.raises(LogFormatError, match="unpacks to more than 100 times its size"):
         list(open_log(path).events())
+
+
+@pytest.mark.parametrize("lines", [9, 10, 30])
+def test_a_clock_that_was_set_back_is_found_once_enough_lines_agree(tmp_path: Path, lines: int) -> None:
+    stamps = [100.0 + 0.1 * number for number in range(30)] + [100.0 + 0.1 * number for number in range(lines)]
+    stamps[15] -= 0.9  # a single line, as in Intel's log
+    path = write(tmp_path / "set.log", [odom(f"{stamp:.6f}", 1.0) for stamp in stamps])
+    log = open_log(path, ReadOptions(require_scan=False))
+    assert len(list(log.events())) == len(stamps)
+    assert log.losses.clock_steps == ({} if lines < 10 else {"ODOM": [(-2_900_000_000, 102_900_000_000)]})
+    assert all("--stamps" not in warning.remedy for warning in log.losses.step_warnings(log.summary))

@@ -68,6 +68,10 @@ def check_log(log: Log, progress: Callable[[int], None] | None = None) -> CheckR
     losses = log.losses.copy()
     for check in topics.values():
         check.finish()
+        if check.steps:
+            losses.clock_steps[check.topic] = check.steps
+    for warning in losses.step_warnings(log.summary):
+        findings.add(Severity.ERROR, warning.code, "", warning.text, warning.remedy)
     scans = [check for check in topics.values() if isinstance(check, ScanCheck)]
     odometry = [check for check in topics.values() if isinstance(check, OdometryCheck)]
     _check_frames(scans, findings)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hsloc.log.checks.findings import NANOSECONDS, Findings, Intervals, Place, Severity
+from hsloc.log.session.ordering import StepDetector
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -44,6 +45,8 @@ class TopicCheck:
         self.last_ns: int | None = None
         self._findings = findings
         self._count = 0
+        self._steps = StepDetector()
+        self.steps: list[tuple[int, int]] = []
 
     def add(self, message: Any, log_time_ns: int) -> None:
         """One message."""
@@ -55,6 +58,8 @@ class TopicCheck:
                 "have the driver stamp its messages, or wait for /clock before recording",
             )  # fmt: skip
             return
+        if (step := self._steps.take(message.stamp_ns, log_time_ns)) is not None:
+            self.steps.append(step)
         self._check_latency(place)
         self._check_order(place)
         self.last_ns = place.stamp_ns

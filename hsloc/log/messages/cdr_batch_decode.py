@@ -97,8 +97,8 @@ def _poses(rows: NDArray[np.void], covariances: Sequence[NDArray[np.float64] | N
     # Not numpy's arctan2, whose last bit depends on the processor.
     theta = list(map(atan2, sines.tolist(), cosines.tolist()))
     stamps = rows["seconds"].astype(np.int64) * NANOSECONDS + rows["nanoseconds"]
-    unset = (qx == 0.0) & (qy == 0.0) & (qw == 0.0)
-    has_headings = not any(not states_rotation((0.0, 0.0, z, 0.0)) for z in qz[unset].tolist())
+    doubtful = (qw == 0.0) | ((qw == 1.0) & ((qx != 0.0) | (qy != 0.0) | (qz != 0.0)))
+    has_headings = all(map(states_rotation, rows["pose"][doubtful, 3:].tolist()))
     return PoseColumns(stamps, x, y, theta, covariances, has_headings)
 
 

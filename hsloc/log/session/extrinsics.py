@@ -157,6 +157,7 @@ class Extrinsics:
             if transform is not None:
                 if not is_given:
                     self._warn_if_restated(tree, base, laser)
+                    self._warn_if_unturned(tree, base, laser)
                 self._spatial[laser] = transform
                 mounting = laser_mounting(transform)
                 if mounting.tilt > TILT_WARNING:
@@ -214,6 +215,21 @@ class Extrinsics:
                     f"the laser's mounting moves during the log ({', '.join(moving)}); its last pose is used for all",
                 )
             )
+
+    def _warn_if_unturned(self, tree: FrameTree, base: str, laser: str) -> None:
+        """Transforms to the laser whose quaternions were not filled, or hold angles."""
+        path = tree.path(tree.resolve(base, laser) or base, tree.resolve(laser, base) or laser)
+        for frame in path[0] + path[1] if path else ():
+            if frame in tree.unturned:
+                values = ", ".join(f"{value:g}" for value in tree.unturned[frame])
+                self.warnings.append(
+                    RunWarning(
+                        WarningCode.EXTRINSICS_UNTURNED,
+                        f"the transform to {frame} has the quaternion ({values}), which is no rotation: how {laser} is "
+                        "turned is not known",
+                        "give --laser-pose x,y,yaw, which hsloc calibrate finds",
+                    )
+                )
 
     def _warn_if_restated(self, tree: FrameTree, base: str, laser: str) -> None:
         """Static transforms that are stated twice with different values: the later ones were taken."""

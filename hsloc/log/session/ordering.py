@@ -32,6 +32,69 @@ JUMP_NS = 10_000_000_000
 the next one agrees with it."""
 MAX_PENDING = 20_000
 """Maximum number of events that wait. Internal: bounds the memory."""
+STEP_NS = 1_000_000_000
+"""Least step of a clock that is reported. chrony sets a clock only if it is wrong by more (`makestep 1 3` is its
+default in distributions), else lets it run faster or slower; stamps of Intel's log run backwards by up to 0.9 s without one."""
+_LEAST_KNOWN_NS = 1_000_000_000
+"""Least time (of the log) over which messages must have come with a delay for it to be the usual one: a recorder that
+has just started may get what was kept for it."""
+
+AGREEING = 10
+"""Messages in a row that must show a step, where single ones may be wrong."""
+
+
+class StepDetector:
+    """Whether the clock of a topic's stamps was set while the recorder's went on.
+
+    A step back is a stamp earlier than the one before, by a delay that grew as much. A step forward is a delay shorter
+    than any before: messages may come late, but not early. Either counts once `AGREEING` messages show it.
+    """
+
+    __slots__ = ("_candidate", "_last", "_least_ns", "_since_ns")
+
+    def __init__(self) -> None:
+        self._last: tuple[int, int] | None = None
+        self._least_ns = 0
+        self._since_ns = 0
+        self._candidate: tuple[int, int, int, int] | None = None
+
+    def take(self, stamp_ns: int, log_time_ns: int) -> tuple[int, int] | None:
+        """(step in ns, log time of the first message after it) where this message confirms one."""
+        last, self._last = self._last, (stamp_ns, log_time_ns)
+        delay = log_time_ns - stamp_ns
+        if last is None:
+            self._least_ns, self._since_ns = delay, log_time_ns
+            return None
+        before = last[1] - last[0]
+        if self._candidate is not None:
+            usual, step, at, left = self._candidate
+            self._candidate = None
+            if abs(delay - (usual - step)) < abs(delay - usual):
+                if left:
+                    self._candidate = usual, step, at, left - 1
+                    return None
+                self._least_ns, self._since_ns = delay, at
+                return step, at
+        step = before - delay
+        back = step < -STEP_NS and stamp_ns < last[0] - STEP_NS
+        forward = step > STEP_NS and delay < self._least_ns - STEP_NS
+        if back or (forward and log_time_ns > last[1] > self._since_ns + _LEAST_KNOWN_NS):
+            self._candidate = before, step, log_time_ns, AGREEING - 2
+        else:
+            self._least_ns = min(self._least_ns, delay)
+        return None
+
+    @property
+    def has_candidate(self) -> bool:
+        """Whether the next messages decide about a step."""
+        return self._candidate is not None
+
+    def run_on(self, stamps: Sequence[int], log_times: Sequence[int]) -> None:
+        """Take messages at once whose stamps rise by less than `STEP_NS` from each to the next."""
+        if self._last is None:
+            self._least_ns, self._since_ns = log_times[0] - stamps[0], log_times[0]
+        self._least_ns = min(self._least_ns, *map(sub, log_times, stamps))
+        self._last = stamps[-1], log_times[-1]
 
 
 class TopicClock:
@@ -45,6 +108,7 @@ class TopicClock:
         "_last_log_ns",
         "_last_own_ns",
         "_losses",
+        "_steps",
         "_suspect",
         "by_log",
         "kind",
@@ -72,6 +136,7 @@ class TopicClock:
         self._last_log_ns = 0
         self._last_own_ns = 0
         self._suspect = False
+        self._steps = StepDetector()
         self._losses = losses
 
     def stamp(self, stamp_ns: int, log_time_ns: int) -> int | None:
@@ -88,6 +153,8 @@ class TopicClock:
 
     def effective(self, stamp_ns: int, log_time_ns: int) -> tuple[int, bool]:
         """(effective stamp, whether it was raised) for the topic's next message."""
+        if (step := self._steps.take(stamp_ns, log_time_ns)) is not None:
+            self._losses.clock_steps.setdefault(self.topic, []).append(step)
         last = self.last_ns
         if last is not None and stamp_ns < self._last_own_ns:
             self._losses.stamps_backwards[self.topic] += 1
@@ -113,14 +180,15 @@ class TopicClock:
 
     def runs_on(self, stamps: Sequence[int]) -> bool:
         """Whether the topic's next messages are what they should be: `effective` would leave all of them alone."""
-        if self._suspect:  # The next one decides whether the clock was set.
+        if self._suspect or self._steps.has_candidate:  # The next one decides whether the clock was set.
             return False
         before = stamps[0] if self.last_ns is None else self.last_ns
         steps: list[int] = list(map(sub, stamps, (before, *stamps[:-1])))
-        return min(steps) >= 0 and max(steps) <= JUMP_NS
+        return min(steps) >= 0 and max(steps) <= STEP_NS
 
     def run_on(self, stamps: Sequence[int], log_times: Sequence[int]) -> None:
         """Take messages of which `runs_on` is true."""
+        self._steps.run_on(stamps, log_times)
         self.last_ns = self._last_own_ns = stamps[-1]
         self._last_log_ns = log_times[-1]
 

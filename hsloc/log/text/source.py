@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import zlib
+from collections import deque
 from dataclasses import replace
 from io import BufferedReader
 from typing import TYPE_CHECKING, BinaryIO, cast
@@ -16,6 +17,7 @@ from hsloc.errors import LogFormatError, TopicError
 from hsloc.log.messages.decode import OdometryMessage, ScanMessage
 from hsloc.log.packing import GZIP
 from hsloc.log.range_codes import NO_RETURN_CM, RANGE_MIN, NoReturnCode, RangeRule
+from hsloc.log.session.ordering import AGREEING, STEP_NS
 from hsloc.log.source import Observation
 from hsloc.log.summary import LogSummary, Losses, ReadOptions, TopicStatistics, TopicSummary
 from hsloc.log.text.formats import Carmen, Wean
@@ -24,7 +26,7 @@ from hsloc.model.calibration import LidarCalibration
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterator, Sequence
     from io import RawIOBase
     from pathlib import Path
 
@@ -284,12 +286,17 @@ class TextSource:
         """As `Source.events`: in the order of the lines; effective stamps are the running maximum."""
         latest: int | None = None
         last: dict[tuple[str, type], int] = {}
+        recent: dict[tuple[str, type], deque[int]] = {}
         for keyword, line in self._parsed(losses):
             for event in self._events_of(line):
                 key = (keyword, type(event))
                 if event.stamp_ns < last.get(key, event.stamp_ns):
                     losses.stamps_backwards[keyword] += 1
                 last[key] = event.stamp_ns
+                around = recent.setdefault(key, deque(maxlen=2 * AGREEING))
+                around.append(event.stamp_ns)
+                if len(around) == 2 * AGREEING and (step := _step_back(around)) is not None:
+                    losses.clock_steps.setdefault(keyword, []).append((step, around[AGREEING - 1]))
                 latest = event.stamp_ns if latest is None else max(latest, event.stamp_ns)
                 yield latest, event
 
@@ -307,3 +314,12 @@ class TextSource:
         for _ in self._parsed(losses):
             pass
         return losses
+
+
+def _step_back(around: Sequence[int]) -> int | None:
+    """Step (ns, negative) of the clock in the middle of stamps, where all after it are earlier than all before."""
+    if around[AGREEING] > around[AGREEING - 1] - STEP_NS:
+        return None
+    stamps = list(around)
+    is_step = max(stamps[AGREEING:]) < min(stamps[:AGREEING])
+    return stamps[AGREEING] - stamps[AGREEING - 1] if is_step else None

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hsloc.export.provenance import config_text
-from hsloc.log import LogWriter
+from hsloc.log import LogWriter, Marker
 from hsloc.model.events import PairedScan
 from hsloc.model.pose2 import IDENTITY, Pose2, compose_poses
 from hsloc.model.trajectory import Trajectory
 from hsloc.version import __version__
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
     from types import TracebackType
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
     from hsloc.analysis.analyse import Analysis
     from hsloc.analysis.second_pass import PosedEvent
+    from hsloc.model.verdict import VerdictReason
     from hsloc.replay.run import Result
 
 _PATH_POSES = 2000
@@ -35,6 +37,10 @@ LAYOUT_FILE = "lichtblick.json"
 _PATHS = {"/path": "#0072b2ff", "/reference_path": "#333333ff", "/odometry_path": "#d55e00ff"}
 _VARIANCES = ((0, "x"), (7, "y"))
 """Entries of the 6 x 6 covariance of a pose in ROS."""
+_GREEN, _VERMILLION = (0.0, 0.62, 0.45, 1.0), (0.84, 0.37, 0.0, 0.6)
+_LINE_M, _TEXT_M = 0.04, 0.4
+_MOST_PLACES = 50
+"""Places of a reason that are marked; of more the first."""
 
 
 def _thinned(path: Trajectory) -> Trajectory:
@@ -45,7 +51,7 @@ def _thinned(path: Trajectory) -> Trajectory:
 class RunRecording:
     """Writes map, scans, transforms, poses and the path of a result; the events come from a second pass over the log.
 
-    Also the covariance of the pose of each scan, where it is known.
+    Also, where they are known, covariance and fitness of each scan, states, errors, loops, and what the verdict names.
 
     A context manager: the file is complete when it ends. `seconds` is the time spent in writing.
     """
@@ -94,6 +100,9 @@ class RunRecording:
             self._writer.scan(scan)
             if (covariance := self._covariance(self._scans)) is not None:
                 self._writer.pose_with_covariance(scan.stamp_ns, posed.T_map_base, covariance, "/pose_with_covariance")
+            fitness = float(self._result.diagnostics.fitness[self._scans])
+            if np.isfinite(fitness):
+                self._writer.number(scan.stamp_ns, fitness, "/fitness")
             self._scans += 1
         else:
             self._write_pose(event.stamp_ns, posed.T_map_odom, event.T_odom_base, posed.T_map_base)
@@ -117,11 +126,50 @@ class RunRecording:
         for warning in metrics.warnings:
             self._writer.log(self._start, _WARN, f"{warning.code}: {warning}")
         self._writer.log(self._start, _INFO, f"verdict: {metrics.verdict}")
+        if comparison is not None:
+            every = max(len(comparison.pairs) // _PATH_POSES, 1)
+            stamps = comparison.pairs.stamps_ns[::every].tolist()
+            for values, topic in (
+                (comparison.errors.trans_part, "/error"),
+                (comparison.errors.angle_deg, "/error_deg"),
+            ):
+                for stamp_ns, value in zip(stamps, values[::every].tolist(), strict=True):
+                    self._writer.number(stamp_ns, value, topic)
+        self._write_states()
+        self._write_markers(metrics.verdict_reasons)
         self.seconds += time.perf_counter() - begin
 
     def _write_pose(self, stamp_ns: int, T_map_odom: Pose2, T_odom_base: Pose2, T_map_base: Pose2) -> None:
         self._writer.transforms(stamp_ns, [("map", "odom", T_map_odom), ("odom", "base_link", T_odom_base)])
         self._writer.pose(stamp_ns, T_map_base)
+
+    def _write_states(self) -> None:
+        """Each time the state of the robot changes."""
+        if self._result.states is None:
+            return
+        before = None
+        stamps = self._result.trajectory.stamps_ns.tolist()
+        for stamp_ns, state in zip(stamps, self._result.states.state, strict=True):
+            if state != before:
+                self._writer.text(stamp_ns, str(state), "/state")
+            before = state
+
+    def _write_markers(self, reasons: Sequence[VerdictReason]) -> None:
+        """Loops between the poses that they join, and places of the verdict's reasons, by their codes."""
+        mapping = self._result.mapping
+        if mapping is not None and mapping.loops:
+            lines = mapping.keyscan_poses[mapping.loop_ends(), :2]
+            accepted = np.array([loop.accepted for loop in mapping.loops])
+            kinds = (("accepted", accepted, _GREEN), ("refused", ~accepted, _VERMILLION))
+            found = [Marker(name, lines[rows].reshape(-1, 2), ink, _LINE_M) for name, rows, ink in kinds]
+            self._writer.markers(self._start, found, "/loops")
+        places = [
+            Marker(reason.code, np.array([place]), _VERMILLION, _TEXT_M, reason.code)
+            for reason in reasons
+            for place in reason.places[:_MOST_PLACES]
+        ]
+        if places:
+            self._writer.markers(self._start, places, "/places_to_check")
 
     def _covariance(self, row: int) -> NDArray[np.float64] | None:
         """Covariance (3, 3) of the pose at a scan, in the order of the log; None where it is not known."""
@@ -144,18 +192,20 @@ def layout() -> dict[str, Any]:
                     "/map": {"visible": True, "colorMode": "map", "frameLocked": True},
                     "/scan": {"visible": True, "colorMode": "flat", "flatColor": "#009e73ff", "pointSize": 3},
                     "/pose_with_covariance": {"visible": True, "type": "arrow", "showCovariance": True},
+                    "/loops": {"visible": True, "namespaces": {"refused": {"visible": False}}},
+                    "/places_to_check": {"visible": True},
                     **{name: {"visible": True, "type": "line", "gradient": [ink, ink]} for name, ink in _PATHS.items()},
                 },
             },
-            "Plot!variance": {
-                "title": "Variance of the position [m²]",
-                "paths": [_series(f"/pose_with_covariance.pose.covariance[{k}]", label) for k, label in _VARIANCES],
-                "showXAxisLabels": True,
-                "showYAxisLabels": True,
-                "showLegend": True,
-                "xAxisVal": "timestamp",
-                "isSynced": True,
-            },
+            "Plot!variance": _plot(
+                "Variance of the position [m²]",
+                *(_series(f"/pose_with_covariance.pose.covariance[{k}]", label) for k, label in _VARIANCES),
+            ),
+            "Plot!quality": _plot(
+                "Fitness, and error where there is a reference [m]",
+                _series("/fitness.data", "fitness"),
+                _series("/error.data", "error"),
+            ),
             "RosOut!log": {"searchTerms": [], "minLogLevel": 1},
         },
         "globalVariables": {},
@@ -163,10 +213,32 @@ def layout() -> dict[str, Any]:
         "playbackConfig": {"speed": 5.0},
         "layout": {
             "first": "3D!map",
-            "second": {"first": "Plot!variance", "second": "RosOut!log", "direction": "row", "splitPercentage": 60},
+            "second": {
+                "first": {
+                    "first": "Plot!quality",
+                    "second": "Plot!variance",
+                    "direction": "row",
+                    "splitPercentage": 50,
+                },
+                "second": "RosOut!log",
+                "direction": "row",
+                "splitPercentage": 65,
+            },
             "direction": "column",
             "splitPercentage": 72,
         },
+    }
+
+
+def _plot(title: str, *series: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "title": title,
+        "paths": list(series),
+        "showXAxisLabels": True,
+        "showYAxisLabels": True,
+        "showLegend": True,
+        "xAxisVal": "timestamp",
+        "isSynced": True,
     }
 
 

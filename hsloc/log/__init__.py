@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from hsloc.log.checks.topics import LEAST_JUMP, LONGEST_JUMP_S, MAX_SPEED
     from hsloc.log.convert import Conversion, convert_log
     from hsloc.log.messages.decode import LinkMessage
+    from hsloc.log.messages.encode import Marker
     from hsloc.log.reader import Log, is_log, open_log
     from hsloc.log.session.extrinsics import read_calibration
     from hsloc.log.session.topic_selection import TF, TF_NAMES
@@ -42,6 +43,7 @@ __all__ = [
     "LogSummary",
     "LogWriter",
     "Losses",
+    "Marker",
     "Profile",
     "ReadOptions",
     "Severity",
@@ -64,6 +66,7 @@ _MODULES = {
     "checks.topics": ("LEAST_JUMP", "LONGEST_JUMP_S", "MAX_SPEED"),
     "convert": ("Conversion", "convert_log"),
     "messages.decode": ("LinkMessage",),
+    "messages.encode": ("Marker",),
     "reader": ("Log", "is_log", "open_log"),
     "session.extrinsics": ("read_calibration",),
     "session.topic_selection": ("TF", "TF_NAMES"),

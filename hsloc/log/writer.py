@@ -199,6 +199,19 @@ class LogWriter:
         """rcl_interfaces/Log; `level` is 20 for information, 30 for a warning, 40 for an error."""
         self._add(topic, definitions.LOG, stamp_ns, encode.log_message(stamp_ns, level, name, text), None)
 
+    def number(self, stamp_ns: int, value: float, topic: str) -> None:
+        """std_msgs/Float64: a curve, of values at these times."""
+        self._add(topic, definitions.FLOAT64, stamp_ns, encode.float64(value), None)
+
+    def text(self, stamp_ns: int, text: str, topic: str) -> None:
+        """std_msgs/String."""
+        self._add(topic, definitions.STRING, stamp_ns, encode.string(text), None)
+
+    def markers(self, stamp_ns: int, markers: Sequence[encode.Marker], topic: str, frame_id: str = "map") -> None:
+        """visualization_msgs/MarkerArray."""
+        data = encode.marker_array(stamp_ns, markers, frame_id)
+        self._add(topic, definitions.MARKER_ARRAY, stamp_ns, data, None)
+
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """A metadata record: seed, scenario, versions."""
         try:

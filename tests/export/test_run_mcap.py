@@ -50,6 +50,8 @@ def test_rosbags_decodes_every_message(results: Path) -> None:
     found = Counter()  # type: ignore[var-annotated]
     poses = []
     logged: list[str] = []
+    states: list[str] = []
+    errors: list[float] = []
     with AnyReader([results / "run.mcap"]) as reader:
         for connection, _, raw in reader.messages():
             message = reader.deserialize(raw, connection.msgtype)
@@ -59,18 +61,35 @@ def test_rosbags_decodes_every_message(results: Path) -> None:
             if connection.topic == "/rosout":
                 assert (message.level, message.name, message.line) == (20, "hsloc", 0)  # type: ignore[attr-defined]
                 logged.append(message.msg)  # type: ignore[attr-defined]
+            if connection.topic == "/state":
+                states.append(message.data)  # type: ignore[attr-defined]
+            if connection.topic == "/error":
+                errors.append(message.data)  # type: ignore[attr-defined]
             if connection.topic == "/map":
                 cells = np.asarray(message.data).reshape(message.info.height, message.info.width)  # type: ignore[attr-defined]
                 np.testing.assert_array_equal(cells, open_log(HALL).map().cells)
     scans = json.loads((results / "metrics.json").read_text())["scans"]["total"]
     of_each = {"/scan": scans, "/pose": len(trajectory), "/tf": len(trajectory)}
     layout = json.loads((results / "lichtblick.json").read_text())
-    assert set(layout["configById"]["3D!map"]["topics"]) <= set(found)
+    of_maps = {"/loops", "/places_to_check"}
+    assert set(layout["configById"]["3D!map"]["topics"]) - of_maps <= set(found)
+    plotted = {
+        line["value"].split(".")[0]
+        for name in ("quality", "variance")
+        for line in layout["configById"][f"Plot!{name}"]["paths"]
+    }
+    assert plotted <= set(found)
+    metrics = json.loads((results / "metrics.json").read_text())
+    assert 0 < found.pop("/fitness") <= scans
+    assert found.pop("/error") == found.pop("/error_deg") == metrics["matched"]
+    assert found.pop("/state") == len(states) == 1
     known = found.pop("/pose_with_covariance")
     assert 0 < known <= scans
     paths = {"/path": 1, "/reference_path": 1, "/odometry_path": 1}
     assert found == {"/map": 1, "/tf_static": 1, "/rosout": 1, **paths, **of_each}
     assert logged == ["verdict: good"]
+    assert states == ["localised"]
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(metrics["ape"]["trans_part"]["rmse"])
     np.testing.assert_allclose(poses, trajectory.poses[:, :2], atol=1e-9)
 
 

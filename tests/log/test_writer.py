@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from dataclasses import replace
 from math import inf, nan, pi
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +44,11 @@ def reencoded(data: bytes, name: str) -> bytes:
     return bytes(STORE.serialize_cdr(STORE.deserialize_cdr(data, name), name, little_endian=True))
 
 
+MARKERS = [
+    encode.Marker("accepted", np.arange(8.0).reshape(4, 2), (0.0, 0.5, 1.0, 0.25), 0.05),
+    encode.Marker("reason", np.array([[1.5, -2.0]]), (1.0, 0.0, 0.0, 1.0), 0.3, "poses_lost: \u00e4"),
+    encode.Marker("none", np.zeros((0, 2)), (0.0, 0.0, 0.0, 1.0), 0.1),
+]
 FRAMES = ["", "m", "ab", "map", "odom", "frame", "laser_", "base_lk", "base_link", "a/long/frame/name"]
 
 
@@ -58,6 +64,14 @@ def test_bytes_equal_the_reference_for_every_alignment(frame: str, child: str) -
         (encode.laser_scan(make_scan(4, intensities=True), frame, 0.1), definitions.LASER_SCAN),
         (encode.laser_scan(make_scan(0), frame, 0.1), definitions.LASER_SCAN),
         (encode.log_message(STAMP, 30, child, frame), definitions.LOG),
+        (encode.float64(-0.25), definitions.FLOAT64),
+        (encode.string(frame), definitions.STRING),
+        (encode.marker_array(STAMP, [], frame), definitions.MARKER_ARRAY),
+        (encode.marker_array(STAMP, MARKERS + MARKERS[::-1], frame), definitions.MARKER_ARRAY),
+        (
+            encode.marker_array(STAMP, [replace(each, namespace=child) for each in MARKERS], frame),
+            definitions.MARKER_ARRAY,
+        ),
         (encode.odometry(STAMP, pose, cov, (1, 2, 3), (frame, child)), definitions.ODOMETRY),
         (encode.transforms(STAMP, [(frame, child, pose), (child, frame, tilted)]), definitions.TF_MESSAGE),
         (encode.transforms(STAMP, []), definitions.TF_MESSAGE),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from paths import RECORDINGS
+from rosbags.highlevel import AnyReader
 
 from hsloc.cli.main import main
 from hsloc.evaluation import Statistics, evaluate, evaluate_relations, read_relations
@@ -36,6 +37,14 @@ def test_a_map_is_drawn_and_the_way_is_right(tmp_path: Path, name: str) -> None:
     assert metrics.map.residuals.within_15_cm > 0.95  # type: ignore[operator]
     assert np.array_equal(load_map(tmp_path / "out" / "map.yaml").cells == 100, found.grid.occupied())
     assert (tmp_path / "out" / "graph.g2o").stat().st_size > 1000
+    with AnyReader([tmp_path / "out" / "run.mcap"]) as reader:
+        connections = [each for each in reader.connections if each.topic == "/loops"]
+        ((connection, _, raw),) = reader.messages(connections)
+        accepted, refused = reader.deserialize(raw, connection.msgtype).markers  # type: ignore[attr-defined]
+    loops = found.mapping.loops
+    closed = sum(loop.accepted for loop in loops)
+    assert [len(each.points) for each in (accepted, refused)] == [2 * closed, 2 * (len(loops) - closed)]
+    assert (accepted.ns, refused.ns, closed > 0) == ("accepted", "refused", True)
 
 
 def test_a_built_map_is_a_map_to_localise_in(tmp_path: Path) -> None:

@@ -6,8 +6,9 @@ not change between messages (frame names and their padding) is made once.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
-from struct import Struct
+from struct import Struct, pack
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -191,3 +192,75 @@ def log_message(stamp_ns: int, level: int, name: str, text: str) -> bytes:
     for each in (name, text, "", ""):
         data += padded_string(each, len(data), 4)
     return ENCAPSULATION + data + _COUNT.pack(0)
+
+
+def float64(value: float) -> bytes:
+    """std_msgs/Float64."""
+    return ENCAPSULATION + pack("<d", value)
+
+
+def string(text: str) -> bytes:
+    """std_msgs/String."""
+    return ENCAPSULATION + padded_string(text, 0, 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Marker:
+    """What a viewer draws: line segments between pairs of `points` (n, 2) [m], or a text at the first of them.
+
+    `colour` is red, green, blue and opacity, each 0 to 1; `size` [m] the width of the lines or the height of the text.
+    """
+
+    namespace: str
+    points: NDArray[np.float64]
+    colour: tuple[float, float, float, float]
+    size: float
+    text: str = ""
+
+
+_LINE_LIST, _TEXT_VIEW_FACING = 5, 9
+
+
+def marker_array(stamp_ns: int, markers: Sequence[Marker], frame_id: str) -> bytes:
+    """visualization_msgs/MarkerArray; they stay until they are replaced."""
+    data = bytearray(_COUNT.pack(len(markers)))
+
+    def field(layout: str, size: int, *values: float) -> None:
+        data.extend(b"\0" * (-len(data) % size) + pack(layout, *values))
+
+    def text(value: str) -> None:
+        data.extend(b"\0" * (-len(data) % 4) + padded_string(value, 0, 1))
+
+    for number, marker in enumerate(markers):
+        points = np.zeros((0 if marker.text else len(marker.points), 3), dtype="<f8")
+        at = (0.0, 0.0)
+        if marker.text:
+            at = float(marker.points[0, 0]), float(marker.points[0, 1])
+        else:
+            points[:, :2] = marker.points
+        field("<iI", 4, *divmod(stamp_ns, NANOSECONDS))
+        text(frame_id)
+        text(marker.namespace)
+        field("<3i", 4, number, _TEXT_VIEW_FACING if marker.text else _LINE_LIST, 0)
+        field("<7d", 8, *at, 0.0, 0.0, 0.0, 0.0, 1.0)
+        # Lines take their width from x, texts their height from z.
+        field("<3d", 8, marker.size, marker.size, marker.size)
+        field("<4f", 4, *marker.colour)
+        field("<iI", 4, 0, 0)  # without end
+        field("<?", 1, False)
+        field("<I", 4, len(points))
+        if len(points):
+            field("", 8)
+            data.extend(points.tobytes())
+        field("<I", 4, 0)  # colours
+        text("")  # texture
+        field("<iI", 4, 0, 0)
+        text("")
+        text("")
+        field("<2I", 4, 0, 0)  # its data, and coordinates in it
+        text(marker.text)
+        text("")  # mesh
+        text("")
+        field("<I", 4, 0)
+        field("<?", 1, False)
+    return ENCAPSULATION + bytes(data)

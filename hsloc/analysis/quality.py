@@ -44,7 +44,8 @@ _FITS = 0.5
 """Fitness of scans at several places from which on these fit: people and furniture hide at most half of the beams."""
 _MOST_NAMED = 5
 """Stray scans whose times a warning names."""
-_MAP_REMEDY = "look at the places on the map; try another --seed, --no-odom, or a cut of the log (--start, --end)"
+_RANGES_REMEDY = "see what the lidar measured: hsloc check; correct its limits with --scan-fix, or choose --scan-topic"
+"""Where beams or whole scans have no return, nothing else helps."""
 _FAILING = {"failed": (Verdict.FAILED,), "check": (Verdict.FAILED, Verdict.CHECK)}
 
 
@@ -176,12 +177,19 @@ def _of_the_map(mapping: MappingResult, result: Result) -> list[VerdictReason]:
             Verdict(reason.verdict),
             reason.code.replace("-", "_"),
             reason.text,
-            _MAP_REMEDY,
+            _map_remedy(reason.code, result),
             places=reason.places,
             times=tuple((a + begin, b + begin) for a, b in reason.times_s),
         )
         for reason in mapping.evidence.reasons
     ]
+
+
+def _map_remedy(code: str, result: Result) -> str:
+    if code in {"blind", "no-returns"}:
+        return _RANGES_REMEDY
+    without_odometry = "" if result.lidar_only else " --no-odom,"
+    return f"look at the places on the map; try another --seed,{without_odometry} or a cut of the log (--start, --end)"
 
 
 def _first_keyscan(result: Result) -> float:

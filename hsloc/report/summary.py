@@ -103,6 +103,8 @@ def _headline(metrics: RunMetrics) -> str:
         made = "Extended the map" if metrics.run.map != "built" else "Built a map"
         if mapping is None:
             return f"{made} from {metrics.scans.used} scans."
+        if mapping.keyscans == 0:
+            return "Built no map: no scan had enough returns."
         loops = "without a loop" if mapping.loops == 0 else f"with {_count(mapping.loops, 'loop')} closed"
         return f"{made} from {mapping.keyscans} scans, {loops}."
     share = metrics.localised.share_of_poses

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hsloc.analysis.analyse import analyse
 from hsloc.analysis.quality import quality_warnings, verdict_reasons
 from hsloc.log import LogWriter, ReadOptions, open_log
 from hsloc.model import Odometry, Pose2, Scan, Truth
 from hsloc.replay.run import run
+from hsloc.report.summary import ResultSummary
 from hsloc.request import RunRequest
 from hsloc.warnings import WarningCode
 
@@ -76,6 +78,17 @@ def test_odometry_in_millimetres_is_not_mended(tmp_path: Path) -> None:
     assert warning.code == WarningCode.ODOMETRY_JUMPS
     assert "check" in [reason.verdict for reason in verdict_reasons(found, found.warnings)]
     assert found.odometry.length() > 1000.0  # as it is, but for the first few jumps
+
+
+def test_a_log_without_a_return_builds_no_map_and_says_what_to_look_at(tmp_path: Path) -> None:
+    def without_returns(event: Any) -> Any:
+        return replace(event, ranges=np.full_like(event.ranges, np.inf)) if isinstance(event, Scan) else event
+
+    log = rewritten(tmp_path / "run.mcap", without_returns, end=3.0)
+    summary = ResultSummary.of(analyse(run(RunRequest(logs=(log,), mode="slam"))).metrics)
+    assert (summary.verdict, summary.headline) == ("failed", "Built no map: no scan had enough returns.")
+    assert any("hsloc check" in reason for reason in summary.reasons)
+    assert not any("--seed" in reason for reason in summary.reasons)
 
 
 @pytest.mark.parametrize("mode", ["localise", "slam"])

@@ -25,6 +25,7 @@ from hsloc.export.run_mcap import LAYOUT_FILE, RunRecording, write_layout
 from hsloc.maps import save_map
 from hsloc.report.data import ReportParts
 from hsloc.report.html import write_report_html
+from hsloc.report.map_image import THUMBNAIL_FILE, draw_thumbnail
 from hsloc.report.png import draw_report
 from hsloc.report.view import view_of
 from hsloc.slam.map_state import STATE_FILE, write_state
@@ -130,6 +131,7 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
     write_json(folder / "metrics.json", analysis.metrics.to_json())
     (folder / "config.yaml").write_text(config_text(result), encoding="utf-8")
     draw_report(folder / "report.png", parts)
+    draw_thumbnail(folder / THUMBNAIL_FILE, parts)
     view = view_of(parts)
     write_report_html(folder / "report.html", parts, view)
     seconds["reports"] = time.perf_counter() - begin

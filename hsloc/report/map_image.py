@@ -1,4 +1,4 @@
-"""Which part of the world a report shows, and the map as a picture of grey levels."""
+"""Which part of the world a report shows, the map as a picture of grey levels, and the small picture of a table."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ import numpy as np
 
 from hsloc.model import Pose2
 from hsloc.report import style
+from hsloc.report.data import prepare, with_gaps
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
     from hsloc.model import OccupancyGrid
-    from hsloc.report.data import ReportData
+    from hsloc.report.data import ReportData, ReportParts
 
     Floats = NDArray[np.float64]
 
@@ -24,6 +27,12 @@ MARGIN = 0.05
 
 LEAST_SIZE = 0.5
 """Smallest side of what is shown, in metres, for a robot that did not move."""
+
+THUMBNAIL_FILE = "thumbnail.png"
+THUMBNAIL = (120, 80)
+"""Width and height [pixels] of the small picture of a result."""
+_FINER = 2
+"""Pixels that it is drawn with for one of it, in each direction, so that lines are smooth."""
 
 SURROUNDINGS = 10.0
 """Metres of map that are shown around the path at least, if the map has them; more around a longer path."""
@@ -122,6 +131,40 @@ def shown_extent(data: ReportData, grid: OccupancyGrid | None, points: Floats | 
     size = max(float((high - low).max()), LEAST_SIZE)
     middle, half = (low + high) / 2.0, np.maximum(high - low, 0.08 * size) / 2.0 + MARGIN * size
     return Extent(*(middle - half).tolist(), *(middle + half).tolist())
+
+
+def draw_thumbnail(path: Path, parts: ReportParts) -> None:
+    """Write a picture of map and trajectory that is small enough for a table of results; known poses are blue."""
+    from PIL import Image, ImageDraw
+
+    data, grid = prepare(parts), parts.grid
+    width, height = (_FINER * side for side in THUMBNAIL)
+    extent = shown_extent(data, grid, parts.points).widened(width / height)
+    pixel = extent.width / width
+    ground = style.PAPER if grid is None else style.UNKNOWN
+    image = Image.new("RGB", (width, height), ground)
+    if grid is not None and (picture := picture_of(grid, max(grid.cells.shape) * grid.resolution / pixel)) is not None:
+        x = extent.x0 + (np.arange(width) + 0.5) * pixel
+        y = extent.y1 - (np.arange(height) + 0.5) * pixel
+        at = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        column, row = np.floor((picture.T_map_corner.inverse() @ at) / picture.side).astype(np.int64).T
+        rows, columns = picture.levels.shape[:2]
+        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        colours = np.zeros((width * height, 4), dtype=np.uint8)
+        colours[inside] = picture.levels[row[inside], column[inside]]
+        levels = Image.fromarray(colours.reshape(height, width, 4))
+        image.paste(levels, mask=levels.getchannel("A"))
+    draw = ImageDraw.Draw(image)
+    for rows_of, colour in ((~data.localised, style.PURPLE), (data.localised, style.BLUE)):
+        line = with_gaps(np.where(rows_of[:, None], data.path, np.nan), data.jumps)
+        line = (line - (extent.x0, extent.y1)) * (1.0 / pixel, -1.0 / pixel)
+        for piece in np.split(line, np.flatnonzero(~np.isfinite(line[:, 0]))):
+            shown = np.round(piece[np.isfinite(piece[:, 0])], 1)
+            if len(shown):
+                every = np.append(np.any(np.diff(shown, axis=0) != 0.0, axis=1), True)
+                draw.line(shown[every].reshape(-1).tolist(), fill=colour, width=2 * _FINER - 1)
+                draw.circle(shown[0].tolist(), 2 * _FINER - 1, fill=colour)  # also of a robot that stood still
+    image.reduce(_FINER).save(path, optimize=True)
 
 
 def line_width(data: ReportData, extent: Extent) -> float:

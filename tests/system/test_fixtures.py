@@ -112,7 +112,7 @@ def test_the_files_equal_the_result(tmp_path: Path) -> None:
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {
         "trajectory.tum", "odometry.tum", "reference.tum", "metrics.json", "timings.json", "config.yaml",
-        "report.png", "report.html", "run.mcap", "states.csv", "lichtblick.json",
+        "report.png", "report.html", "run.mcap", "states.csv", "lichtblick.json", "thumbnail.png",
     }  # fmt: skip
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     written = read_tum(tmp_path / "out" / "trajectory.tum")

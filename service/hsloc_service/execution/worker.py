@@ -136,6 +136,7 @@ def execute(
     from hsloc.evaluation import read_relations
     from hsloc.export.results_folder import write_results
     from hsloc.replay.run import run
+    from hsloc.report.map_image import THUMBNAIL_FILE
 
     report("open", 0.0, 1.0, 0)
     request = make_request(job, folder)
@@ -161,7 +162,11 @@ def execute(
         say(f"warning: {warning}")
     say(f"verdict: {written.metrics.verdict}")
     limits = exceeded_limits(request, written.metrics)
-    found = {"outcome": "below_threshold" if limits else "ok", "limits": [line[:500] for line in limits]}
+    found: dict[str, Any] = {
+        "outcome": "below_threshold" if limits else "ok",
+        "limits": [line[:500] for line in limits],
+    }
+    found["thumbnail"] = THUMBNAIL_FILE
     return found | summarise(written.metrics, written.timings) | {"run": written.view.values["run"]}
 
 

@@ -106,6 +106,7 @@ def brief_view(row: JobRow) -> JobView:
             "mode": metrics.get("run", {}).get("mode"),
             "duration_s": metrics.get("log", {}).get("duration_s"),
             "headline": summary.get("headline"),
+            "thumbnail": summary.get("thumbnail"),
             "key_figures": [each for name in names for each in summary.get("figures", []) if each["name"] == name],
         }
     return view.model_copy(update={"request": request, "summary": summary})

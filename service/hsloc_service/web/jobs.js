@@ -22,6 +22,26 @@ function figures(found) {
   return box;
 }
 
+// Small pictures of results, as object URLs by job; null where one could not be had.
+const pictures = new Map();
+
+async function picture(image, id, name) {
+  if (!pictures.has(id)) {
+    const answer = request(`/v1/jobs/${id}/results/${name}`);
+    pictures.set(id, answer.then((found) => found.blob()).then((blob) => URL.createObjectURL(blob)).catch(() => null));
+  }
+  const address = await pictures.get(id);
+  if (address) image.src = address; else image.remove();
+}
+
+function thumbnail(job) {
+  if (!job.summary?.thumbnail) return []; // jobs of earlier versions have none
+  const image = element("img");
+  Object.assign(image, { alt: "", width: 72, height: 48 });
+  picture(image, job.id, job.summary.thumbnail);
+  return [image];
+}
+
 function row(job) {
   const key = JSON.stringify(job, (name, value) => name === "age_s" || name === "heartbeat_age_s" ? undefined : value);
   const known = rows.get(job.id);
@@ -41,7 +61,10 @@ function row(job) {
     bar.setAttribute("aria-label", `${job.progress.phase} of ${job.log}`);
     result.append(bar);
   }
-  line.append(cell(box), cell(link, ...(job.title ? [element("small", job.log, "quiet name")] : []), ...chips(job.labels)), result,
+  const name = element("div"), named = element("div", "", "named");
+  name.append(link, ...(job.title ? [element("small", job.log, "quiet name")] : []), ...chips(job.labels));
+  named.append(...thumbnail(job), name);
+  line.append(cell(box), cell(named), result,
     summary.key_figures?.length ? cell(figures(summary.key_figures)) : cell(job.message || ""),
     cell(summary.mode ?? ""), cell(summary.duration_s ? duration(summary.duration_s) : ""),
     cell(job.started && job.ended ? ran(job) : ""),
@@ -49,6 +72,12 @@ function row(job) {
   if (known && known.line.contains(document.activeElement)) queueMicrotask(() => link.focus());
   rows.set(job.id, { key, line });
   return line;
+}
+
+function forget(id) {
+  rows.delete(id);
+  pictures.get(id)?.then((address) => { if (address) URL.revokeObjectURL(address); });
+  pictures.delete(id);
 }
 
 export async function refresh(label) {
@@ -62,7 +91,7 @@ export async function refresh(label) {
   if (!jobs.length && offset) { offset = Math.max(offset - PAGE, 0); return refresh(); }
   const lines = jobs.map(row), body = $("jobs").tBodies[0];
   if (lines.length !== body.rows.length || lines.some((line, k) => body.rows[k] !== line)) body.replaceChildren(...lines);
-  for (const id of rows.keys()) if (!jobs.some((job) => job.id === id)) rows.delete(id);
+  for (const id of rows.keys()) if (!jobs.some((job) => job.id === id)) forget(id);
   const filtered = Boolean(value || $("search").value.trim() || $("label-filter").value);
   $("no-jobs").hidden = total > 0 || filtered;
   for (const part of [$("jobs"), document.querySelector(".filters"), document.querySelector(".pages")]) part.hidden = total === 0 && !filtered;

@@ -3,9 +3,10 @@
 At random: kill -9 of workers, servers and jobs' processes, a worker that stands still for longer than its lease and
 comes back, a restart of PostgreSQL. With `--network` (as root) each server and worker is a network namespace of its
 own, and the store is S3 (moto's server): then a worker or server is cut off from the network for longer than a lease,
-the store is away for as long, and a clock is set an hour forward, PostgreSQL's among them. Afterwards: every accepted
-job has ended exactly once, its results are right and there once, every upload is whole, every webhook came, and no
-process is left.
+the store is away for a minute, and a clock is set an hour forward, PostgreSQL's among them. With `--real N` each N-th
+job is the real localiser's, whose results must have the SHA-256 of those of `hsloc replay`; the others sleep.
+Afterwards: every accepted job has ended exactly once, its results are right and there once, every upload is whole,
+every webhook came, and no process is left.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import os
 import random
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import threading
@@ -30,7 +32,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 import postgresql
 from network import S3, Clock, Machine, Network
-from rig import Server, Worker, jobs_processes, kill_all
+from rig import FAKE_WORKER, Server, Worker, jobs_processes, kill_all
 from sqlalchemy import select
 
 from hsloc.client import Client, ClientError
@@ -43,6 +45,14 @@ ENDS = ("succeeded", "failed", "crashed", "cancelled")
 LEASE_S = 4.0
 """By default; a busy machine needs more, or jobs are requeued because nothing is scheduled."""
 HOUR_S = 3600
+AWAY_S = 60.0
+"""Time for which the store cannot be reached."""
+RECORDING = Path(__file__).parents[2] / "recordings" / "paper.mcap"
+END_S = 1.0
+"""How much of the recording a job of the real localiser reads [s]: most of its time is that of any start."""
+SEEDS = (1, 2, 3)
+COMPARED = ("trajectory.tum", "odometry.tum", "reference.tum", "states.csv", "metrics.json", "report.png")
+"""Results without wall times and without the command line, which names the caller's files."""
 
 
 class Fleet:
@@ -71,6 +81,7 @@ class Fleet:
             "HSLOC_WEBHOOK_ATTEMPTS": "50",
             "HSLOC_WEBHOOK_BACKOFF_S": "0.2",
             "HSLOC_STORE_TIMEOUT_S": "10",
+            "HSLOC_WORKER_COMMAND": f"{sys.executable},-P,{Path(__file__).with_name('mixed_worker.py')},{FAKE_WORKER}",
             **({} if store is None else store.variables),
         }
         machines = [None if network is None else network.machine() for _ in range(2 + workers)]
@@ -108,7 +119,7 @@ class Fleet:
         elif kind in ("cut worker", "cut server"):
             self.cut(rng.choice(self.workers if kind == "cut worker" else self.servers).machine)
         elif kind == "store":
-            self.cut(None if self.s3 is None else self.s3.machine)
+            self.cut(None if self.s3 is None else self.s3.machine, AWAY_S)
         elif kind == "clock":
             machine = rng.choice((*self.servers, *self.workers)).machine
             assert machine is not None
@@ -132,11 +143,11 @@ class Fleet:
                 worker.start()
         return kind
 
-    def cut(self, machine: Machine | None) -> None:
+    def cut(self, machine: Machine | None, seconds: float = 0.0) -> None:
         """A machine without network for longer than a lease."""
         assert machine is not None
         machine.cut()
-        time.sleep(1.5 * self.lease_s)
+        time.sleep(max(1.5 * self.lease_s, seconds))
         machine.join()
 
 
@@ -163,28 +174,48 @@ class Handler(BaseHTTPRequestHandler):
         pass
 
 
+def of_the_command_line(folder: Path) -> dict[int, dict[str, str]]:
+    """SHA-256 of the results of `hsloc replay` for each seed, by their names."""
+    shutil.copy(RECORDING, folder)
+    found = {}
+    for seed in SEEDS:
+        command = [sys.executable, "-m", "hsloc.cli.main", "replay", RECORDING.name, "-q", "--end", str(END_S)]
+        subprocess.run([*command, "--seed", str(seed), "--out", f"cli-{seed}"], check=True, cwd=folder)
+        paths = [folder / f"cli-{seed}" / name for name in COMPARED]
+        found[seed] = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+    return found
+
+
 def submit_all(
-    client: Client, count: int, seed: int, hook: str, accepted: dict[str, tuple[int, str]], until: float
+    client: Client, numbers: range, real: int, hook: str, accepted: dict[str, tuple[int, str]], until: float
 ) -> None:
-    """Upload and submit, as a client that tries again; one in ten is cancelled soon after."""
-    rng = random.Random(seed)
-    path = Path(tempfile.gettempdir()) / f"fleet-{os.getpid()}-{seed}.mcap"
-    for k in range(count):
+    """Upload and submit, as a client that tries again; one in ten is cancelled soon after.
+
+    A job of the real localiser is known by its number, which is one of SEEDS.
+    """
+    rng = random.Random(numbers[0])
+    path = Path(tempfile.gettempdir()) / f"fleet-{os.getpid()}-{numbers[0]}.mcap"
+    for number in numbers:
         if time.monotonic() > until:
             break
-        path.write_bytes(f"slow {rng.uniform(0.5, 3.0):.3f} {k} ".encode() + rng.randbytes(50_000))
-        number = seed * 100_000 + k
-        job = client.submit(client.upload(path), seed=number, webhook=hook)
-        accepted[job["id"]] = (number, hashlib.sha256(path.read_bytes()).hexdigest())
+        log, seed, more = path, number, {}
+        if real and number % real == 0:
+            log, seed, more = RECORDING, rng.choice(SEEDS), {"read": {"end_s": END_S}}
+        else:
+            path.write_bytes(f"slow {rng.uniform(0.5, 3.0):.3f} {number} ".encode() + rng.randbytes(50_000))
+        job = client.submit(client.upload(log), seed=seed, webhook=hook, **more)
+        accepted[job["id"]] = (seed, hashlib.sha256(log.read_bytes()).hexdigest())
         if rng.random() < 0.1:
             with suppress(ClientError):
                 client.cancel(job["id"])
         time.sleep(rng.uniform(0.0, 0.6))
-    path.unlink()
+    path.unlink(missing_ok=True)
 
 
-def judge(fleet: Fleet, accepted: dict[str, tuple[int, str]], receiver: Receiver) -> list[str]:
-    """What is wrong; nothing, if all is well."""
+def judge(
+    fleet: Fleet, accepted: dict[str, tuple[int, str]], receiver: Receiver, expected: dict[int, dict[str, str]]
+) -> list[str]:
+    """What is wrong; nothing, if all is well. `expected`: SHA-256 of the command line's results for each seed."""
     wrong: list[str] = []
     database = Database(fleet.url)
     results, uploads = ObjectStore(fleet.store, "results"), ObjectStore(fleet.store, "uploads")
@@ -204,11 +235,17 @@ def judge(fleet: Fleet, accepted: dict[str, tuple[int, str]], receiver: Receiver
         elif files[job.file_id].sha256 != digest or parts.hash(job.file_id)[1] != digest:
             wrong.append(f"{job_id}: its upload is not what was sent")
         elif job.state == "succeeded":
-            for asset in [each for each in assets if each.job_id == job_id]:
+            own = [each for each in assets if each.job_id == job_id]
+            if missing := {"trajectory.tum", *expected.get(number, ())} - {each.name for each in own}:
+                wrong.append(f"{job_id}: lacks {', '.join(sorted(missing))}")
+            for asset in own:
                 content = results.read(job.folder or "", asset.name, 0, asset.size)
                 if hashlib.sha256(content).hexdigest() != asset.sha256:
                     wrong.append(f"{job_id}: {asset.name} is not what its manifest says")
-                if asset.name == "trajectory.tum" and not content.startswith(f"{number} ".encode()):
+                if number in SEEDS:
+                    if expected[number].get(asset.name, asset.sha256) != asset.sha256:
+                        wrong.append(f"{job_id}: {asset.name} is not that of the command line")
+                elif asset.name == "trajectory.tum" and not content.startswith(f"{number} ".encode()):
                     wrong.append(f"{job_id}: has the results of another")
     folders = {job.folder for job in jobs.values() if job.folder is not None}
     if set(jobs) != set(accepted):
@@ -235,9 +272,12 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=60.0, help="Time to submit and mistreat, at most.")
     parser.add_argument("--network", action="store_true", help="Network namespaces and S3; needs root and moto.")
+    parser.add_argument("--clients", type=int, default=2)
+    parser.add_argument("--real", type=int, default=0, metavar="N", help="Each N-th job is the real localiser's.")
     arguments = parser.parse_args()
     folder, rng = Path(tempfile.mkdtemp(prefix="hsloc-fleet-")), random.Random(arguments.seed)
     accepted: dict[str, tuple[int, str]] = {}
+    expected = of_the_command_line(folder) if arguments.real else {}
     with ExitStack() as stack:
         network = store = clock = None
         if arguments.network:
@@ -257,10 +297,12 @@ def main() -> int:
         begin = time.monotonic()
         until = begin + 60.0 * arguments.minutes
         clients = []
-        for k, server in enumerate(fleet.servers):
-            client = Client(server.url, attempts=300, timeout_s=10.0, block=20_000)
+        first = 100_000 * arguments.seed
+        for k in range(arguments.clients):
+            client = Client(fleet.servers[k % 2].url, attempts=300, timeout_s=10.0, block=20_000)
             client.request("GET", "/healthz")  # a server that never answered is given up sooner
-            work = (client, arguments.jobs // 2, arguments.seed * 10 + k, hook, accepted, until)
+            numbers = range(first + k, first + arguments.jobs, arguments.clients)
+            work = (client, numbers, arguments.real, hook, accepted, until)
             clients.append(threading.Thread(target=submit_all, args=work, daemon=True))
             clients[-1].start()
         done: Counter[str] = Counter()
@@ -289,8 +331,10 @@ def main() -> int:
         time.sleep(5.0)
         for worker in fleet.workers:
             worker.end()
-        wrong = judge(fleet, accepted, receiver)
-    print(f"{len(accepted)} jobs accepted; {sum(done.values())} mishaps: {dict(done)}; {seconds:.0f} s")
+        wrong = judge(fleet, accepted, receiver, expected)
+    real = sum(number in SEEDS for number, _ in accepted.values())
+    print(f"{len(accepted)} of {arguments.jobs} jobs accepted, {real} with the real localiser; {seconds:.0f} s")
+    print(f"{sum(done.values())} mishaps: {dict(done)}")
     print(f"states: {dict(states)}; attempts: {dict(sorted(attempts.items()))}")
     print(f"webhooks: {len(receiver.count)} events, {sum(receiver.count.values()) - len(receiver.count)} sent again")
     print("\n".join(wrong) or "nothing lost, nothing twice, no process left")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import http.client
+import json
 import re
 import socket
 import sqlite3
@@ -16,6 +18,7 @@ from live_service import settings, submit, upload, wait
 from hsloc.cli.main import main as program
 from hsloc_service.auth import Tokens
 from hsloc_service.http.app import create_app
+from hsloc_service.http.middleware import LINGER_SILENCE_S
 from hsloc_service.http.openapi import describe
 
 if TYPE_CHECKING:
@@ -188,11 +191,33 @@ def test_a_large_body_without_a_token_is_not_read(make_live: Callable[..., Live]
                 sent += line.send(bytes(65536))
         except OSError:
             pass  # the server has closed
-    assert sent < 20_000_000  # what the kernel's buffers took
+    assert sent < 20_000_000  # LINGER_BYTES, and what the kernel's buffers took
     with socket.create_connection(("127.0.0.1", live.port), 10.0) as line:
         line.sendall(head.encode())
         assert line.recv(4096).startswith(b"HTTP/1.1 401")
     assert list((live.data / "uploads").iterdir()) == []
+
+
+def test_a_refusal_reaches_a_client_that_sends_on(make_live: Callable[..., Live]) -> None:
+    live = make_live()
+    unknown = {"Authorization": "Bearer hsl_unknown"}
+    cases = [("POST", "/v1/jobs", unknown, 401), ("POST", "/v1/jobs", {}, 413), ("PATCH", "/v1/files", {}, 405)]
+    for method, path, headers, status in cases * 5:
+        line = http.client.HTTPConnection("127.0.0.1", live.port, timeout=10.0)
+        line.request(method, path, bytes(5_000_000), headers)  # reads nothing before all is sent
+        answer = line.getresponse()
+        assert answer.status == status
+        assert json.loads(answer.read())["message"]
+        line.close()
+    begin = time.monotonic()
+    with socket.create_connection(("127.0.0.1", live.port), 10.0) as silent:
+        # One that waits to be asked for its body is not waited for.
+        host = f"127.0.0.1:{live.port}\r\nAuthorization: Bearer hsl_unknown"
+        head = f"POST /v1/jobs HTTP/1.1\r\nHost: {host}\r\nExpect: 100-continue\r\nContent-Length: 9\r\n\r\n"
+        silent.sendall(head.encode())
+        while silent.recv(4096):
+            pass
+    assert time.monotonic() - begin < LINGER_SILENCE_S
 
 
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "evil.example:8000", ""])

@@ -30,7 +30,7 @@ from hsloc_service.http import (
 )
 from hsloc_service.http.context import Context, known_query
 from hsloc_service.http.guard import Guard
-from hsloc_service.http.middleware import Conditional, add_error_handlers
+from hsloc_service.http.middleware import Conditional, Lingering, add_error_handlers
 from hsloc_service.http.openapi import add_openapi
 from hsloc_service.jobs.repository import Jobs
 from hsloc_service.jobs.shares import Shares
@@ -91,6 +91,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(
         Guard, settings=settings, tokens=Tokens(context.database), shares=context.shares, servers=context.servers
     )
+    app.add_middleware(Lingering)
     for router in ROUTERS:
         app.include_router(router, dependencies=[Depends(known_query)])
     _add_page(app)

@@ -1,6 +1,7 @@
 """What every request and its answer pass: time-outs, exceptions as answers, conditional and compressed answers.
 
-uvicorn alone never closes a connection whose request does not come: five hundred of them stay five hundred. Every error
+uvicorn alone never closes a connection whose request does not come: five hundred of them stay five hundred, and resets
+one whose request it has not read. Every error
 has the shape `{"code", "message", "details"}`. A client that polls gets 304 while nothing changes, and gzip where it
 does.
 """
@@ -12,6 +13,7 @@ import gzip
 import hashlib
 import logging
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, cast
 
 from anyio import to_thread
@@ -40,6 +42,11 @@ if TYPE_CHECKING:
 
 RATE_WINDOW = 2.5
 """Time over which the rate of a body is averaged, in body time-outs: a silence below one of them must not decide."""
+
+LINGER_S, LINGER_SILENCE_S = 30.0, 5.0
+"""How long a body that was refused is read, and how long nothing may come [s]: as nginx does."""
+LINGER_BYTES = 10 << 20
+"""How much of it is read: a block of 8 MiB, as our clients send it, and what comes with it."""
 
 _CODES = {404: "not_found", 405: "method", 413: "too_large", 400: "bad_request", 416: "range"}
 MIN_GZIP_BYTES = 1024
@@ -232,6 +239,61 @@ def _closing(request: Request, headers: dict[str, str]) -> dict[str, str]:
 
 def _answer(status: int, code: str, message: str, headers: dict[str, str], details: Any = None) -> Response:
     return Response(problem(code, message, details), status, headers, "application/json")
+
+
+class Lingering:
+    """Reads on for a while where an answer ends the connection before its request was read, and closes it then.
+
+    A connection that is closed with bytes unread is reset, and the reset may overtake the answer (RFC 9112, 9.6). The
+    answer goes out at once; its end is kept from uvicorn, which would close, until the client has sent all, too much,
+    or nothing for too long.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, and its answer back."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        # Who waits for `100 Continue` sends nothing after another answer.
+        sends = "expect" not in Headers(scope=scope)
+        closes, end = False, None
+
+        async def read() -> Message:
+            nonlocal sends
+            message = await receive()
+            sends = message.get("more_body", False)
+            return message
+
+        async def answer(message: Message) -> None:
+            nonlocal closes, end
+            if message["type"] == "http.response.start":
+                headers = Headers(raw=message["headers"])
+                closes = headers.get("connection") == "close" and "content-length" in headers
+            elif closes and sends and not message.get("more_body", False):
+                end = {**message, "body": b""}
+                message = {**message, "more_body": True}
+            await send(message)
+
+        await self._app(scope, read, answer)
+        if end is not None:
+            await _discard(receive)
+            await send(end)
+
+
+async def _discard(receive: Receive) -> None:
+    """Read the rest of a body, within limits."""
+    count = 0
+    with suppress(TimeoutError):
+        async with asyncio.timeout(LINGER_S):
+            while count < LINGER_BYTES:
+                async with asyncio.timeout(LINGER_SILENCE_S):
+                    message = await receive()
+                count += len(message.get("body", b""))
+                if not message.get("more_body", False):
+                    return
 
 
 class Conditional:

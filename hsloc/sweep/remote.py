@@ -1,7 +1,8 @@
 """Logs and results of a sweep at URLs, as fsspec knows them: `s3://bucket/logs/*.mcap`, `gs://...`, `file:///mnt/logs`.
 
-A log is fetched whole by the process that runs it, which keeps the newest one for its next run. An object of an object
-store appears whole, and a file of a file system by a rename, so that nothing that is read is half written.
+A log is fetched by the process that runs it, which keeps the newest one for its next run; of an MCAP file with an index
+the topics that hsloc cannot read, such as images, are left out (`hsloc.log.mcap.ranges`). An object of an object store
+appears whole, and a file of a file system by a rename, so that nothing that is read is half written.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from urllib.parse import urlsplit
 from hsloc.errors import HslocError, LogError, OutputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
 OBJECT_STORES = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl")
 """They have no folders, and what is written appears by one call."""
@@ -73,9 +74,28 @@ class RemoteLog:
             target.parent.mkdir(parents=True, exist_ok=True)
             with _as_error(LogError, file.url, "read"):
                 fs, path = _file_system(file.url)
-                fs.get_file(path, str(target))
-            if target.stat().st_size != file.size:
+                if _copy_ranges(fs, path, file.size, target):
+                    # What came of two versions would fit together by chance only.
+                    changed = file.version != (_version(fs.info(path)) or file.version)
+                else:
+                    fs.get_file(path, str(target))
+                    changed = target.stat().st_size != file.size
+            if changed:
                 raise LogError(f"{file.url}: it changed while it was read; run the sweep again")
+
+
+def _copy_ranges(fs: Any, path: str, size: int, target: Path) -> bool:
+    """Whether a file is one of which a part is enough, and that was fetched."""
+    from hsloc.log.mcap.ranges import copy_needed
+
+    def fetch(ranges: Sequence[tuple[int, int]]) -> Sequence[bytes]:
+        found: list[bytes] = fs.cat_ranges(
+            [path] * len(ranges), *map(list, zip(*ranges, strict=True)), on_error="raise"
+        )
+        return found
+
+    with target.open("w+b") as file:
+        return copy_needed(fetch, size, file) is not None
 
 
 class _Kept:
@@ -129,8 +149,12 @@ def _files(fs: Any, path: str, listed: dict[str, Any]) -> Iterator[RemoteFile]:
 def _file(fs: Any, path: str, below: str, listed: dict[str, Any]) -> RemoteFile:
     info = listed if listed.get("type") == "file" else fs.info(path)  # a link is listed as what it is, not as its file
     # Where nothing changes with the content, none is taken for known.
-    version = next((str(info[name]) for name in _VERSIONS if info.get(name) is not None), uuid.uuid4().hex)
-    return RemoteFile(fs.unstrip_protocol(path), below, int(info["size"]), version)
+    return RemoteFile(fs.unstrip_protocol(path), below, int(info["size"]), _version(info) or uuid.uuid4().hex)
+
+
+def _version(info: dict[str, Any]) -> str | None:
+    """What a file's content is known by; None where the file system has nothing of the kind."""
+    return next((str(info[name]) for name in _VERSIONS if info.get(name) is not None), None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from hsloc.log.checks.profile import Profile, read_profile, violations
     from hsloc.log.checks.topics import LEAST_JUMP, LONGEST_JUMP_S, MAX_SPEED
     from hsloc.log.convert import Conversion, convert_log
+    from hsloc.log.mcap.ranges import copy_needed
     from hsloc.log.messages.decode import LinkMessage
     from hsloc.log.messages.encode import Marker
     from hsloc.log.reader import Log, is_log, open_log
@@ -50,6 +51,7 @@ __all__ = [
     "Transform3",
     "check_log",
     "convert_log",
+    "copy_needed",
     "is_log",
     "is_static_topic",
     "laser_mounting",
@@ -65,6 +67,7 @@ _MODULES = {
     "checks.profile": ("Profile", "read_profile", "violations"),
     "checks.topics": ("LEAST_JUMP", "LONGEST_JUMP_S", "MAX_SPEED"),
     "convert": ("Conversion", "convert_log"),
+    "mcap.ranges": ("copy_needed",),
     "messages.decode": ("LinkMessage",),
     "messages.encode": ("Marker",),
     "reader": ("Log", "is_log", "open_log"),

@@ -1,7 +1,7 @@
 """Logs and results of a sweep at URLs, as fsspec knows them: `s3://bucket/logs/*.mcap`, `gs://...`, `file:///mnt/logs`.
 
 A log is fetched by the process that runs it, which keeps the newest one for its next run; of an MCAP file with an index
-the topics that hsloc cannot read, such as images, are left out (`hsloc.log.mcap.ranges`). An object of an object store
+the topics that hsloc cannot read, such as images, are left out (`hsloc.log.copy_needed`). An object of an object store
 appears whole, and a file of a file system by a rename, so that nothing that is read is half written.
 """
 
@@ -86,7 +86,7 @@ class RemoteLog:
 
 def _copy_ranges(fs: Any, path: str, size: int, target: Path) -> bool:
     """Whether a file is one of which a part is enough, and that was fetched."""
-    from hsloc.log.mcap.ranges import copy_needed
+    from hsloc.log import copy_needed
 
     def fetch(ranges: Sequence[tuple[int, int]]) -> Sequence[bytes]:
         found: list[bytes] = fs.cat_ranges(

@@ -14,7 +14,7 @@ import threading
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from sqlalchemy import delete, exists, select, update
+from sqlalchemy import delete, exists, select, tuple_, update
 
 from hsloc_service.audit import RETENTION, forget, note
 from hsloc_service.db.database import clock
@@ -124,9 +124,9 @@ class Housekeeping:
 
         In batches of BATCH, a transaction each, so that other writes wait for one batch at most.
         """
-        seq: int | None = 0
-        while seq is not None and not self._stop.is_set():
-            seq = self._delete_jobs(before, seq)
+        last: tuple[float, int] | None = (0.0, 0)
+        while last is not None and not self._stop.is_set():
+            last = self._delete_jobs(before, last)
         with self._database.write() as session:
             empty = ~exists().where(JobRow.sweep == SweepRow.id)
             session.execute(delete(SweepRow).where(SweepRow.created < before, empty))
@@ -134,18 +134,20 @@ class Housekeeping:
         while ident is not None and not self._stop.is_set():
             ident = self._delete_uploads(before, ident)
 
-    def _delete_jobs(self, before: float, after: int) -> int | None:
-        """Delete a batch of jobs; the `seq` of the last one, None if there are no more."""
-        query = select(JobRow).where(JobRow.state.in_(ENDED), JobRow.ended < before, JobRow.seq > after)
+    def _delete_jobs(self, before: float, after: tuple[float, int]) -> tuple[float, int] | None:
+        """Delete a batch of jobs that ended after others; end and `seq` of the last one, None if there are no more."""
+        behind = tuple_(JobRow.ended, JobRow.seq) > tuple_(*after)
+        query = select(JobRow).where(JobRow.ended < before, behind)
         with self._database.write() as session:
             self._database.lock(session, "tenants")
-            jobs = session.scalars(query.order_by(JobRow.seq).limit(BATCH)).all()
+            jobs = session.scalars(query.order_by(JobRow.ended, JobRow.seq).limit(BATCH)).all()
             extended = base_job(session, *(job.id for job in jobs))
-            old = [job for job in jobs if job.id not in extended]
+            # Not a part of the query: SQLite would go by the state, through all jobs.
+            old = [job for job in jobs if job.state in ENDED and job.id not in extended]
             delete_job(session, *old)
             for job in old:
                 note(session, job.tenant, RETENTION, "job.delete", job.id)
-            return jobs[-1].seq if jobs else None
+            return (jobs[-1].ended or 0.0, jobs[-1].seq) if jobs else None
 
     def _delete_uploads(self, before: float, after: str) -> str | None:
         """Delete a batch of uploads; the id of the last one, None if there are no more."""

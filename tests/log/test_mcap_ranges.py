@@ -46,7 +46,7 @@ def recording(compression: CompressionType, *, mixed: bool, chunked: bool = True
             add(pictures, IMAGE_BYTES)
         late = late or writer.register_channel("/odom", "cdr", odometry)
         add(late, 700)
-    writer.finish()
+    writer.finish()  # type: ignore[no-untyped-call]
     return stream.getvalue()
 
 

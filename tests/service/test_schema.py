@@ -6,7 +6,7 @@ import ast
 import sqlite3
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from fastapi.testclient import TestClient
@@ -16,13 +16,20 @@ from sqlalchemy import event
 from hsloc_service.auth import ANYBODY
 from hsloc_service.db import database, migrations
 from hsloc_service.db.database import Database
-from hsloc_service.db.tables import SCHEMA_VERSION
+from hsloc_service.db.tables import SCHEMA_VERSION, JobRow
+from hsloc_service.housekeeping import Housekeeping
 from hsloc_service.http.app import create_app
+from hsloc_service.jobs.leases import Leases
+from hsloc_service.jobs.repository import JobFilter, Jobs
+from hsloc_service.results.deletion_queue import DeletionQueue
+from hsloc_service.results.stores import ResultStores
 from hsloc_service.settings import SettingsError
+from hsloc_service.storage import Storage
 from hsloc_service.uploads.repository import need_quota
+from hsloc_service.webhooks import WebhookSender
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from sqlalchemy import Connection
 
@@ -152,6 +159,39 @@ def test_no_query_of_a_submission_reads_the_rows_of_a_tenant(tmp_path: Path) -> 
             plan = plain.execute(f"EXPLAIN QUERY PLAN {statement}", [0] * statement.count("?")).fetchall()
             assert "USING COVERING INDEX" in plan[0][3], plan
     plain.close()
+
+
+def test_what_is_asked_again_and_again_does_not_read_all_jobs(tmp_path: Path) -> None:
+    """SQLite chooses by the form of a query alone; claims went through all jobs of a tenant that had ended."""
+    base, chosen = Database(tmp_path / "hsloc.db"), settings(tmp_path)
+    storage = Storage(chosen.data)
+    stores = ResultStores(storage, chosen)
+    deletions = DeletionQueue(base, storage, stores, 30.0)
+    asked: list[tuple[str, Any]] = []
+    event.listen(base._engine, "before_cursor_execute", lambda *now: asked.append((now[2], now[3])))
+    calls: dict[str, Callable[[], object]] = {
+        "job_waiting": lambda: Leases(base, 30.0).claim("one:1"),
+        "job_by_end": lambda: Housekeeping(base, storage, chosen, deletions)._delete_jobs(1.0, (0.0, 0)),
+        "delivery_by_state": WebhookSender(base, chosen).deliver_next,
+        "job_by_name": lambda: Jobs(base, storage, chosen).list(ANYBODY, JobFilter(order="name")),
+    }
+    with base.write() as session:
+        session.add(JobRow(seq=1, id="1", tenant="a", file_id="1", log_name="a", request={"log": "1"}, created=1.0))
+    with sqlite3.connect(tmp_path / "hsloc.db") as plain:
+        for index, call in calls.items():
+            asked.clear()
+            call()
+            plans = [
+                row[3]
+                for statement, values in list(asked)
+                if statement.startswith("SELECT")
+                for row in plain.execute(f"EXPLAIN QUERY PLAN {statement}", values)
+            ]
+            assert any(index in line for line in plans), (index, plans)
+            assert not [line for line in plans if line.startswith(("SCAN job", "SCAN delivery")) or "ix_job" in line]
+    plain.close()
+    base.close()
+    storage.close()
 
 
 def test_a_migration_that_fails_leaves_the_old_database(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from sqlalchemy import JSON, BigInteger, Index, Integer, Text, UniqueConstraint
+from sqlalchemy import JSON, BigInteger, Index, Integer, Text, UniqueConstraint, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 """Stored in the database; what leads from one to the next is in `migrations`."""
 
 JobState = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
@@ -121,6 +121,9 @@ class JobRow(Base):
         Index("job_by_state", "state", "seq"),
         Index("job_by_tenant", "tenant", "state", "bytes"),  # the quota, and how many wait: asked at every submission
         Index("job_by_start", "tenant", "started"),  # when a tenant was served last: asked at every claim
+        Index("job_waiting", "tenant", "state", text("priority DESC"), "seq"),  # whose turn it is: asked at every claim
+        Index("job_by_end", "ended", "seq"),  # the old ones: asked at every tidying
+        Index("job_by_name", "tenant", text("lower(log_name)"), text("seq DESC")),  # a page of them in this order
     )
 
 
@@ -240,6 +243,7 @@ class DeliveryRow(Base):
     last_status: Mapped[int | None]
     last_error: Mapped[str | None]
     created: Mapped[float]
+    __table_args__ = (Index("delivery_by_state", "state", "next_at"),)  # what is due: asked every second
 
 
 class SecretRow(Base):

@@ -300,7 +300,8 @@ def _turns(session: Session, waiting: Iterable[ColumnElement[bool]]) -> list[tup
     other = aliased(JobRow)
     running = select(func.count()).where(other.tenant == tenants.c.tenant, other.state.in_(("running", "cancelling")))
     served = select(func.max(other.started)).where(other.tenant == tenants.c.tenant)
-    first = select(func.min(other.seq)).where(other.tenant == tenants.c.tenant, other.state == "queued")
+    # Of the plain column SQLite would look for the minimum from the oldest row on, through all that have ended.
+    first = select(func.min(other.seq + 0)).where(other.tenant == tenants.c.tenant, other.state == "queued")
     turns = session.execute(
         select(
             running.correlate(tenants).scalar_subquery(),

@@ -84,6 +84,8 @@ def test_the_queue_has_an_end(make_client: Callable[..., TestClient]) -> None:
     jobs = [client.post("/v1/jobs", json={"log": file}).json()["id"]]
     wait(client, jobs[0], states=("running",))
     jobs += [client.post("/v1/jobs", json={"log": file}).json()["id"] for _ in range(2)]
+    queues = [client.get(f"/v1/jobs/{job}").json()["queue"] for job in jobs]
+    assert queues == [None, {"ahead": 0, "wait_s": None}, {"ahead": 1, "wait_s": None}]
     refused = client.post("/v1/jobs", json={"log": file})
     assert (refused.status_code, refused.json()["code"]) == (429, "too_many")
     assert int(refused.headers["retry-after"]) >= 1

@@ -16,7 +16,7 @@ from hsloc_service.db.database import open_database
 from hsloc_service.db.tables import JobRow
 from hsloc_service.errors import ServiceError
 from hsloc_service.execution.job_process import parse_line
-from hsloc_service.jobs.leases import Leases, RetryPolicy
+from hsloc_service.jobs.leases import Leases, RetryPolicy, place_in_queue
 from hsloc_service.jobs.repository import ORDERS, JobFilter, Jobs
 from hsloc_service.jobs.workers import Presence
 from hsloc_service.results.store import Asset
@@ -70,6 +70,30 @@ def test_a_job_is_claimed_once(parts: Parts) -> None:
     assert claim is not None
     assert (claim.job_id, claim.attempt) == (job, 1)
     assert leases.claim("b") is None
+
+
+def test_the_place_in_the_queue_is_that_of_the_claims(parts: Parts) -> None:
+    jobs = [parts.submit(priority=priority) for priority in (0, 0, 5, 0, 5)]
+    parts.submit(OTHER)
+    leases = parts.leases()
+
+    def places() -> list[tuple[int, float | None]]:
+        found = [parts.jobs.get(ANYBODY, each) for each in jobs]
+        return [place_in_queue(parts.database, each) for each in found if each.state == "queued"]
+
+    assert places() == [(2, None), (3, None), (0, None), (4, None), (1, None)]
+    claims = {claim.tenant: claim for claim in (leases.claim("a"), leases.claim("a")) if claim is not None}
+    mine = claims[ANYBODY.tenant]  # one of each tenant
+    assert mine.job_id == jobs[2]
+    assert places() == [(1, None), (2, None), (3, None), (0, None)]
+    leases.succeed(mine, "f", ASSET, {})
+    with parts.database.write() as session:
+        session.execute(update(JobRow).where(JobRow.id == mine.job_id).values(started=100.0, ended=108.0))
+    assert places() == [(1, 8.0), (2, 16.0), (3, 24.0), (0, 0.0)]
+    claim = leases.claim("a")
+    assert claim is not None
+    assert claim.job_id == jobs[4]
+    assert places() == [(0, 4.0), (1, 12.0), (2, 20.0)]
 
 
 def test_an_expired_lease_is_taken_over_and_the_first_owner_is_fenced_off(parts: Parts) -> None:

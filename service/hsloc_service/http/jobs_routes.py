@@ -23,12 +23,14 @@ from hsloc_service.http.schemas import (
     JobList,
     JobRequest,
     JobView,
+    QueueView,
     RerunRequest,
     State,
     Verdict,
     checked,
 )
 from hsloc_service.http.views import brief_view, delivery_view, job_view
+from hsloc_service.jobs.leases import place_in_queue
 from hsloc_service.jobs.repository import JobFilter, JobOrder
 from hsloc_service.stored_request import plain
 
@@ -104,8 +106,13 @@ def list_jobs(
 
 @router.get("/{job_id}", responses=problems(404))
 def get(ctx: Ctx, who: Reader, job_id: JobId) -> JobView:
-    """One job."""
-    return job_view(ctx.jobs.get(who, job_id))
+    """One job; of one that waits, where it is in the queue."""
+    row = ctx.jobs.get(who, job_id)
+    view = job_view(row)
+    if row.state != "queued":
+        return view
+    ahead, wait_s = place_in_queue(ctx.database, row)
+    return view.model_copy(update={"queue": QueueView(ahead=ahead, wait_s=wait_s)})
 
 
 @router.patch("/{job_id}", responses=problems(404))

@@ -243,6 +243,15 @@ class ProgressView(BaseModel):
     age_s: float = Field(description="seconds since the job's process said so")
 
 
+class QueueView(BaseModel):
+    """Where a waiting job is in the queue of its tenant."""
+
+    ahead: int = Field(ge=0, description="jobs of yours that are begun before it")
+    wait_s: float | None = Field(
+        description="seconds until it begins, about, by how long your last jobs ran; null: none ran"
+    )
+
+
 class JobView(BaseModel):
     """A job.
 
@@ -267,6 +276,7 @@ class JobView(BaseModel):
     started: AwareDatetime | None
     ended: AwareDatetime | None
     progress: ProgressView | None
+    queue: QueueView | None = Field(default=None, description="of a waiting job that is asked for by its id")
     heartbeat_age_s: float | None = Field(description="seconds since the job's supervisor said that it lives")
     outcome: Literal["ok", "below_threshold"] | None = Field(
         description="of a job that succeeded: below_threshold if its result does not keep a limit of the request, such "
@@ -281,29 +291,6 @@ class JobList(BaseModel):
     jobs: list[JobView]
     next: int | None
     total: int | None = Field(default=None, description="how many jobs the filter leaves, where `brief` was asked for")
-
-
-class WorkerView(BaseModel):
-    """A server or worker."""
-
-    id: str
-    kind: Literal["server", "worker"]
-    host: str
-    pid: int
-    version: str
-    slots: int
-    busy: int = Field(description="slots that run a job, of any tenant")
-    jobs: list[Ident] = Field(description="your jobs that it runs")
-    draining: bool = Field(description="it was asked to stop, and begins no more jobs")
-    started: AwareDatetime
-    heartbeat_age_s: float
-    alive: bool = Field(description="its last heartbeat is younger than a lease; else its jobs go to others")
-
-
-class WorkerList(BaseModel):
-    """The servers and workers that share a database; empty where it is one server's own."""
-
-    workers: list[WorkerView]
 
 
 class AssetView(BaseModel):

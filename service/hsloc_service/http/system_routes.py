@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
 from fastapi.responses import Response
@@ -23,20 +23,21 @@ from hsloc_service.http.context import Admin, Context, Ctx, Reader, problems
 from hsloc_service.http.schemas import (
     UUID_PATTERN,
     Health,
+    Ident,
     Info,
     LabelList,
     Options,
     Problem,
     SecretView,
-    WorkerList,
     known_moment,
 )
-from hsloc_service.http.views import worker_view
 from hsloc_service.jobs.workers import alive_workers, workers
 from hsloc_service.webhooks import secret_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from hsloc_service.jobs.workers import WorkerState
 
 router = APIRouter(tags=["system"])
 MAX_COMPARED = 100
@@ -49,7 +50,49 @@ class SeedTable(BaseModel):
     rows: list[list[str]]
 
 
+class WorkerView(BaseModel):
+    """A server or worker."""
+
+    id: str
+    kind: Literal["server", "worker"]
+    host: str
+    pid: int
+    version: str
+    slots: int
+    busy: int = Field(description="slots that run a job, of any tenant")
+    jobs: list[Ident] = Field(description="your jobs that it runs")
+    draining: bool = Field(description="it was asked to stop, and begins no more jobs")
+    started: AwareDatetime
+    heartbeat_age_s: float
+    alive: bool = Field(description="its last heartbeat is younger than a lease; else its jobs go to others")
+
+
+class WorkerList(BaseModel):
+    """The servers and workers that share a database; empty where it is one server's own."""
+
+    workers: list[WorkerView]
+
+
 _TEXT = {"description": "the metrics", "content": {"text/plain": {"schema": {"type": "string"}}}}
+
+
+def _worker_view(state: WorkerState, lease_s: float) -> WorkerView:
+    """A server or worker."""
+    row = state.row
+    return WorkerView(
+        id=row.id,
+        kind="server" if row.kind == "server" else "worker",
+        host=row.host,
+        pid=row.pid,
+        version=row.version,
+        slots=row.slots,
+        busy=state.busy,
+        jobs=state.jobs,
+        draining=row.draining,
+        started=known_moment(row.started),
+        heartbeat_age_s=round(state.age_s, 3),
+        alive=state.age_s < lease_s,
+    )
 
 
 @router.get("/healthz")
@@ -101,7 +144,7 @@ def info(ctx: Ctx, who: Reader) -> Info:
 @router.get("/v1/workers", responses=problems())
 def list_workers(ctx: Ctx, who: Admin) -> WorkerList:
     """The servers and workers that share the database, with your jobs that they run. Needs the scope `admin`."""
-    return WorkerList(workers=[worker_view(each, ctx.settings.lease_s) for each in workers(ctx.database, who)])
+    return WorkerList(workers=[_worker_view(each, ctx.settings.lease_s) for each in workers(ctx.database, who)])
 
 
 class AuditEntry(BaseModel):

@@ -10,7 +10,6 @@ from hsloc_service.http.schemas import (
     FileView,
     JobView,
     ProgressView,
-    WorkerView,
     known_moment,
     moment,
 )
@@ -19,7 +18,6 @@ from hsloc_service.jobs.repository import split_labels
 if TYPE_CHECKING:
     from hsloc_service.db.tables import DeliveryRow, FileRow, JobRow
     from hsloc_service.http.schemas import State
-    from hsloc_service.jobs.workers import WorkerState
 
 
 def file_view(row: FileRow) -> FileView:
@@ -33,25 +31,6 @@ def file_view(row: FileRow) -> FileView:
         sha256=row.sha256,
         created=known_moment(row.created),
         expires=moment(row.expires),
-    )
-
-
-def worker_view(state: WorkerState, lease_s: float) -> WorkerView:
-    """A server or worker."""
-    row = state.row
-    return WorkerView(
-        id=row.id,
-        kind="server" if row.kind == "server" else "worker",
-        host=row.host,
-        pid=row.pid,
-        version=row.version,
-        slots=row.slots,
-        busy=state.busy,
-        jobs=state.jobs,
-        draining=row.draining,
-        started=known_moment(row.started),
-        heartbeat_age_s=round(state.age_s, 3),
-        alive=state.age_s < lease_s,
     )
 
 

@@ -13,7 +13,7 @@ import uuid
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from sqlalchemy import func, or_, select
+from sqlalchemy import and_, func, or_, select
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import aliased
 
@@ -311,6 +311,42 @@ def _turns(session: Session, waiting: Iterable[ColumnElement[bool]]) -> list[tup
         )
     ).all()
     return sorted(((*turn,) for turn in turns), key=lambda turn: (turn[0], turn[1], turn[2] or 0))
+
+
+class Place(NamedTuple):
+    """Where a waiting job is in the queue of its tenant."""
+
+    ahead: int
+    """Jobs of the tenant that are begun before."""
+    wait_s: float | None
+    """Time until it begins [s], about; None where no job of the tenant has run."""
+
+
+_LAST_RUNS = 20
+"""Jobs whose run times stand for those that wait."""
+
+
+def place_in_queue(database: Database, job: JobRow) -> Place:
+    """Of a waiting job: how many go before, and for how long, if as many of the tenant run at once as now.
+
+    The jobs that run now are taken to be half done.
+    """
+    of_tenant = JobRow.tenant == job.tenant
+    before = or_(JobRow.priority > job.priority, and_(JobRow.priority == job.priority, JobRow.seq < job.seq))
+    run_s = (
+        select((JobRow.ended - JobRow.started).label("run_s"))
+        .where(of_tenant, JobRow.state == "succeeded")
+        .order_by(JobRow.seq.desc())
+        .limit(_LAST_RUNS)
+        .subquery()
+    )
+    with database.read() as session:
+        counted = select(func.count()).select_from(JobRow)
+        ahead = session.scalar(counted.where(of_tenant, JobRow.state == "queued", before)) or 0
+        running = session.scalar(counted.where(of_tenant, JobRow.state.in_(("running", "cancelling")))) or 0
+        mean_s = session.scalar(select(func.avg(run_s.c.run_s)))
+    wait_s = None if mean_s is None else float(mean_s) * (ahead / max(running, 1) + (0.5 if running else 0.0))
+    return Place(ahead, wait_s)
 
 
 def _held(session: Session, claim: Claim) -> JobRow | None:

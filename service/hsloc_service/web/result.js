@@ -1,7 +1,7 @@
 // One job: its state while it runs, then its result as report.html shows it.
 
 import { events, get, hasToken, post, request } from "./api.js";
-import { $, ACTIVE, badge, button, bytes, cell, element, guarded, heading, list, ran } from "./dom.js";
+import { $, ACTIVE, badge, button, bytes, cell, duration, element, guarded, heading, list, ran } from "./dom.js";
 import * as labels from "./labels.js";
 import * as share from "./share.js";
 
@@ -54,8 +54,19 @@ function begin() {
   return watching.signal;
 }
 
+// Others of the queue end without an event of this job.
+async function watchQueue(job, mine) {
+  while (job?.state === "queued") {
+    await new Promise((done) => { setTimeout(done, 5000); });
+    if (mine.aborted) return;
+    job = await guarded(() => get(`/v1/jobs/${job.id}`));
+    if (job?.state === "queued" && !mine.aborted) render(job);
+  }
+}
+
 // What the job's process writes, and how far it is, until it has ended.
 async function follow(job, mine) {
+  watchQueue(job, mine);
   const isActive = ACTIVE.includes(job.state), box = $("job-log"), text = box.lastElementChild;
   box.open = isActive ? box.open : ["failed", "crashed"].includes(job.state);
   for await (const { kind, data } of events(`/v1/jobs/${job.id}/events`, mine)) {
@@ -86,7 +97,7 @@ function render(job, isMine = true) {
   state.replaceChildren(element("span", ended ?? job.state, `state ${job.state}${ended ? " quiet" : ""}`));
   if (job.reason) state.append(` (${job.reason})`);
   if (job.message) state.append(`: ${job.message}`);
-  if (job.state === "queued") state.append(": waits for a slot");
+  if (job.state === "queued") state.append(`: waits for a slot${place(job.queue)}`);
   const progress = job.progress;
   $("job-bar").hidden = !ACTIVE.includes(job.state);
   if (progress) {
@@ -101,6 +112,12 @@ function render(job, isMine = true) {
   $("job-request").lastElementChild.textContent = JSON.stringify(settings, null, 2);
   offer(job, isMine);
   $("job-describe").hidden = !isMine;
+}
+
+function place(queue) {
+  if (!queue) return "";
+  const ahead = queue.ahead === 0 ? "next of yours" : `${queue.ahead} of yours before it`;
+  return `, ${ahead}${queue.wait_s === null ? "" : `, begins in about ${duration(queue.wait_s)}`}`;
 }
 
 // What can be done with a job. While it runs the buttons stay, so that progress does not take the focus from them.

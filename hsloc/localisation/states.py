@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.kalman_filter import predict_covariance
 from hsloc.localisation.track_evidence import TrackRow, smooth, usual_explained
 from hsloc.model.estimate import Ambiguity, Evidence, LikelyPlace, State, Status
+from hsloc.model.pose2 import Pose2
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -90,6 +92,47 @@ def with_pose_errors(rows: StateRows, errors: F64, reason: str) -> StateRows:
     return replace(rows, state=states, sigma=sigma, reason=reasons)
 
 
+def with_odometry_alone(
+    rows: StateRows,
+    poses: F64,
+    scanned: tuple[int, int],
+    alone: NDArray[np.bool_],
+    motion_covariance: Callable[[Pose2], F64],
+) -> StateRows:
+    """The rows of poses (n, 3) with what the odometry adds to their variances where it is all there is.
+
+    Rows before `scanned[0]` come before the first scan, those from `scanned[1]` on after the last; `motion_covariance`
+    (3, 3) is that of a motion. Of the poses `alone` (n,), around which there are no scans, those that are less certain
+    than a localised one has to be are predicted.
+    """
+    first, last = scanned
+    n, sigma = len(rows), rows.sigma.copy()
+    for origin, walk in ((last - 1, range(last, n)), (first, range(first - 1, -1, -1))):
+        if not (0 <= origin < n and np.isfinite(sigma[origin]).all()):
+            continue
+        begin, covariance, largest = Pose2.from_array(poses[origin]), np.diag(sigma[origin] ** 2), sigma[origin]
+        at = poses[origin]
+        for k in walk:
+            if (poses[k] != at).any():  # a robot at rest stays as certain as it is
+                at = poses[k]
+                motion = begin.between(Pose2.from_array(at))
+                grown = predict_covariance(covariance, begin, motion, motion_covariance(motion))
+                largest = np.fmax(largest, np.sqrt(np.diag(grown)))
+            sigma[k] = np.fmax(sigma[k], largest)
+    with np.errstate(invalid="ignore"):
+        is_vague = (sigma[:, :2].max(axis=1) > MAX_SIGMA) | (sigma[:, 2] > MAX_SIGMA_ANGLE)
+    vague = rows.is_localised() & is_vague & alone
+    states = tuple(State.PREDICTED if each else state for each, state in zip(vague, rows.state, strict=True))
+    reasons = tuple(
+        f"{_deviation(sigma[k])}, by the odometry alone" if vague[k] else reason for k, reason in enumerate(rows.reason)
+    )
+    return replace(rows, state=states, sigma=sigma, reason=reasons)
+
+
+def _deviation(sigma: F64) -> str:
+    return f"standard deviation {max(sigma[0], sigma[1]):.2f} m, {np.degrees(sigma[2]):.1f} deg"
+
+
 class StateLog:
     """Collects the estimates of the scans that say something of the state; `rows` judges them all in hindsight."""
 
@@ -105,6 +148,11 @@ class StateLog:
 
     def __len__(self) -> int:
         return len(self._estimates)
+
+    @property
+    def scanned(self) -> tuple[int, int]:
+        """Numbers of odometry messages before the first scan and before the last."""
+        return (self._counts[0], self._counts[-1]) if self._counts else (0, 0)
 
     def at_odometry(self, n: int, smoothed: Mapping[int, F64] | None = None, between: F64 | float = 0.0) -> StateRows:
         """The states at the n odometry messages: each lies between two scans, and is no surer than either.
@@ -257,7 +305,7 @@ def _judge(probabilities: F64, sigma: F64, usual: float, before: Sequence[TrackR
             return State.OFF_MAP, f"the map explains {evidence.explained:.2f} of the scan, usually {usual:.2f}"
         return State.LOST, "scans before or after do not fit"
     if not (max(sigma[0], sigma[1]) <= MAX_SIGMA and sigma[2] <= MAX_SIGMA_ANGLE):
-        return State.PREDICTED, f"standard deviation {max(sigma[0], sigma[1]):.2f} m, {np.degrees(sigma[2]):.1f} deg"
+        return State.PREDICTED, _deviation(sigma)
     return State.LOCALISED, ""
 
 

@@ -16,7 +16,7 @@ from hsloc.localisation.kalman_filter import (
     smooth_matches,
 )
 from hsloc.localisation.mounting_error import mounting_error
-from hsloc.localisation.states import StateLog, with_pose_errors
+from hsloc.localisation.states import StateLog, with_odometry_alone, with_pose_errors
 from hsloc.model.estimate import ScanDiagnostics, State, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
 from hsloc.model.pose2 import Pose2, compose_poses
@@ -36,6 +36,11 @@ if TYPE_CHECKING:
     from hsloc.slam.result import MappingResult
 
     F64 = NDArray[np.float64]
+
+_SILENT_NS = 1e9
+"""Time without scans (ns) from which poses follow the odometry alone: no lidar turns so slowly ..."""
+_SILENT_INTERVALS = 3.0
+"""... and, in usual intervals of the scans, where a log holds only some of them."""
 
 
 class RunHistory:
@@ -191,6 +196,12 @@ class RunHistory:
         covariances = dict(zip(self._anchor_states, smoothed.covariances, strict=True))
         between = bridge_variances(self.odometry().poses, self._anchors, smoothed.motion)
         rows = self._states.at_odometry(len(self._odometry_stamps), covariances, between)
+        if self._motion_model is not None:
+            noise, factor = self._motion_model, self._anchors[-1].noise_scale if self._anchors else 1.0
+            poses = self.trajectory()[0].poses
+            rows = with_odometry_alone(
+                rows, poses, self._states.scanned, self._is_alone(), lambda motion: factor * noise.covariance(motion)
+            )
         if scale is not None and scale.is_doubted:
             reason = f"the scale of the map is {scale.value:.3f} +- {scale.sigma:.3f}"
             rows = with_pose_errors(rows, scale.pose_errors(self.trajectory()[0].poses), reason)
@@ -198,6 +209,15 @@ class RunHistory:
             errors = mounting.pose_errors(self.trajectory()[0].poses)
             rows = with_pose_errors(rows, errors, "the laser is mounted elsewhere than stated")
         return rows
+
+    def _is_alone(self) -> NDArray[np.bool_]:
+        """Which odometry messages (n,) lie where the lidar gave no scans, at its ends or between."""
+        odometry, scans = np.array(self._odometry_stamps), np.sort(np.array(self._scan_stamps))
+        after = np.searchsorted(scans, odometry)
+        usual = float(np.median(np.diff(scans))) if len(scans) > 1 else 0.0
+        bounds = np.array([-np.inf, *scans.tolist(), np.inf])
+        found: NDArray[np.bool_] = bounds[after + 1] - bounds[after] > max(_SILENT_NS, _SILENT_INTERVALS * usual)
+        return found
 
     def mounting_error(self) -> MountingError | None:
         """How far the laser is from where it is said to be; None where that is not known, or with several lasers."""

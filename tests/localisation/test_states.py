@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from hsloc.export.results_folder import STATES_HEADER, write_states
-from hsloc.localisation.states import StateLog, StateRows, localisation_reasons, with_pose_errors
+from hsloc.localisation.motion_models import OdometryNoise
+from hsloc.localisation.states import StateLog, StateRows, localisation_reasons, with_odometry_alone, with_pose_errors
 from hsloc.model import Estimate, Evidence, Pose2, State, Status, Trajectory
 from hsloc.model.estimate import LikelyPlace
 from hsloc.model.verdict import Verdict, verdict_of
@@ -54,6 +55,23 @@ def test_poses_off_the_map_are_not_localised_and_those_before_are() -> None:
     assert states.is_localised()[:40].all()
     assert states.state[-1] is State.OFF_MAP
     assert "0.60" in states.reason[-1]
+
+
+def test_poses_that_follow_the_odometry_alone_become_predicted() -> None:
+    states = judged(*(estimate(k) for k in range(20)))  # 40 poses
+    poses = np.zeros((40, 3))
+    poses[:, 0] = np.minimum(0.2 * np.arange(40), 6.0)  # at rest from the 31st on
+    alone = np.arange(40) != 20
+    grown = with_odometry_alone(states, poses, (5, 15), alone, OdometryNoise().covariance)
+    x = grown.sigma[:, 0]
+    assert (x[5:15] == states.sigma[5:15, 0]).all()
+    assert (np.diff(x[14:31]) > 0.0).all()
+    assert (np.diff(x[:6]) < 0.0).all()
+    assert (x[31:] == x[30]).all()
+    assert x[30] == pytest.approx(np.hypot(0.02, 0.1 * (6.0 - 2.8)))  # 10 % of the way
+    # After 0.2 m the heading is open by more than 2 deg.
+    assert np.flatnonzero(grown.is_localised()).tolist() == [*range(5, 15), 20]
+    assert grown.reason[-1].endswith("by the odometry alone")
 
 
 def test_a_guess_of_the_search_has_the_state_that_the_search_gave_it() -> None:

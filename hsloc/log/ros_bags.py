@@ -8,25 +8,23 @@ hard or the file was cut, gets one in a temporary copy, as `rosbag reindex` make
 
 from __future__ import annotations
 
-import bz2
-import io
 import os
 import shutil
 import sqlite3
-import struct
 from abc import ABC, abstractmethod
 from contextlib import closing, contextmanager
-from typing import IO, TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 from urllib.parse import quote
 
 from hsloc.errors import LogError, LogFormatError
+from hsloc.log.bag_index import reindex
 from hsloc.log.container import Channel, RawMessage, guarded, in_runs, plausible_times
 from hsloc.log.files import Scratch
 from hsloc.log.messages.definitions import long_name
 from hsloc.log.summary import Losses, TopicStatistics
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sized
+    from collections.abc import Collection, Iterator
     from contextlib import AbstractContextManager
     from pathlib import Path
 
@@ -111,7 +109,7 @@ class BagContainer(_Bag):
         """Whether a bag with an index could be made of what is whole of a file without one; it is read from then on."""
         copy = self._scratch.folder / "reindexed.bag"
         try:
-            chunks = _reindex(self._file, copy)
+            chunks = reindex(self._file, copy)
         except OSError as error:
             raise LogError(
                 f"{self.path}: has no index, and a copy with one cannot be written ({error.strerror or error}); set "
@@ -121,7 +119,9 @@ class BagContainer(_Bag):
             return False
         self._file = copy
         self.losses_at_opening.truncated_files += 1
-        self.losses_at_opening.note(f"{self.path}: has no index, or a wrong one: its {chunks} whole chunks are read")
+        self.losses_at_opening.note(
+            f"{self.path}: has no index, or a wrong one: its {chunks} chunks are read as far as they go"
+        )
         return True
 
     def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
@@ -172,120 +172,6 @@ class BagContainer(_Bag):
     def _guarded(self, losses: Losses | None = None) -> AbstractContextManager[None]:
         remedy = "`rosbag reindex` (or of version 1.2 `rosbag fix`)"
         return guarded(f"{self.path}: cannot be read as a {self.format}", remedy, losses)
-
-
-_BAG_MAGIC, _BAG_HEADER_BYTES = b"#ROSBAG V2.0\n", 4096
-_MOST_HEADER, _MOST_CHUNK = 1 << 20, 1 << 28
-"""Largest header and chunk (bytes) that are believed: recorders write chunks of 768 kB. Operations of the records:"""
-_MESSAGE, _INDEX_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = b"\x02", b"\x03", b"\x04", b"\x05", b"\x06", b"\x07"
-
-
-def _reindex(source: Path, target: Path) -> int:
-    """Write a bag of the whole chunks of another, with a new index; the number of chunks."""
-    connections: dict[bytes, tuple[bytes, bytes]] = {}
-    infos: list[bytes] = []
-    with source.open("rb") as stream, target.open("wb") as out:
-        if stream.read(len(_BAG_MAGIC)) != _BAG_MAGIC:
-            return 0
-        out.write(_BAG_MAGIC + b" " * _BAG_HEADER_BYTES)
-        while (record := _bag_record(stream)) is not None:
-            fields, data = _bag_fields(record[0]), record[1]
-            if fields.get(b"op") == _CONNECTION:
-                connections.setdefault(fields.get(b"conn", b""), record)
-            content = _chunk_content(fields, data) if fields.get(b"op") == _CHUNK else None
-            if content is None:
-                continue
-            entries = _chunk_index(content, connections)
-            at = struct.pack("<Q", out.tell())
-            out.write(_packed(*record))
-            version = {b"ver": struct.pack("<I", 1)}
-            for conn, places in entries.items():
-                head = {b"op": _INDEX, **version, b"conn": conn, b"count": _count_of(places)}
-                out.write(_packed(_bag_header(head), b"".join(places)))
-            times = sorted(
-                (place[:8] for places in entries.values() for place in places), key=struct.Struct("<II").unpack
-            )
-            if times:
-                span = {b"start_time": times[0], b"end_time": times[-1], b"count": _count_of(entries)}
-                counts = b"".join(conn + _count_of(places) for conn, places in entries.items())
-                infos.append(_packed(_bag_header({b"op": _CHUNK_INFO, **version, b"chunk_pos": at, **span}), counts))
-        end = out.tell()
-        out.write(b"".join(_packed(*each) for each in connections.values()) + b"".join(infos))
-        header = _bag_header(
-            {b"op": _INDEX_HEADER, b"index_pos": struct.pack("<Q", end), b"conn_count": _count_of(connections),
-             b"chunk_count": _count_of(infos)}
-        )  # fmt: skip
-        out.seek(len(_BAG_MAGIC))
-        out.write(_packed(header, b" " * (_BAG_HEADER_BYTES - 8 - len(header))))
-    return len(infos)
-
-
-def _bag_record(stream: IO[bytes]) -> tuple[bytes, bytes] | None:
-    """Header and data of the next record; None where it is not whole."""
-    parts = []
-    for most in (_MOST_HEADER, _MOST_CHUNK):
-        size = int.from_bytes(stream.read(4), "little")
-        parts.append(stream.read(size) if size <= most else b"")
-        if len(parts[-1]) < size:
-            return None
-    return (parts[0], parts[1]) if parts[0] else None
-
-
-def _bag_fields(header: bytes) -> dict[bytes, bytes]:
-    found, at = {}, 0
-    while at + 4 <= len(header):
-        size = int.from_bytes(header[at : at + 4], "little")
-        name, _, value = header[at + 4 : at + 4 + size].partition(b"=")
-        found[name] = value
-        at += 4 + size
-    return found
-
-
-def _bag_header(fields: dict[bytes, bytes]) -> bytes:
-    items = [name + b"=" + value for name, value in fields.items()]
-    return b"".join(_count_of(item) + item for item in items)
-
-
-def _packed(header: bytes, data: bytes) -> bytes:
-    return _count_of(header) + header + _count_of(data) + data
-
-
-def _count_of(items: Sized) -> bytes:
-    return len(items).to_bytes(4, "little")
-
-
-def _chunk_content(fields: dict[bytes, bytes], data: bytes) -> bytes | None:
-    """What a chunk holds, unpacked; None where it is damaged."""
-    size = int.from_bytes(fields.get(b"size", b""), "little")
-    compression = fields.get(b"compression", b"none")
-    if size > _MOST_CHUNK or compression not in (b"none", b"bz2", b"lz4"):
-        return None
-    try:
-        if compression == b"bz2":
-            data = bz2.BZ2Decompressor().decompress(data, size)
-        elif compression == b"lz4":
-            import lz4.frame
-
-            data = lz4.frame.LZ4FrameDecompressor().decompress(data, size)
-    except (OSError, EOFError, RuntimeError, ValueError):
-        return None
-    return data if len(data) == size else None
-
-
-def _chunk_index(content: bytes, connections: dict[bytes, tuple[bytes, bytes]]) -> dict[bytes, list[bytes]]:
-    """Time (8 bytes) and place (4) of each message of a chunk, by connection; connections are noted."""
-    found: dict[bytes, list[bytes]] = {}
-    stream = io.BytesIO(content)
-    at = 0
-    while (record := _bag_record(stream)) is not None:
-        fields = _bag_fields(record[0])
-        conn, time = fields.get(b"conn", b""), fields.get(b"time", b"")
-        if fields.get(b"op") == _CONNECTION and len(conn) == 4:
-            connections.setdefault(conn, record)
-        elif fields.get(b"op") == _MESSAGE and conn in connections and len(time) == 8:
-            found.setdefault(conn, []).append(time + at.to_bytes(4, "little"))
-        at = stream.tell()
-    return found
 
 
 class Db3Container(_Bag):

@@ -99,7 +99,21 @@ def test_a_bag_without_its_index_is_read_as_far_as_it_goes(tmp_path: Path, mcap:
     assert 0.4 * len(expected) < len(found) < len(expected)
     assert found == expected[: len(found)]
     assert log.losses.truncated_files == 1
-    assert "whole chunks are read" in " ".join(log.losses.reasons)
+    assert "chunks are read as far as they go" in " ".join(log.losses.reasons)
+
+
+@pytest.mark.parametrize(("compression", "least"), [("", 0.45), ("LZ4", 0.2)])
+def test_the_whole_records_of_a_chunk_that_was_cut_are_read(tmp_path: Path, compression: str, least: float) -> None:
+    mcap = write_run(tmp_path / "run.mcap", scans=200)
+    whole = log_formats.bag1(mcap, tmp_path / "whole.bag", compression=compression)
+    expected = list(map(describe, open_log(whole).events()))
+    path = tmp_path / "cut.bag"
+    path.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])  # in the middle of its only chunk
+    log = open_log(path)
+    found = list(map(describe, log.events()))
+    assert least * len(expected) < len(found) < len(expected)
+    assert found == expected[: len(found)]
+    assert log.losses.data_lost
 
 
 @pytest.mark.parametrize("packed", ["run.mcap.gz", "run.mcap.zst"])

@@ -110,12 +110,13 @@ def ros1_mcap(source: Path, target: Path) -> Path:
     return write(target, items(), source)
 
 
-def bag1(source: Path, target: Path, chunk_bytes: int = 1 << 20) -> Path:
-    """As a ROS 1 bag, compressed."""
-    compressed = Writer1(target)
-    compressed.chunk_threshold = chunk_bytes
-    compressed.set_compression(Writer1.CompressionFormat.LZ4)
-    with AnyReader([source]) as reader, compressed as writer:
+def bag1(source: Path, target: Path, chunk_bytes: int = 1 << 20, compression: str = "LZ4") -> Path:
+    """As a ROS 1 bag, compressed with `LZ4` or `BZ2`, or not."""
+    bag = Writer1(target)
+    bag.chunk_threshold = chunk_bytes
+    if compression:
+        bag.set_compression(Writer1.CompressionFormat[compression])
+    with AnyReader([source]) as reader, bag as writer:
         connections: dict[str, Any] = {}
         for connection, log_time, raw in reader.messages():
             name = connection.msgtype

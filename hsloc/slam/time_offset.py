@@ -47,6 +47,9 @@ _LEAST_TURNED = 1.0
 _LONGEST_HALF_S = 0.5
 """Half of a sweep that is longer (s) is an error of time_increment, not a lidar that turns so slowly."""
 _MIN_STEPS = 20
+_SPARSE_S = 0.25
+"""Time (s) between messages beyond which the odometry is not interpolated: half-way it would miss 8 mrad of a turn that
+starts with 1 rad/s^2, several times the noise of a matched scan, and show an offset that is none."""
 _HUBER = 1.345
 """Scale of the robust weights in standard deviations (Huber 1981): 95 % efficient on Gaussian errors."""
 _LEAST_AGREEMENT = 0.8
@@ -117,10 +120,13 @@ def find_offset(scans: Headings, odometry: Headings, near_s: float = _NEAR_S, st
     """The offset at which steps of the scans' heading agree best with those of the odometry.
 
     Searched within `near_s` of `start_s`: first on a grid, then by robust least squares on the steps, whose residuals
-    give the standard deviation.
+    give the standard deviation. Sparse odometry is compared where it is, with the scans interpolated.
     """
     if len(scans.theta) < _MIN_STEPS or len(odometry.theta) < _MIN_STEPS:
         return UNKNOWN
+    if _is_sparse(odometry, scans):
+        found = find_offset(odometry, scans, near_s, -start_s)
+        return found._replace(seconds=-found.seconds)
     origin = int(odometry.stamps_ns[0])
     t_odom = (odometry.stamps_ns - origin) / NANOSECONDS
     t_scan = (scans.stamps_ns - origin) / NANOSECONDS
@@ -221,8 +227,9 @@ def estimate_offset(
 
 def _best_offset(turns: Headings, odometry: Headings) -> Offset:
     # By steps of half a second and more the rotation stands out of the noise of single scans.
-    near = find_offset(_thinned(turns), odometry)
-    whole = find_offset(_thinned(turns), odometry, near_s=RANGE_S)
+    steps = turns if _is_sparse(odometry, turns) else _thinned(turns)
+    near = find_offset(steps, odometry)
+    whole = find_offset(steps, odometry, near_s=RANGE_S)
     if not isfinite(whole.sigma):
         return near
     limit = 1.2 * _misfit(turns, odometry, whole.seconds)
@@ -236,7 +243,7 @@ def find_drift(scans: Headings, odometry: Headings, offset_s: float) -> float:
 
     The offsets of both halves of the scans are compared, each as far from the other as half of the whole.
     """
-    scans = _thinned(scans)
+    scans = scans if _is_sparse(odometry, scans) else _thinned(scans)
     middle = len(scans.theta) // 2
     halves = [
         find_offset(Headings(scans.stamps_ns[part], scans.theta[part]), odometry, start_s=offset_s)
@@ -262,6 +269,12 @@ def half_sweep_ns(scan: Scan) -> int:
 
 def _headings(pairs: list[tuple[int, float]]) -> Headings:
     return Headings.of(np.array([stamp for stamp, _ in pairs], dtype=np.int64), np.array([theta for _, theta in pairs]))
+
+
+def _is_sparse(headings: Headings, others: Headings) -> bool:
+    """Whether headings are too far apart to be interpolated, and farther than others."""
+    interval_ns, other_ns = (float(np.median(np.diff(each.stamps_ns))) for each in (headings, others))
+    return interval_ns > max(other_ns, _SPARSE_S * NANOSECONDS)
 
 
 def _thinned(headings: Headings, step_s: float = 0.2) -> Headings:

@@ -92,7 +92,8 @@ OPTIONS: tuple[Option, ...] = (
     Option(
         name="resume", flag="--resume", kind="path", metavar="MAP", doors=ONE_RUN,
         help="Earlier mapping run whose map is extended: its folder or map.npz; with submit the id of its job.",
-        http="Id of a job of yours that built a map, which is extended: the new one is in its frame.",
+        http="Id of a job of yours that built a map, which is extended: the new one is in its frame. With mode "
+        "localise the robot is localised on it.",
     ),
     Option(
         name="assert_loop", flag="--assert-loop", kind="topics", metavar="T1,T2", doors=ONE_RUN,

@@ -118,6 +118,15 @@ def test_two_parts_then_an_extended_map_scored_by_relations(
     summary = client.get(f"/v1/jobs/{extended.json()['id']}").json()["summary"]
     assert summary["metrics"]["relations"] == metrics["relations"]
 
+    on_it = {"log": more["log"], "resume": more["resume"], "mode": "localise", "unknown_start": True}
+    localised = client.post("/v1/jobs", json={**on_it, "read": {"end_s": 6.0}})
+    assert localised.status_code == 201, localised.text
+    on_map = ("--mode", "localise", "--map", "map.npz", "--unknown-start", "--end", "6")
+    replay(tmp_path / "drawn", str(OFFICE), *on_map, "--out", str(tmp_path / "localised"))
+    same_bytes(client, localised.json()["id"], tmp_path / "localised")
+    metrics = json.loads((tmp_path / "localised" / "metrics.json").read_text())
+    assert (metrics["run"]["mode"], metrics["run"]["map"]) == ("localise", "map.npz")
+
 
 def test_relations_that_cannot_be_read_are_refused_at_once(make_client: Callable[..., TestClient]) -> None:
     client = make_client(worker_command=REAL, job_memory_bytes=4 << 30)
@@ -179,13 +188,12 @@ def test_what_contradicts_itself_is_refused(client: TestClient) -> None:
     assert "either `log`, or `logs`" in refused(client, 422, log=log, logs=[log, other])
     assert "named twice" in refused(client, 422, logs=[log, log])
     assert "logs" in refused(client, 422, logs=[])
-    assert "leave out one" in refused(client, 422, log=log, resume=job, mode="localise")
     assert "leave out one" in refused(client, 422, log=log, resume=job, map={"yaml": log, "image": other})
     assert "graph mapper" in refused(client, 422, log=log, resume=job, mapper="point")
     again = submit(client, b"ok", resume=job)
-    answer = client.post(f"/v1/jobs/{again}/rerun", json={"mode": "localise"})
+    answer = client.post(f"/v1/jobs/{again}/rerun", json={"mapper": "point"})
     assert (answer.status_code, answer.json()["code"]) == (422, "invalid")
-    assert "leave out one" in answer.json()["message"]
+    assert "graph mapper" in answer.json()["message"]
 
 
 def test_a_text_that_the_database_does_not_take_is_refused(

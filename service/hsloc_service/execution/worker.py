@@ -215,7 +215,7 @@ def make_request(job: Mapping[str, Any], folder: Path) -> RunRequest:
     if job.get("map") is not None:
         values["map"] = linked_map(folder, job["map"], job["map_image"])
     if job.get("resume") is not None:
-        values["resume"] = folder / job["resume"]
+        values["map" if wanted.get("mode") == "localise" else "resume"] = folder / job["resume"]
     return RunRequest.from_values([folder / place for place in job["logs"]], {**values, "bare_names": True})
 
 

@@ -157,7 +157,6 @@ class JobRequest(_Job):  # type: ignore[misc, valid-type]
             "then": {
                 "properties": {
                     "map": {"type": "null"},
-                    "mode": {"enum": ["auto", "slam"]},
                     "mapper": {"enum": ["graph", None]},
                 }
             },
@@ -186,9 +185,9 @@ class JobRequest(_Job):  # type: ignore[misc, valid-type]
             raise PydanticCustomError("logs", "give either `log`, or `logs` for several parts of one run")
         if self.logs is not None and len(set(self.logs)) < len(self.logs):
             raise PydanticCustomError("logs", "logs: a log is named twice; several logs must be parts of one run")
-        if self.resume is not None and (self.map is not None or self.mode == "localise"):
+        if self.resume is not None and self.map is not None:
             raise PydanticCustomError(
-                "resume", "a map is either localised in (`map`) or extended (`resume`); leave out one of them"
+                "resume", "the map is either that of files (`map`) or that of a job (`resume`); leave out one of them"
             )
         if self.resume is not None and self.mapper == "point":
             raise PydanticCustomError("resume", "a map is extended by the graph mapper; leave out `resume` or `mapper`")

@@ -152,7 +152,7 @@ async function reusable() {
   const built = jobs.filter((job) => job.summary?.mode === "slam" && job.request.mapper !== "point" && job.request.config?.mapper !== "point");
   fill($("stored"), "none", logs);
   fill($("stored-map"), "none", maps);
-  fill($("resume"), "none: begin a new one", built.map((job) => [job.id, `${job.log}, ${when(job.created)}`]));
+  fill($("resume"), "none", built.map((job) => [job.id, `${job.log}, ${when(job.created)}`]));
 }
 
 function fill(box, none, entries) {

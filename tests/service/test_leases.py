@@ -167,14 +167,6 @@ def test_a_tenant_with_many_jobs_does_not_hold_up_another(parts: Parts) -> None:
     assert order == [many[0], single, many[1]]
 
 
-def test_the_journal_is_durable(tmp_path: Path) -> None:
-    parts = Parts(tmp_path)
-    with parts.database.read() as session:
-        connection = session.connection()
-        assert connection.exec_driver_sql("PRAGMA journal_mode").scalar_one() == "wal"
-        assert connection.exec_driver_sql("PRAGMA synchronous").scalar_one() == 2
-
-
 def test_tenants_take_turns_in_a_single_slot(parts: Parts) -> None:
     """Where nothing runs between two claims, who was served longest ago comes first."""
     many = [parts.submit() for _ in range(4)]
@@ -302,14 +294,6 @@ def test_a_job_with_a_tag_waits_for_a_worker_that_has_it(parts: Parts) -> None:
     tagged = replace(leases, tags=("big-memory",))
     claims = [leases.claim("folder:a"), leases.claim("folder:a"), tagged.claim("folder:b")]
     assert [claim and claim.job_id for claim in claims] == [small, None, large]
-
-
-def test_one_housekeeper_at_a_time(parts: Parts) -> None:
-    with parts.database.elected("housekeeping") as first, parts.database.elected("housekeeping") as second:
-        assert first
-        assert second is not parts.database.shared
-    with parts.database.elected("housekeeping") as again:
-        assert again
 
 
 def test_a_text_that_postgresql_does_not_take(parts: Parts) -> None:

@@ -194,6 +194,25 @@ def test_what_is_asked_again_and_again_does_not_read_all_jobs(tmp_path: Path) ->
     storage.close()
 
 
+def test_the_journal_is_durable(tmp_path: Path) -> None:
+    base = Database(tmp_path / "hsloc.db")
+    with base.read() as session:
+        connection = session.connection()
+        assert connection.exec_driver_sql("PRAGMA journal_mode").scalar_one() == "wal"
+        assert connection.exec_driver_sql("PRAGMA synchronous").scalar_one() == 2
+    base.close()
+
+
+def test_one_housekeeper_at_a_time(tmp_path: Path, database_url: str) -> None:
+    base = Database(database_url or tmp_path / "hsloc.db")
+    with base.elected("housekeeping") as first, base.elected("housekeeping") as second:
+        assert first
+        assert second is not base.shared
+    with base.elected("housekeeping") as again:
+        assert again
+    base.close()
+
+
 def test_a_migration_that_fails_leaves_the_old_database(old: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = columns(old, "job")
     monkeypatch.setitem(migrations.STEPS, 1, (*migrations.STEPS[1], "ALTER TABLE absent ADD COLUMN x"))

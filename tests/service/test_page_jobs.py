@@ -75,6 +75,7 @@ def test_several_logs_are_several_jobs_or_one_and_the_table_finds_them(
     page.select_option("#filter", "state=failed")
     page.wait_for_function("() => document.querySelector('#page-text').textContent === 'no such job'")
     page.click("nav >> text=Uploads")
+    page.wait_for_function(r"() => /^They take .* of .*\.$/.test(document.querySelector('#quota').textContent)")
     page.wait_for_function("() => document.querySelectorAll('#file-table tbody tr').length === 3")
     need_accessible(page)
     page.click("#file-table button >> nth=0")  # used again, without an upload
@@ -185,7 +186,7 @@ SPARSE = """() => {
 # A robot that drove 3 m along x of the place in which it was searched for, with a jump after the first pose.
 PLACES = """async () => {
   const root = document.createElement("div"), charts = document.createElement("div"), found = [];
-  root.style.width = "600px"; document.body.replaceChildren(root, charts);
+  root.style.width = "600px"; document.body.append(root, charts);  // the page goes on
   const t = [0, 1, 2, 3, 4], x = [9, 1, 2, 3, 4], y = [9, 0, 0, 0, 0], theta = [0, 0, 0, 0, 0];
   const trajectory = { t, x, y, theta, breaks: [1], state: [0, 0, 0, 0, 0], states: ["ambiguous"] };
   const place = { begin: 0, end: 4, at: 4, x: [4, 7], y: [0, 5], theta: [0, Math.PI / 2], p: [0.5, 0.5],

@@ -129,6 +129,9 @@ def test_pages_of_uploads(client: TestClient) -> None:
     rest = client.get("/v1/files", params={"limit": 3, "before": first["next"]}).json()
     assert [each["id"] for each in first["files"] + rest["files"]] == files[::-1]
     assert rest["next"] is None
+    info = client.get("/v1/info").json()
+    assert (info["upload_bytes"], info["result_bytes"]) == (5, 0)
+    assert info["quota_bytes"] > 1 << 30
     assert client.get("/v1/files", params={"before": str(uuid.uuid4())}).status_code == 404
 
 

@@ -343,6 +343,9 @@ class Info(BaseModel):
     queued: int
     max_upload_bytes: int
     free_bytes: int
+    upload_bytes: int = Field(description="what your uploads take")
+    result_bytes: int = Field(description="what the results of your jobs take")
+    quota_bytes: int = Field(description="what both may take together")
 
 
 class Options(BaseModel):

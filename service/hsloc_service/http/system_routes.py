@@ -32,6 +32,7 @@ from hsloc_service.http.schemas import (
     known_moment,
 )
 from hsloc_service.jobs.workers import alive_workers, workers
+from hsloc_service.uploads.repository import used_bytes
 from hsloc_service.webhooks import secret_of
 
 if TYPE_CHECKING:
@@ -129,6 +130,7 @@ def info(ctx: Ctx, who: Reader) -> Info:
         queued = session.scalar(
             select(func.count()).select_from(JobRow).where(JobRow.state == "queued", JobRow.tenant == who.tenant)
         )
+        uploads, results = used_bytes(session, who)
     return Info(
         version=__version__,
         tenant=who.tenant,
@@ -138,6 +140,9 @@ def info(ctx: Ctx, who: Reader) -> Info:
         queued=queued or 0,
         max_upload_bytes=ctx.settings.max_upload_bytes,
         free_bytes=ctx.storage.free_bytes(),
+        upload_bytes=uploads,
+        result_bytes=results,
+        quota_bytes=ctx.settings.tenant_bytes,
     )
 
 

@@ -162,8 +162,8 @@ class Files:
         self.storage.upload_path(file_id).unlink(missing_ok=True)
 
 
-def need_quota(session: Session, who: Principal, most: int, size: int = 0) -> None:
-    """Raises ServiceError 507 where uploads, as received or announced, and results of a tenant take too much.
+def used_bytes(session: Session, who: Principal) -> tuple[int, int]:
+    """What uploads, as received or announced, and results of a tenant take.
 
     Results count wherever they are stored, by their manifest.
     """
@@ -171,6 +171,12 @@ def need_quota(session: Session, who: Principal, most: int, size: int = 0) -> No
     announced = case((FileRow.received > size_or_none, FileRow.received), else_=size_or_none)
     uploads = session.scalar(select(func.coalesce(func.sum(announced), 0)).where(FileRow.tenant == who.tenant)) or 0
     results = session.scalar(select(func.coalesce(func.sum(JobRow.bytes), 0)).where(JobRow.tenant == who.tenant)) or 0
+    return int(uploads), int(results)
+
+
+def need_quota(session: Session, who: Principal, most: int, size: int = 0) -> None:
+    """Raises ServiceError 507 where uploads and results of a tenant take too much."""
+    uploads, results = used_bytes(session, who)
     if uploads + results + size > most:
         raise no_space(f"your uploads take {uploads} and your results {results} of {most} bytes; delete some")
 

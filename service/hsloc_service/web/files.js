@@ -20,7 +20,8 @@ function row(file, useAgain) {
 }
 
 export async function show(useAgain, more = false) {
-  const found = await get(`/v1/files?limit=50${more && next ? `&before=${next}` : ""}`);
+  const found = await get(`/v1/files?limit=50${more && next ? `&before=${next}` : ""}`), info = await get("/v1/info");
+  $("quota").textContent = `They take ${bytes(info.upload_bytes)} and the results of your jobs ${bytes(info.result_bytes)}, of ${bytes(info.quota_bytes)}.`;
   shown = more ? [...shown, ...found.files] : found.files;
   next = found.next;
   $("file-table").tBodies[0].replaceChildren(...shown.map((file) => row(file, useAgain)));

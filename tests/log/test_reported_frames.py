@@ -117,6 +117,20 @@ def test_places_that_are_stated_on_tf_again_and_again_are_named(tmp_path: Path, 
     assert "--laser-pose" in str(warning)
 
 
+def test_poses_are_offered_as_the_odometry_where_there_is_no_other(tmp_path: Path) -> None:
+    path = tmp_path / "poses.mcap"
+    with LogWriter(path) as log:
+        for number in range(5):
+            log.pose_with_covariance(START + number * SECOND, Pose2(0.0, 0.0, 0.0), topic="/amcl_pose", frame_id="map")
+            log.pose_with_covariance(
+                START + number * SECOND, Pose2(0.1, 0.0, 0.0), topic="/robot_pose", frame_id="odom"
+            )
+            log.scan(make_scan(START + number * SECOND))
+    with pytest.raises(TopicError, match="--odom-topic /robot_pose"):
+        open_log(path)
+    assert open_log(path, ReadOptions(odom_topic="/robot_pose")).summary.odom_topic == "/robot_pose"
+
+
 @pytest.mark.parametrize("name", ["/robot1/tf", "tf"])
 def test_transforms_of_any_name_may_be_chosen_as_the_odometry(tmp_path: Path, name: str) -> None:
     path = write_robot(tmp_path / "a.mcap", "/robot1", odom="world", topic=False)

@@ -268,6 +268,10 @@ def _remedy_of_several(kind: str, flag: str, candidates: Sequence[str], channels
     return f"{remedy}, or take all with {flag} {','.join(candidates[:_LISTED])}"
 
 
+_NO_ODOMETRY = ("initialpose", "amcl_pose", "goal_pose", "goal")
+"""Last names of topics whose poses are stated by hand, or jump as a localiser does."""
+
+
 def _remedy_of_none(kind: str, channels: Sequence[Channel], options: ReadOptions) -> str:
     unread = sorted({encoding for c in channels if (encoding := _unread_encoding(c))})
     if unread:
@@ -286,6 +290,9 @@ def _remedy_of_none(kind: str, channels: Sequence[Channel], options: ReadOptions
     moving = sorted({c.topic for c in channels if is_transform_topic(c) and not is_static_topic(c.topic)})
     if moving:
         remedy += f"; or it is in the transforms: --odom-topic {moving[0]}"
+    poses = [t for t in of_type(channels, *POSE_TYPES[1:]) if t.rpartition("/")[2] not in _NO_ODOMETRY]
+    if poses:
+        remedy += f"; or it is the poses of --odom-topic {poses[0]}"
     for other in ODOMETRY_KINDS:
         if other.missing(options) and (topics := of_type(channels, other.typename)):
             remedy += f"; or it is made of {topics[0]} with {other.missing(options)}"

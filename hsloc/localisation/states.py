@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.joined_tracks import joined_begins
 from hsloc.localisation.kalman_filter import predict_covariance
-from hsloc.localisation.track_evidence import TrackRow, smooth, usual_explained
+from hsloc.localisation.track_evidence import CONFIDENCE, States, TrackRow, smooth, usual_explained
 from hsloc.model.estimate import Ambiguity, Evidence, LikelyPlace, State, Status
 from hsloc.model.pose2 import Pose2
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
@@ -20,13 +21,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.localisation.motion_models import MotionModel
     from hsloc.model.estimate import Estimate
 
     F64 = NDArray[np.float64]
+    from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.model.trajectory import Trajectory
 
-CONFIDENCE = 0.9
-"""Least probability that the track is right for a pose to be called localised."""
 MAX_SIGMA = 0.1
 """Largest standard deviation of a localised pose in any direction (m): 2.5 of them are 0.25 m."""
 MAX_SIGMA_ANGLE = np.radians(2.0)
@@ -39,6 +40,7 @@ _SETTLED = 5
 """Matches after which the covariance no longer knows how a track began."""
 _NAMED = 3
 """Places that are named where several fit."""
+_CONTRADICTED = "scans fit, but by the odometry other stretches of the run are elsewhere"
 USABLE_SHARE = 0.5
 """Least share of localised poses of a result that is usable as a whole."""
 TOLERATED_SHARE = 0.01
@@ -139,6 +141,7 @@ class StateLog:
     def __init__(self) -> None:
         self._estimates: list[Estimate] = []
         self._counts: list[int] = []
+        self._begins: tuple[States, ...] | None = None
 
     def add(self, estimate: Estimate, odometry_count: int) -> None:
         """Take the estimate at a scan and the number of odometry messages before; one without evidence is skipped."""
@@ -153,6 +156,14 @@ class StateLog:
     def scanned(self) -> tuple[int, int]:
         """Numbers of odometry messages before the first scan and before the last."""
         return (self._counts[0], self._counts[-1]) if self._counts else (0, 0)
+
+    def join_tracks(self, odometry: F64, model: MotionModel, grid: OccupancyGrid) -> None:
+        """Weigh the tracks of the run against each other by the odometry (n, 3) between them and the map."""
+        rows, owners = self._tracks()
+        count = sum(row.begins for row in rows)
+        if len(odometry) == 0 or count == 0 or (count == 1 and self._estimates[-1].status is not Status.SEARCHING):
+            return
+        self._begins = joined_begins((self._estimates, self._counts, owners), rows, odometry, model, grid)
 
     def at_odometry(self, n: int, smoothed: Mapping[int, F64] | None = None, between: F64 | float = 0.0) -> StateRows:
         """The states at the n odometry messages: each lies between two scans, and is no surer than either.
@@ -184,7 +195,8 @@ class StateLog:
     def at_scans(self, smoothed: Mapping[int, F64] | None = None) -> StateRows:
         """The states at the scans that were added; `smoothed` as for `at_odometry`."""
         rows, owners = self._tracks()
-        probabilities = smooth(rows)
+        probabilities = smooth(rows, self._begins)
+        own = probabilities if self._begins is None else smooth(rows)
         usual = usual_explained(rows)
         sigma = self._sigma(owners, smoothed or {})
         states: list[State] = []
@@ -198,6 +210,8 @@ class StateLog:
                 continue
             probability[k] = probabilities[owner, 0]
             state, reason = _judge(probabilities[owner], sigma[k], usual, rows[: owner + 1])
+            if probability[k] < CONFIDENCE <= own[owner, 0]:
+                state, reason = State.LOST, _CONTRADICTED
             states.append(state)
             reasons.append(reason or estimate.reason)
         fitness = np.array([np.nan if e.fitness is None else e.fitness for e in self._estimates])
@@ -206,7 +220,7 @@ class StateLog:
     def ambiguities(self) -> tuple[Ambiguity, ...]:
         """The stretches of the scans that are ambiguous, with the places between which they do not decide."""
         rows, owners = self._tracks()
-        probabilities = smooth(rows)
+        probabilities = smooth(rows, self._begins)
         several = [
             estimate.state is State.AMBIGUOUS if owner < 0 else _is_ambiguous(probabilities[owner])
             for estimate, owner in zip(self._estimates, owners, strict=True)

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 States = tuple[float, float, float]
 """A number for each state: right, alike, astray."""
 
+CONFIDENCE = 0.9
+"""Least probability that the track is right for a pose to be called localised."""
 PRIOR_RIGHT, _PRIOR_ALIKE, _PRIOR_ASTRAY = 0.98, 0.01, 0.01
 """Probabilities of the states where a track begins: with a given start, or where the relocaliser was sure."""
 PRIOR: States = (PRIOR_RIGHT, _PRIOR_ALIKE, _PRIOR_ASTRAY)
@@ -196,24 +198,43 @@ class TrackFilter:
         return self.states
 
 
-def smooth(rows: Sequence[TrackRow]) -> F64:
-    """The probabilities of right, alike and astray at each row, shape (n, 3), given all rows."""
-    n = len(rows)
+def smooth(rows: Sequence[TrackRow], begins: Sequence[States] | None = None) -> F64:
+    """The probabilities of right, alike and astray at each row, shape (n, 3), given all rows.
+
+    `begins` are those with which each track begins, its own scans left aside; by default `PRIOR` for each.
+    """
+    likelihoods, backward = _looked_back(rows)
+    probabilities = np.zeros((len(rows), 3))
+    states, tracks = PRIOR, 0
+    for k, row in enumerate(rows):
+        if k == 0 or row.begins:
+            states = PRIOR if begins is None else begins[tracks]
+            tracks += 1
+        else:
+            states = row.moved_on(states)
+        states = _product(states, likelihoods[k])
+        probabilities[k] = _product(states, backward[k])
+    return probabilities
+
+
+def entry_likelihoods(rows: Sequence[TrackRow]) -> list[States]:
+    """Of the evidence of each track, if it begins right, in a look-alike or astray; up to a common factor."""
+    likelihoods, backward = _looked_back(rows)
+    starts = [k for k, row in enumerate(rows) if k == 0 or row.begins]
+    return [_product(likelihoods[k], backward[k]) for k in starts]
+
+
+def _looked_back(rows: Sequence[TrackRow]) -> tuple[list[States], list[States]]:
+    """The likelihoods of each row, and of all that follows it in its track."""
     usual = usual_explained(rows)
     likelihoods = [row.likelihoods(usual) for row in rows]
-    backward: list[States] = [(1.0, 1.0, 1.0)] * n
-    for k in range(n - 2, -1, -1):
+    backward: list[States] = [(1.0, 1.0, 1.0)] * len(rows)
+    for k in range(len(rows) - 2, -1, -1):
         following = rows[k + 1]
         if not following.begins:
             after = _product(likelihoods[k + 1], backward[k + 1])
             backward[k] = _product(following.looked_back(after), (1.0, 1.0, 1.0))
-    probabilities = np.zeros((n, 3))
-    states = PRIOR
-    for k, row in enumerate(rows):
-        before = PRIOR if k == 0 or row.begins else row.moved_on(states)
-        states = _product(before, likelihoods[k])
-        probabilities[k] = _product(states, backward[k])
-    return probabilities
+    return likelihoods, backward
 
 
 def usual_explained(rows: Sequence[TrackRow]) -> float:

@@ -269,7 +269,7 @@ def _run_with(
     trajectory, localised = history.trajectory() if mapping is None else history.mapped(mapping)
     scale = None if localiser is None else localiser.map_scale
     mounting = history.mounting_error() if localise else None
-    states = history.states(scale, mounting) if localise else None
+    states = history.states(scale, mounting, grid) if localise else None
     tracked = localised
     if states is not None:
         localised = states.is_localised()

@@ -15,6 +15,7 @@ from hsloc.localisation.kalman_filter import (
     predict_covariance,
     smooth_matches,
 )
+from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.localisation.mounting_error import mounting_error
 from hsloc.localisation.states import StateLog, with_odometry_alone, with_pose_errors
 from hsloc.model.estimate import ScanDiagnostics, State, Status
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from hsloc.localisation.states import StateRows
     from hsloc.model.certificate import Certificate
     from hsloc.model.estimate import Ambiguity, Estimate
+    from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.slam.result import MappingResult
 
     F64 = NDArray[np.float64]
@@ -184,14 +186,22 @@ class RunHistory:
             self._smoothed = smooth_matches(self._anchors, self._motion_model)
         return self._smoothed
 
-    def states(self, scale: MapScale | None = None, mounting: MountingError | None = None) -> StateRows | None:
+    def states(
+        self,
+        scale: MapScale | None = None,
+        mounting: MountingError | None = None,
+        grid: OccupancyGrid | None = None,
+    ) -> StateRows | None:
         """The state of each pose of the trajectory in hindsight; None for an estimator that weighs no evidence.
 
+        With the map, `grid`, the tracks of the run are weighed against each other by the odometry between them.
         Where the map has another `scale` than the lidar, or the laser another `mounting` than stated, poses are as
         uncertain as that makes them.
         """
         if len(self._states) == 0:
             return None
+        if grid is not None:
+            self._states.join_tracks(self.odometry().poses, self._motion_model or OdometryNoise(), grid)
         smoothed = self._smooth()
         covariances = dict(zip(self._anchor_states, smoothed.covariances, strict=True))
         between = bridge_variances(self.odometry().poses, self._anchors, smoothed.motion)

@@ -1,0 +1,397 @@
+"""Which of the tracks of a run are right: tracks that the odometry does not join exclude each other.
+
+A track begins where the relocaliser was sure and ends where the robot was lost. Each is judged by its own scans in
+`track_evidence`; but half a building often fits where the other half is not mapped, however long the robot drives
+there, and no scan contradicts that. The odometry does: from a track that is right it leads to the next one, as far as
+its errors allow. Two tracks that it does not join are both right only if somebody carried the robot, which is rare.
+Where it leads off the mapped ground, a place that fits elsewhere on the map is a look-alike of one that is not mapped;
+in such places more beams end in free space or behind walls. And where it leads over mapped ground, the robot should
+have been found there.
+
+All subsets of right tracks are weighed: each track by its own evidence, neighbours in the subset by the odometry
+between them, the others as wrong. The sum over all subsets is one over paths through the tracks in their order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import ceil, exp, hypot, log, pi
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from hsloc.localisation.track_evidence import NOT_UNIQUE
+from hsloc.model.pose2 import Pose2, compose_poses, rotated, wrap_angle, wrap_angles
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from hsloc.localisation.motion_models import MotionModel
+    from hsloc.model.estimate import Evidence
+    from hsloc.model.occupancy_grid import OccupancyGrid
+
+    F64 = NDArray[np.float64]
+    Bools = NDArray[np.bool_]
+
+_MOST_BENT = 2.0
+"""Variance of a heading (rad^2) up to which it bends what is known of a place: beyond it the place may be anywhere."""
+_KIDNAPPED = 1e-2
+"""Probability that somebody carried the robot while it was lost. Assumed: a claim that others contradict needs 100
+times the evidence."""
+_SLIPPED = 0.1
+"""Probability that wheels slipped by more than the noise, once while it was lost."""
+_SLIP = np.diag((0.5**2, 0.5**2, 0.35**2))
+"""Covariance of such a slip: half a metre, as the window that is searched after a refused match, and 20 deg."""
+_DISTORTION = np.diag((0.3**2, 0.3**2, 0.05**2))
+"""Covariance of two places of a map, one by the other: a built map bends."""
+_GIVEN_ALIKE = 0.1
+"""A given start is this much less likely to be in a look-alike of the right place than one that was searched for."""
+_MOST_SUPPORT = 10.0
+"""Ratio by which a track supports another one that odometry joins to it, at most: both may be look-alikes of one
+stretch that is not mapped."""
+_LOOK_ALIKE = 0.1
+"""Probability that a place is claimed where the robot is on ground that is not mapped: nearly 1 in simulated halls of
+which half is mapped, nearly 0 in rooms, corridors and on maps of parts of Intel, Freiburg and ACES; one for all."""
+_FEW_SHORT, _CROWDED, _WIDELY = 0.02, 0.3, 0.6
+"""Share of beams that end before a wall at right places: the first on the mean, but in a part of the runs, the second,
+among people or furniture that moved, anything up to the third; in look-alikes anything up to it. On maps of parts of
+these logs and on simulated half maps (seeds 1 to 6) it was 0 to 0.04 in right tracks, 0.04 to 0.4 in wrong ones."""
+_FEW_THROUGH, _MANY_THROUGH, _HIDDEN = 0.012, 0.06, 0.3
+"""Mean share of beams that end behind a wall at right places (0 to 0.03, also where 30 % of the map has changed), and
+at look-alikes (0 to 0.15) but for a part of them, the third, that have the same walls."""
+_MOST_MISFITS = 30.0
+"""Most that both count."""
+_OTHER_MAP = 3e-2
+"""Probability that the map is of another building, or mirrored. Assumed: a few of a hundred maps that are given."""
+_RIVALLED, _MOST_RIVALLED = 3.0, 30.0
+"""Ratio of the probabilities, on another map and on the right one, that a comparison leaves another place as good: of
+230 scans of another building 88 % had one within 0.85, of 231 right ones 20 to 40 %; and the most that several count,
+which see the same map."""
+_STEP, _STEP_ANGLE = 0.2, 0.2
+"""Motions (m, rad) whose errors are taken for independent."""
+_FOUND_AFTER_M, _LOST_M, _MOST_FROM_LOST = 6.0, 5.0, 6.0
+"""A robot on mapped ground is found again within the first (m); each further stretch of the second (m) counts 1, up to
+the third in all."""
+_SCALE, _TURN_SCALE, _DRIFT = 0.03, 0.04, 0.01
+"""Standard deviations of the scale of the odometry, of that of its turns, and of its drift in heading (rad/m): those of
+wheels that are not calibrated, as in benchmarks/calibration.py."""
+_DRIFT_OVER_M, _DRIFT_KNOWN = 5.0, 2
+"""The drift is measured over stretches of the first (m); the assumption weighs like the second of them."""
+_NEAR_BORDER, _FARTHEST_BORDER = 0.5, 5.0
+"""The odometry leaves the mapped ground where nothing is mapped beside it within the first (m) and two standard
+deviations, the second at most; anywhere else it leads through a wall."""
+_VAGUE = 3.0
+"""Standard deviation (m) from which on it is not known whether the odometry leads over mapped ground."""
+_LEAST_NOISE = 0.25
+"""Least variance of the odometry's noise by the assumed one."""
+_LOOKED_AT = 6
+"""Places of a search at which it is asked how well its way is known."""
+_HORIZON = 12
+"""Tracks between two right ones of which the odometry says anything, at most."""
+
+
+class Errors(NamedTuple):
+    """Of the odometry: the variances of its noise by the assumed ones, and the drift of its heading (rad/m)."""
+
+    scale: float
+    drift: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Way:
+    """The odometry of a run, and what its errors add up to.
+
+    `poses` (n, 3) are T_odom_base. `noise` (n, 3, 3) sums the covariances of the motions so far, each moved to the
+    origin of the odometry's frame, so that the sum between two poses is the difference of two rows. `bias` (n, 3, 3)
+    are the errors (rows) at a pose, moved to the origin likewise, of wheels that differ, of a scale and of a scale of
+    turns, each by 1.
+    """
+
+    poses: F64
+    noise: F64
+    bias: F64
+
+    @staticmethod
+    def of(poses: F64, model: MotionModel) -> Way:
+        """Of odometry poses (n, 3)."""
+        noise = np.zeros((len(poses), 3, 3))
+        total = np.zeros((3, 3))
+        last, first = Pose2.from_array(poses[0]), 0
+        for k, (x, y, theta) in enumerate(poses.tolist()):
+            if hypot(x - last.x, y - last.y) < _STEP and abs(wrap_angle(theta - last.theta)) < _STEP_ANGLE:
+                continue
+            here = Pose2(x, y, theta)
+            noise[first:k] = total
+            reach = _shift(-here.x, -here.y)
+            total = total + reach @ rotated(model.covariance(last.between(here)), last.theta) @ reach.T
+            last, first = here, k
+        noise[first:] = total
+        steps = np.diff(poses, axis=0)
+        metres, turns = np.hypot(steps[:, 0], steps[:, 1]), wrap_angles(steps[:, 2])
+        middle = 0.5 * (poses[1:, :2] + poses[:-1, :2])
+        bias = np.zeros((len(poses), 3, 3))
+        for kind, part in ((0, metres), (2, turns)):
+            bias[1:, kind] = np.cumsum(np.column_stack((part * middle[:, 1], -part * middle[:, 0], part)), axis=0)
+        # A translation by itself does not turn anything: its error is moved to the origin as it is.
+        bias[1:, 1, :2] = np.cumsum(steps[:, :2], axis=0)
+        return Way(poses, noise, bias)
+
+    def metres(self, messages: NDArray[np.int64]) -> F64:
+        """Path length up to the messages (m)."""
+        result: F64 = self.bias[messages, 0, 2]
+        return result
+
+    def between(self, a: int, b: int, errors: Errors) -> F64:
+        """Covariance (3, 3) of pose b by pose a, along the axes of the odometry's frame."""
+        a, b = min(a, b), max(a, b)
+        shift = _shift(*self.poses[b, :2])
+        bias = (self.bias[b] - self.bias[a]) @ shift.T * np.array(((errors.drift,), (_SCALE,), (_TURN_SCALE,)))
+        result: F64 = shift @ (errors.scale * (self.noise[b] - self.noise[a])) @ shift.T + bias.T @ bias
+        return result
+
+    def known(self, a: int, b: int, errors: Errors) -> float:
+        """How much may be said of where the odometry leads from one message to another, in [0, 1]."""
+        variance = float(np.trace(self.between(a, b, errors)[:2, :2]))
+        return 1.0 / (1.0 + variance / _VAGUE**2)
+
+    def led_to(self, T_map_base: Pose2, a: int, others: NDArray[np.int64]) -> F64:
+        """Poses (m, 3) in the map at the messages `others` by the odometry from `T_map_base` at message a."""
+        T_map_odom = T_map_base @ Pose2.from_array(self.poses[a]).inverse()
+        return compose_poses(T_map_odom.to_array(), self.poses[others])
+
+
+def _shift(x: float, y: float) -> F64:
+    """How an error of x, y and heading at the origin moves a point at x, y (3, 3)."""
+    return np.array(((1.0, 0.0, -y), (0.0, 1.0, x), (0.0, 0.0, 1.0)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """A track: where it is sure for the first and for the last time, and what its own scans say.
+
+    `enters` and `leaves` are indices of odometry messages with the poses T_map_base there, `messages` those of its
+    scans, `headings` the headings in the map there. `alike` and `astray` are the likelihoods of its evidence if it
+    began there by the one if it began right. `lost` are the messages of the scans of the search after it. `is_found`
+    says that a search led to it, and no given start. `said` is the evidence of the scans that were matched until it
+    leaves. `noise_scale` is that of the odometry's variances.
+    """
+
+    enters: int
+    entry: Pose2
+    leaves: int
+    exit: Pose2
+    messages: NDArray[np.int64]
+    headings: F64
+    alike: float
+    astray: float
+    lost: NDArray[np.int64]
+    is_found: bool
+    said: tuple[Evidence, ...] = ()
+    noise_scale: float = 1.0
+
+    def wrong(self, priors: tuple[float, float, float]) -> float:
+        """Weight of the track if it does not begin right: in a look-alike or astray."""
+        alike = priors[1] if self.is_found else _GIVEN_ALIKE * priors[1]
+        return alike * self.alike + priors[2] * self.astray
+
+    def look_alike(self) -> float:
+        """Likelihood of its beams in a look-alike by that at the right place, times the probability of a claim."""
+        short = float(np.mean([each.short for each in self.said])) if self.said else 0.0
+        through = float(np.mean([each.through for each in self.said])) if self.said else 0.0
+        right = (1.0 - _CROWDED) * exp(-short / _FEW_SHORT) / _FEW_SHORT + _CROWDED / _WIDELY
+        behind = exp(through / _FEW_THROUGH - through / _MANY_THROUGH) * _FEW_THROUGH / _MANY_THROUGH
+        ratio = (_HIDDEN + (1.0 - _HIDDEN) * behind) / (_WIDELY * right)
+        return _LOOK_ALIKE * min(ratio, _MOST_MISFITS)
+
+    def on_another_map(self) -> float:
+        """The same on a map of another building, where comparisons more often find a place that fits as well."""
+        rivalled = sum(each.rival > NOT_UNIQUE for each in self.said)
+        return self.look_alike() * min(_RIVALLED**rivalled, _MOST_RIVALLED)
+
+
+class MappedGround:
+    """Where a map knows something, and where one gets from there to what it does not know."""
+
+    def __init__(self, grid: OccupancyGrid) -> None:
+        self._known = grid.cells >= 0
+        self._free = grid.free()
+        self._inverse = grid.origin.inverse()
+        self._resolution = grid.resolution
+        self.volume = 2.0 * pi * float(self._free.sum()) * grid.resolution**2
+        """Of all poses on free ground (m^2 rad)."""
+
+    def holds(self, points: F64) -> Bools:
+        """Which of the points (n, 2) in the map lie on known cells."""
+        cells = self._cells(points)
+        height, width = self._known.shape
+        inside = (cells >= 0).all(axis=1) & (cells < (width, height)).all(axis=1)
+        result = np.zeros(len(points), dtype=np.bool_)
+        result[inside] = self._known[cells[inside, 1], cells[inside, 0]]
+        return result
+
+    def is_open(self, point: F64, within: float) -> bool:
+        """Whether free ground borders on what is unknown, or on the edge of the map, near a point (2,)."""
+        (u, v), reach = self._cells(point[None])[0].tolist(), ceil(within / self._resolution)
+        height, width = self._known.shape
+        if not (-reach <= u < width + reach and -reach <= v < height + reach):
+            return False
+        rows, columns = slice(max(v - reach, 0), v + reach + 1), slice(max(u - reach, 0), u + reach + 1)
+        unknown = np.pad(~self._known[rows, columns], 1)
+        # The edge of the map is as good as unknown, that of the part that is looked at is not.
+        unknown[0], unknown[-1] = v - reach <= 0, v + reach >= height - 1
+        unknown[:, 0] |= u - reach <= 0
+        unknown[:, -1] |= u + reach >= width - 1
+        beside = unknown[:-2, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :-2] | unknown[1:-1, 2:]
+        return bool((self._free[rows, columns] & beside).any())
+
+    def _cells(self, points: F64) -> NDArray[np.int64]:
+        cells: NDArray[np.int64] = np.floor((self._inverse @ points) / self._resolution).astype(np.int64)
+        return cells
+
+
+def _left_open(way: Way, start: tuple[int, Pose2], last: int, ground: MappedGround, errors: Errors) -> Bools:
+    """Where the odometry from a message and its pose to another message has left the mapped ground, not through walls.
+
+    One for each message on the way, the first included; before the first message they are in reverse order.
+    """
+    first, pose = start
+    messages = np.arange(first, last + 1) if last >= first else np.arange(first, last - 1, -1)
+    poses = way.led_to(pose, first, messages)
+    known = ground.holds(poses[:, :2])
+    leaves = np.flatnonzero(known[:-1] & ~known[1:])
+    result = np.zeros(len(known), dtype=np.bool_)
+    result[: leaves[0] if len(leaves) else len(known)] = True
+    for k, end in pairwise([*leaves.tolist(), len(known)]):
+        spread = way.between(first, int(messages[k]), errors)
+        within = _NEAR_BORDER + 2.0 * float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1]))
+        result[k:end] = ground.is_open(poses[k, :2], min(within, _FARTHEST_BORDER))
+    return result & ~known
+
+
+def right_tracks(tracks: Sequence[Track], way: Way, ground: MappedGround, priors: tuple[float, float, float]) -> F64:
+    """The probability that each of the n tracks begins right, shape (n,), given all of them.
+
+    `priors` are those of right, alike and astray where a track begins.
+    """
+    n = len(tracks)
+    pairs = _Pairs.of(tracks, way, ground)
+    own = np.array([each.wrong(priors) for each in tracks])
+    look_alike = np.array([each.look_alike() if each.is_found else 0.0 for each in tracks])
+    # Log weight of a step from one right track to the next, row and column 0 and n + 1 for none before and none after:
+    # of the tracks between, which are wrong, and of the next one.
+    wrong = np.concatenate(((0.0,), np.cumsum(np.log(own))))
+    step = np.full((n + 2, n + 2), -np.inf)
+    for i in range(-1, n):
+        for j in range(i + 1, n + 1):
+            if j - i - 1 > _HORIZON:
+                step[i + 1, j + 1] = wrong[j] - wrong[i + 1]
+            else:
+                step[i + 1, j + 1] = pairs.between(i, j, own, look_alike)
+            step[i + 1, j + 1] += log(priors[0]) if j < n else 0.0
+    forward, backward = np.full(n + 2, -np.inf), np.full(n + 2, -np.inf)
+    forward[0] = backward[n + 1] = 0.0
+    for j in range(1, n + 2):
+        forward[j] = np.logaddexp.reduce(forward[:j] + step[:j, j])
+    for i in range(n, -1, -1):
+        backward[i] = np.logaddexp.reduce(backward[i + 1 :] + step[i, i + 1 :])
+    other_map = log(_OTHER_MAP) + sum(log(each.on_another_map()) for each in tracks)
+    total = np.logaddexp(forward[n + 1], other_map)
+    result: F64 = np.exp(np.minimum(forward[1:-1] + backward[1:-1] - total, 0.0))
+    return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pairs:
+    """What the odometry says of pairs of n tracks, each (n, n), the first of a pair being right.
+
+    `joined` is the log of how much more probable that makes the second, `unmapped` how likely the second was on ground
+    off the map, and `lost` the metres of the search after the second that were on mapped ground.
+    """
+
+    joined: F64
+    unmapped: F64
+    lost: F64
+
+    @staticmethod
+    def of(tracks: Sequence[Track], way: Way, ground: MappedGround) -> _Pairs:
+        n = len(tracks)
+        joined, unmapped, lost = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+        drift = _drift(tracks, way)
+        for i, one in enumerate(tracks):
+            errors = Errors(max(one.noise_scale, _LEAST_NOISE), drift)
+            for j in range(max(i - _HORIZON, 0), min(i + _HORIZON + 1, n)):
+                other = tracks[j]
+                if j > i:
+                    joined[i, j] = _joined(one, other, way, ground.volume, errors)
+                if j != i:
+                    unmapped[i, j] = _unmapped(one, other, way, ground, errors)
+                if j >= i and len(other.lost):
+                    lost[i, j] = _lost_way(one, other, way, ground, errors)
+        return _Pairs(joined, unmapped, lost)
+
+    def between(self, i: int, j: int, own: F64, look_alike: F64) -> float:
+        """Log weight of two right tracks i and j by each other, -1 and n for none, and of those between, all wrong."""
+        n = len(own)
+        k = np.arange(i + 1, j)
+        share = np.zeros(len(k))
+        weight = 0.0
+        if i >= 0:
+            share = self.unmapped[i, k]
+            metres = float(self.lost[i, i:j].sum())
+            weight -= min(max(metres - _FOUND_AFTER_M, 0.0) / _LOST_M, _MOST_FROM_LOST)
+        if j < n:
+            share = np.maximum(share, self.unmapped[j, k])
+            weight += float(self.joined[i, j]) if i >= 0 else 0.0
+        return weight + float(np.log(own[k] + look_alike[k] * share).sum())
+
+
+def _drift(tracks: Sequence[Track], way: Way) -> float:
+    """Standard deviation of the drift of the odometry's heading (rad/m), as the tracks show it."""
+    squares, count = _DRIFT_KNOWN * _DRIFT**2, _DRIFT_KNOWN
+    for track in tracks:
+        off = np.unwrap(track.headings - way.poses[track.messages, 2])
+        path = way.metres(track.messages)
+        edges = np.unique(np.searchsorted(path, np.arange(path[0], path[-1], _DRIFT_OVER_M)))
+        if len(edges) > 1:
+            squares += float(((np.diff(off[edges]) / np.diff(path[edges])) ** 2).sum())
+            count += len(edges) - 1
+    return float(np.sqrt(squares / count))
+
+
+def _joined(one: Track, other: Track, way: Way, volume: float, errors: Errors) -> float:
+    """Log of how much more probable the second track's entry is, the first being right, than any other pose."""
+    predicted = way.led_to(one.exit, one.leaves, np.array([other.enters]))[0]
+    error = other.entry.to_array() - predicted
+    error[2] = wrap_angle(float(error[2]))
+    spread = way.between(one.leaves, other.enters, errors)
+    # Where the heading is uncertain by more than a little, the place lies on an arc and beside its tangent.
+    bent = 0.5 * min(float(spread[2, 2]), _MOST_BENT) * float(np.linalg.eigvalsh(spread[:2, :2])[-1])
+    turn = one.exit.theta - way.poses[one.leaves, 2]
+    covariance = rotated(spread, turn) + _DISTORTION + np.diag((bent, bent, 0.0))
+    found = 0.0
+    for weight, each in ((1.0 - _SLIPPED, covariance), (_SLIPPED, covariance + _SLIP)):
+        highest = volume / np.sqrt((2.0 * pi) ** 3 * np.linalg.det(each))
+        found += weight * max(float(highest), 1.0) * exp(-0.5 * float(error @ np.linalg.solve(each, error)))
+    return log(min(found, _MOST_SUPPORT) + _KIDNAPPED)
+
+
+def _unmapped(one: Track, other: Track, way: Way, ground: MappedGround, errors: Errors) -> float:
+    """Share of the second track's scans that are on ground off the map, the first track being right."""
+    later = other.enters > one.enters
+    start = (one.leaves, one.exit) if later else (one.enters, one.entry)
+    gone = _left_open(way, start, int(other.messages[-1 if later else 0]), ground, errors)
+    middle = int(other.messages[len(other.messages) // 2])
+    return way.known(start[0], middle, errors) * float(gone[abs(other.messages - start[0])].mean())
+
+
+def _lost_way(one: Track, other: Track, way: Way, ground: MappedGround, errors: Errors) -> float:
+    """Metres of the search after a track that, the first track being right, did not lead to ground off the map."""
+    gone = _left_open(way, (one.leaves, one.exit), int(other.lost[-1]), ground, errors)
+    some = np.unique(np.linspace(0, len(other.lost) - 1, _LOOKED_AT).astype(np.int64))
+    known = [way.known(one.leaves, int(other.lost[k]), errors) for k in some]
+    weights = np.interp(np.arange(1, len(other.lost)), some, known)
+    weights[gone[other.lost[1:] - one.leaves]] = 0.0
+    return float(np.diff(way.metres(other.lost)) @ weights)

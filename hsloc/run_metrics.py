@@ -103,6 +103,22 @@ class LogMetrics:
     """Topic or file of the reference trajectory; null where there is none."""
     lasers: tuple[LaserMetrics, ...]
     """The lasers whose scans were used."""
+    clock_offsets: tuple[ClockOffsetMetrics, ...] | None = None
+    """Offsets of the clocks, by the matches of the run; left out where none was determined."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockOffsetMetrics:
+    """By how much the stamps of a laser's scans are later than those of the odometry, as their headings show."""
+
+    topic: str
+    """Topic of the scans."""
+    seconds: float
+    """The offset [s]; a scan with the stamp t shows the robot where the odometry has it that much before t."""
+    sigma: float
+    """Standard deviation of the offset [s]."""
+    corrected: bool
+    """Whether the stamps of the scans were corrected by it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,6 +33,7 @@ from hsloc.model.pose2 import Pose2, compose_poses
 from hsloc.model.trajectory import Trajectory
 from hsloc.model.verdict import verdict_of
 from hsloc.run_metrics import RunMetrics
+from hsloc.trajectory_io.tum import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,6 +47,10 @@ if TYPE_CHECKING:
     from hsloc.warnings import RunWarning
 
     Convergence = dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
+
+
+_SAME_STAMP_NS = 1000
+"""Difference of stamps that are the same: files state seconds with six decimals."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,7 +162,29 @@ def _likelihood(result: Result) -> LikelihoodField | None:
 
 def _relations(result: Result) -> RelationsResult | None:
     path = result.request.relations
-    return None if path is None else evaluate_relations(result.trajectory, read_relations(path))
+    if path is None:
+        return None
+    stated, trajectory = read_relations(path), result.trajectory
+    first, second = (_in_clock_of_poses(result, stamps) for stamps in (stated.first_ns, stated.second_ns))
+    if result.mapping is not None and first is not stated.first_ns and second is not stated.second_ns:
+        stamps = np.concatenate((trajectory.stamps_ns, result.diagnostics.stamps_ns))
+        trajectory = Trajectory(stamps, np.concatenate((trajectory.poses, result.mapping.scan_poses)))
+    return evaluate_relations(trajectory, replace(stated, first_ns=first, second_ns=second))
+
+
+def _in_clock_of_poses(result: Result, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Stamps (n,) of reference poses in the clock of the trajectory, that of the odometry.
+
+    References that were made of a log's scans bear their stamps as recorded: where these were corrected, they are, too.
+    """
+    shifts = set(result.reading.offsets_s().values()) if result.corrected_offsets and result.reading else set()
+    scans = np.sort(result.diagnostics.stamps_ns)
+    if len(shifts) != 1 or len(stamps_ns) == 0 or len(scans) < 2:
+        return stamps_ns
+    moved = stamps_ns + round(shifts.pop() * NS_PER_S)
+    after = np.clip(np.searchsorted(scans, moved), 1, len(scans) - 1)
+    apart = np.minimum(np.abs(moved - scans[after]), np.abs(moved - scans[after - 1]))
+    return moved if float((apart <= _SAME_STAMP_NS).mean()) > 0.5 else stamps_ns
 
 
 class _Errors:
@@ -166,6 +193,9 @@ class _Errors:
     def __init__(self, result: Result, alignment: str) -> None:
         self._alignment = alignment
         self._reference = result.reference
+        if self._reference is not None and result.request.reference is not None:
+            stamps = _in_clock_of_poses(result, self._reference.stamps_ns)
+            self._reference = Trajectory(stamps, self._reference.poses)
         self.odometry = start_together(result.odometry, result.trajectory, result.localised)
         self.whole, self.reason = self._compare(result.trajectory)
         self.localised, self.localised_reason = None, None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import asdict
+from math import isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,7 @@ from hsloc.log import LaserSummary
 from hsloc.matching import summarise
 from hsloc.run_metrics import (
     CertificateMetrics,
+    ClockOffsetMetrics,
     EvaluationCounts,
     FitnessMetrics,
     LaserMetrics,
@@ -75,7 +77,19 @@ def log_metrics(result: Result) -> LogMetrics:
         odometry=None if result.lidar_only else summary.odom_topic,
         reference=None if result.reference is None else reference,
         lasers=tuple(LaserMetrics.of(laser) for laser in lasers),
+        clock_offsets=_clock_offsets(result),
     )
+
+
+def _clock_offsets(result: Result) -> tuple[ClockOffsetMetrics, ...] | None:
+    """Those that were corrected, else those that are left; None without any."""
+    is_corrected = bool(result.corrected_offsets)
+    offsets = (result.corrected_offsets if is_corrected else result.clock_offsets) or {}
+    found = [(topic, each) for topic, each in sorted(offsets.items()) if isfinite(each.sigma)]
+    return tuple(
+        ClockOffsetMetrics(topic=topic, seconds=each.seconds, sigma=each.sigma, corrected=is_corrected)
+        for topic, each in found
+    ) or None  # fmt: skip
 
 
 def _path_length(result: Result) -> float:

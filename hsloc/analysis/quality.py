@@ -9,8 +9,8 @@ import numpy as np
 
 from hsloc.localisation.states import localisation_reasons
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
-from hsloc.replay.clock_offset import KNOWN, is_lost, is_matched, matched_headings
-from hsloc.slam.time_offset import Headings, clock_warnings, drift_warning, find_drift, find_offset, offsets_of_log
+from hsloc.replay.clock_offset import KNOWN, matched_headings
+from hsloc.slam.time_offset import clock_warnings, drift_warning, find_drift, find_offset, offsets_of_log
 from hsloc.trajectory_io.tum import NS_PER_S
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -126,20 +126,13 @@ def offset_warnings(result: Result) -> list[RunWarning]:
     """Whether scans and odometry are stamped by clocks, or at moments, that differ: by the headings of the result."""
     if result.lidar_only or not len(result.odometry) or any(warning.code in KNOWN for warning in result.warnings):
         return []
-    stamps, odometry = result.diagnostics.stamps_ns, result.odometry
+    odometry = result.odometry
     given = result.request.read.offsets_s()
     if result.clock_offsets is not None:
         return [warning for _, warning in clock_warnings(result.clock_offsets, given)]
-    if result.mapping is not None:
-        matched = is_matched(result.diagnostics)
-        scans = Headings.of(stamps[matched], result.mapping.scan_poses[matched, 2])
-        turned = Headings.of(odometry.stamps_ns, odometry.poses[:, 2])
-        lost = is_lost(result.diagnostics)
-    else:
-        scans, turned = matched_headings(result.diagnostics, odometry, result.trajectory)
-        lost = False  # then the run itself has looked for them
+    scans, turned = matched_headings(result.diagnostics, odometry, result.trajectory)
     offset = find_offset(scans, turned)
-    if not (offset.is_significant or lost):
+    if not offset.is_significant:
         drift = find_drift(scans, turned, offset.seconds)
         return [drift_warning(result.summary.scan_topic or "the scans", drift)] if drift else []
     # Poses are weighed with the odometry, which hides a part of the offset: the scans alone show the whole of it.

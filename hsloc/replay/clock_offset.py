@@ -8,6 +8,7 @@ Stamps are then corrected, and the log is replayed once more.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,17 +17,50 @@ from hsloc.log import LONGEST_OFFSET_S, open_log
 from hsloc.model.estimate import Status
 from hsloc.options import AUTO
 from hsloc.slam.mounting_choice import with_chosen_mountings
-from hsloc.slam.time_offset import HINT_S, Headings, as_option, clock_warnings, find_offset, offsets_of_log
+from hsloc.slam.time_offset import (
+    HINT_S,
+    LARGE_S,
+    Headings,
+    as_option,
+    clock_warnings,
+    find_offset,
+    offsets_of_log,
+)
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from hsloc.log import Log, ReadOptions
     from hsloc.model.estimate import ScanDiagnostics
     from hsloc.model.trajectory import Trajectory
+    from hsloc.replay.run_history import RunHistory
     from hsloc.request import RunRequest
     from hsloc.slam.time_offset import Offset
+
+
+class LateScans(Exception):
+    """The scans that were matched show an offset that is certain; internal: whoever maps corrects it, and begins again.
+
+    `offsets` (s) are by topic; `option` is the value of `--time-offset` that removes them.
+    """
+
+    def __init__(self, offsets: Mapping[str, Offset], option: str) -> None:
+        super().__init__(option)
+        self.offsets = offsets
+        self.option = option
+
+    def with_rest(self, left: Mapping[str, Offset]) -> dict[str, Offset]:
+        """The whole offsets: with what is `left` after the correction, which the prediction had hidden."""
+        whole = dict(self.offsets)
+        for topic, removed in self.offsets.items():
+            if topic in left and isfinite(left[topic].sigma):
+                seconds, sigma = removed.seconds + left[topic].seconds, left[topic].sigma
+                whole[topic] = removed._replace(seconds=seconds, sigma=sigma)
+        return whole
+
 
 KNOWN = (
     WarningCode.CLOCK_OFFSET,
@@ -128,6 +162,35 @@ class ClockEvidence:
         return not self.offset.is_significant or abs(self.offset.seconds) < 0.5 * abs(before.offset.seconds)
 
 
+def offsets_of_mapping(
+    request: RunRequest, log: Log, reading: ReadOptions, history: RunHistory, *, deskew: bool, correct: bool
+) -> dict[str, Offset]:
+    """The offsets (s) by topic that a log shows which has been matched, before its map is solved.
+
+    Raises LateScans where one is certain and the user has given none, if these are to be corrected: large ones, for
+    smaller ones bend no map, and to match again takes a third of a run.
+    """
+    if reading.stamps != "header":
+        return {}
+    # Corrected stamps are those of the middle.
+    offset = history.clock_offset(sweeps=correct and not deskew)
+    if offset is None or (history.lasers > 1 and offset.is_significant):
+        # Several lasers have clocks of their own.
+        found, option = clock_offsets(request, reading, deskew=deskew)
+    else:
+        found = {log.summary.scan_topic or "": offset}
+        is_free = offset.is_certain and not _is_given(request)
+        option = as_option(found, deskew=deskew) if is_free else None
+    is_large = any(each.is_certain and abs(each.seconds) >= LARGE_S for each in found.values())
+    if correct and option is not None and is_large:
+        raise LateScans({name: each for name, each in found.items() if each.is_certain}, option)
+    return found
+
+
+def _is_given(request: RunRequest) -> bool:
+    return request.read.time_offset is not None or bool(request.reading().offsets_s())
+
+
 def clock_offsets(request: RunRequest, reading: ReadOptions, *, deskew: bool) -> tuple[dict[str, Offset], str | None]:
     """The offsets (s) by topic that the scans of a log, as it was read, show by themselves, and what removes them.
 
@@ -136,6 +199,5 @@ def clock_offsets(request: RunRequest, reading: ReadOptions, *, deskew: bool) ->
     """
     # Poses are weighed with the odometry, which hides a part of the offset: the scans alone show the whole of it.
     found = offsets_of_log(request.logs, reading, request.config.graph_mapper.front_end)
-    is_given = request.read.time_offset is not None or bool(request.reading().offsets_s())
     certain = {topic: offset for topic, offset in found.items() if offset.is_certain}
-    return found, None if is_given else as_option(certain, deskew=deskew)
+    return found, None if _is_given(request) else as_option(certain, deskew=deskew)

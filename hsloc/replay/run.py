@@ -18,7 +18,7 @@ from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.model.pose2 import IDENTITY
 from hsloc.preprocessing.odometry import ContinuousOdometry, OdometryWatch, UnusableOdometry
 from hsloc.preprocessing.scans import ScanWatch
-from hsloc.replay.clock_offset import ClockEvidence, clock_offsets, open_as_meant
+from hsloc.replay.clock_offset import ClockEvidence, LateScans, clock_offsets, offsets_of_mapping, open_as_meant
 from hsloc.replay.engine import rarely_collected, replay
 from hsloc.replay.map_and_start import find_map, find_start, first_odometry, load_state, require_map, resumed
 from hsloc.replay.references import read_reference
@@ -107,6 +107,8 @@ class Result:
     deskewed: bool = False
     clock_offsets: Mapping[str, Offset] | None = None
     """Offsets of the scans' stamps that were found and not removed, by topic."""
+    corrected_offsets: Mapping[str, Offset] | None = None
+    """Those that were found by the matches of the run and removed."""
     reading: ReadOptions | None = None
     """How the log was read, with what was found on the way; None is what the request says."""
     log: Log | None = field(default=None, repr=False)
@@ -185,6 +187,11 @@ def _run(request: RunRequest, progress: Callable[[Progress], None] | None) -> Re
             "repair its source, or name another with --odom-topic",
         )
         return _run_with(request, progress, lidar_only=True, warnings=(warning,))
+    except LateScans as late:
+        result = _run_with(request, progress, lidar_only=False, time_offset=late.option)
+        whole = late.with_rest(result.clock_offsets or {})
+        warnings = (*result.warnings, *(warning for _, warning in clock_warnings(whole, removed=True)))
+        return replace(result, warnings=warnings, corrected_offsets=whole)
     settled = (WarningCode.CLOCK_OFFSET_APPLIED, WarningCode.CLOCK_SET)
     is_settled = any(warning.code in settled for warning in result.warnings)
     if result.mode != "localise" or result.lidar_only or is_settled:
@@ -198,7 +205,8 @@ def _run(request: RunRequest, progress: Callable[[Progress], None] | None) -> Re
         again = _run_with(request, progress, lidar_only=False, warnings=warnings, time_offset=option)
         if again.clock_evidence().is_better(evidence):
             seconds = {name: value + again.seconds[name] for name, value in result.seconds.items()}
-            return replace(again, seconds=seconds)
+            certain = {topic: offset for topic, offset in offsets.items() if offset.is_certain}
+            return replace(again, seconds=seconds, corrected_offsets=certain)
     return replace(result, clock_offsets=offsets)
 
 
@@ -258,14 +266,17 @@ def _run_with(
         where = "between --start and --end" if is_cut else f"on {log.summary.odom_topic} that could be read"
         raise LogError(f"{request.logs[0]}: no odometry {where}{_lost(log)}; the scans alone can do: --no-odom")
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
-    mapping, true_grid = None, None if localise else grid
+    of_steps = log.losses.step_warnings(log.summary)
+    mapping, true_grid, offsets = None, None if localise else grid, None
     if isinstance(estimator, Mapper):
+        if not lidar_only and not of_steps:
+            is_first = time_offset is None
+            offsets = offsets_of_mapping(request, log, reading, history, deskew=deskew, correct=is_first)
         mapping = estimator.finish(_share(progress, log.summary.duration_s, history.scans))
         grid = mapping.grid
         seconds["finish"] = time.perf_counter() - replayed
     elif isinstance(estimator, PointMapper):
         grid = estimator.grid()
-    of_steps = log.losses.step_warnings(log.summary)
     trajectory, localised = history.trajectory() if mapping is None else history.mapped(mapping)
     scale = None if localiser is None else localiser.map_scale
     mounting = history.mounting_error() if localise else None
@@ -282,7 +293,7 @@ def _run_with(
         odometry=history.odometry(),
         reference=history.reference() if reference is None else reference,
         grid=require_map(grid),
-        diagnostics=_diagnostics(history, mapping),
+        diagnostics=history.diagnostics(mapping),
         losses=log.losses,
         warnings=(*log.summary.warnings, *warnings, *events.warnings(), *watch.warnings(), *of_steps),
         seconds=seconds,
@@ -297,6 +308,7 @@ def _run_with(
         ambiguities=history.ambiguities(states),
         lidar_only=lidar_only,
         deskewed=deskew,
+        clock_offsets=offsets,
         reading=reading,
         log=None if log.is_unpacked else log,
     )
@@ -306,16 +318,6 @@ def _lost(log: Log) -> str:
     """What could not be read, as the end of a message; empty where all could."""
     lost = [*log.losses.lines(), *log.losses.reasons]
     return f": {'; '.join(lost)}" if lost else ""
-
-
-def _diagnostics(history: RunHistory, mapping: MappingResult | None) -> ScanDiagnostics:
-    """What became of each scan; of a map that was built, with the covariances of the solved graph."""
-    diagnostics = history.diagnostics()
-    if mapping is None:
-        return diagnostics
-    covariances = mapping.scan_covariances
-    sigma = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
-    return replace(diagnostics, covariance=covariances, sigma=sigma)
 
 
 def _events(request: RunRequest, log: Log, lidar_only: bool, localise: bool) -> Iterable[Event]:

@@ -52,7 +52,7 @@ _SPARSE_S = 0.25
 starts with 1 rad/s^2, several times the noise of a matched scan, and show an offset that is none."""
 _HUBER = 1.345
 """Scale of the robust weights in standard deviations (Huber 1981): 95 % efficient on Gaussian errors."""
-_LEAST_AGREEMENT = 0.8
+LEAST_AGREEMENT = 0.8
 """Correlation of the rotations of scans and odometry from which on an offset is believed: what is left explains a third
 of the rotation at most. Offsets of scans whose angles are wrong reach less."""
 _CORRELATED_S = 0.5
@@ -215,19 +215,19 @@ def estimate_offset(
         return UNKNOWN
     turns, odometry_turns = _headings(scans), _headings(odometry)
     found = _best_offset(turns, odometry_turns)
-    if _agreement(turns, odometry_turns, found.seconds) >= _LEAST_AGREEMENT:
+    if agreement(turns, odometry_turns, found.seconds) >= LEAST_AGREEMENT:
         half = float(np.median(halves)) / NANOSECONDS
         return found._replace(drift_s=find_drift(turns, odometry_turns, found.seconds), half_sweep_s=half)
     mirrored = Headings(turns.stamps_ns, -turns.theta)
-    back = find_offset(_thinned(mirrored), odometry_turns)
-    if isfinite(back.sigma) and _agreement(mirrored, odometry_turns, back.seconds) >= _LEAST_AGREEMENT:
+    back = find_offset(thinned(mirrored), odometry_turns)
+    if isfinite(back.sigma) and agreement(mirrored, odometry_turns, back.seconds) >= LEAST_AGREEMENT:
         return UNKNOWN._replace(is_mirrored=True)
     return UNKNOWN
 
 
 def _best_offset(turns: Headings, odometry: Headings) -> Offset:
     # By steps of half a second and more the rotation stands out of the noise of single scans.
-    steps = turns if _is_sparse(odometry, turns) else _thinned(turns)
+    steps = turns if _is_sparse(odometry, turns) else thinned(turns)
     near = find_offset(steps, odometry)
     whole = find_offset(steps, odometry, near_s=RANGE_S)
     if not isfinite(whole.sigma):
@@ -243,7 +243,7 @@ def find_drift(scans: Headings, odometry: Headings, offset_s: float) -> float:
 
     The offsets of both halves of the scans are compared, each as far from the other as half of the whole.
     """
-    scans = scans if _is_sparse(odometry, scans) else _thinned(scans)
+    scans = scans if _is_sparse(odometry, scans) else thinned(scans)
     middle = len(scans.theta) // 2
     halves = [
         find_offset(Headings(scans.stamps_ns[part], scans.theta[part]), odometry, start_s=offset_s)
@@ -253,9 +253,9 @@ def find_drift(scans: Headings, odometry: Headings, offset_s: float) -> float:
     return 2.0 * change.seconds if change.is_significant and 2.0 * abs(change.seconds) >= LARGE_S else 0.0
 
 
-def _agreement(scans: Headings, odometry: Headings, offset_s: float) -> float:
+def agreement(scans: Headings, odometry: Headings, offset_s: float) -> float:
     """The correlation (-1 to 1) of the rotations between scans with those of the odometry, an offset removed."""
-    seen, turned = _rotations(_thinned(scans, _CORRELATED_S), odometry, offset_s)
+    seen, turned = _rotations(thinned(scans, _CORRELATED_S), odometry, offset_s)
     if len(seen) < 2:
         return 0.0
     return float(np.sum(seen * turned) / max(sqrt(float(np.sum(seen**2) * np.sum(turned**2))), 1e-12))
@@ -277,7 +277,7 @@ def _is_sparse(headings: Headings, others: Headings) -> bool:
     return interval_ns > max(other_ns, _SPARSE_S * NANOSECONDS)
 
 
-def _thinned(headings: Headings, step_s: float = 0.2) -> Headings:
+def thinned(headings: Headings, step_s: float = 0.2) -> Headings:
     """Headings at least `step_s` apart."""
     kept = [0]
     for k, stamp in enumerate(headings.stamps_ns.tolist()):

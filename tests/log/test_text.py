@@ -107,6 +107,22 @@ def test_the_calibration_of_another_lidar_does_not_count(tmp_path: Path) -> None
     assert alone.summary.extrinsics == "identity"
 
 
+@pytest.mark.parametrize(
+    ("offset", "order"),
+    [(-1.2, "SOSOOO"), (-0.2, "OSOSOO"), (0.0, "OOSOSO"), (1.2, "OOOSOS")],
+)
+def test_scans_with_an_offset_are_in_the_order_of_their_corrected_stamps(
+    tmp_path: Path, offset: float, order: str
+) -> None:
+    """Odometry at 1, 2, 3 and 4 s, scans at 2 and 3 s after the odometry of the same stamp."""
+    lines = [odom("1"), odom("2"), flaser("2", [1.0] * 181), odom("3"), flaser("3", [1.0] * 181), odom("4")]
+    log = open_log(write(tmp_path / "log.clf", lines), ReadOptions(time_offset=f"FLASER={offset}"))
+    events = list(log.events())
+    assert "".join("S" if isinstance(event, Scan) else "O" for event in events) == order
+    if offset:
+        assert [event.stamp_ns for event in events] == sorted(event.stamp_ns for event in events)
+
+
 def test_laser_lines_give_odometry_only_where_nothing_else_does(tmp_path: Path) -> None:
     path = write(tmp_path / "log.clf", [flaser("1", [1.0] * 180, x=1.0), flaser("2", [1.0] * 180, x=2.0)])
     log = open_log(path)

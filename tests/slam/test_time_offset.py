@@ -12,8 +12,10 @@ import pytest
 
 from hsloc.analysis.analyse import analyse
 from hsloc.evaluation import evaluate
+from hsloc.evaluation.association import interpolate_poses
 from hsloc.log import ReadOptions, convert_log, open_log
 from hsloc.model import Odometry, Scan
+from hsloc.model.pose2 import relative_poses
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
 from hsloc.slam.front_end import FrontEndParameters
@@ -142,6 +144,34 @@ def test_a_run_warns_of_late_scans_and_auto_removes_it(tmp_path: Path) -> None:
     assert sound.reference is not None
     assert evaluate(sound.trajectory, sound.reference).ape.trans_part.rmse < 0.01
     assert analyse(sound).metrics.warnings == ()
+
+
+def test_late_scans_of_a_log_that_is_mapped_are_corrected(tmp_path: Path) -> None:
+    """Relations with stamps of scans as recorded are compared at these scans, others in the odometry's clock."""
+    late = tmp_path / "late.mcap"
+    convert_log(open_log((OFFICE,), replace(END, time_offset="/scan=0.25", end_s=20.0)), late)
+    scans = [event.stamp_ns for event in open_log(late).events() if isinstance(event, Scan)]
+    truth = run(RunRequest(logs=(late,))).reference
+    assert truth is not None
+    at = np.array(scans[20:-20:15])
+    means = []
+    for name, stamps in (("recorded", at), ("moved", at - 250_000_000)):
+        poses = interpolate_poses(truth, at - 250_000_000)
+        steps = relative_poses(poses[:-1], poses[1:])
+        path = tmp_path / f"{name}.relations"
+        rows = zip(stamps[:-1].tolist(), stamps[1:].tolist(), steps.tolist(), strict=True)
+        path.write_text("".join(f"{a / 1e9:.9f} {b / 1e9:.9f} {x} {y} 0 0 0 {theta}\n" for a, b, (x, y, theta) in rows))
+        result = run(RunRequest(logs=(late,), mode="slam", relations=path))
+        metrics = analyse(result).metrics
+        assert [each.code for each in metrics.warnings] == ["clock_offset_applied"]
+        assert metrics.verdict != "failed"
+        assert metrics.log.clock_offsets is not None
+        (offset,) = metrics.log.clock_offsets
+        assert offset.corrected
+        assert offset.seconds == pytest.approx(0.25, abs=0.005)
+        assert metrics.relations is not None
+        means.append(metrics.relations.statistics.trans_part.mean)
+    assert max(means) < 0.02
 
 
 def test_stamps_of_a_log_that_is_localised_are_corrected_unless_the_user_gives_them(tmp_path: Path) -> None:

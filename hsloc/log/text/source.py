@@ -10,6 +10,7 @@ import gzip
 import zlib
 from collections import deque
 from dataclasses import replace
+from heapq import heappop, heappush
 from io import BufferedReader
 from typing import TYPE_CHECKING, BinaryIO, cast
 
@@ -283,10 +284,15 @@ class TextSource:
             raise TopicError(f"{self._shown}: no odometry lines in this {self._format.name} log")
 
     def events(self, losses: Losses) -> Iterator[tuple[int, Event]]:
-        """As `Source.events`: in the order of the lines; effective stamps are the running maximum."""
+        """As `Source.events`: in the order of the lines; effective stamps are the running maximum.
+
+        Scans with an offset take the place among the other lines that their corrected stamps have.
+        """
         latest: int | None = None
         last: dict[tuple[str, type], int] = {}
         recent: dict[tuple[str, type], deque[int]] = {}
+        number = 0
+        waiting: list[tuple[int, int, Event]] = []
         for keyword, line in self._parsed(losses):
             for event in self._events_of(line):
                 key = (keyword, type(event))
@@ -297,8 +303,18 @@ class TextSource:
                 around.append(event.stamp_ns)
                 if len(around) == 2 * AGREEING and (step := _step_back(around)) is not None:
                     losses.clock_steps.setdefault(keyword, []).append((step, around[AGREEING - 1]))
-                latest = event.stamp_ns if latest is None else max(latest, event.stamp_ns)
-                yield latest, event
+                offset_ns = self._scan_offset_ns if isinstance(event, Scan) else 0
+                as_written = event.stamp_ns - offset_ns
+                latest = as_written if latest is None else max(latest, as_written)
+                number += 1
+                heappush(waiting, (latest + offset_ns, number, event))
+                # No line to come is earlier than that.
+                while waiting and waiting[0][0] <= latest + min(self._scan_offset_ns, 0):
+                    effective, _, first = heappop(waiting)
+                    yield effective, first
+        while waiting:
+            effective, _, first = heappop(waiting)
+            yield effective, first
 
     def map(self) -> OccupancyGrid | None:
         """Text logs carry no map."""

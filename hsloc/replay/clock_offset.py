@@ -19,7 +19,6 @@ from hsloc.options import AUTO
 from hsloc.slam.mounting_choice import with_chosen_mountings
 from hsloc.slam.time_offset import (
     HINT_S,
-    LARGE_S,
     Headings,
     as_option,
     clock_warnings,
@@ -167,8 +166,11 @@ def offsets_of_mapping(
 ) -> dict[str, Offset]:
     """The offsets (s) by topic that a log shows which has been matched, before its map is solved.
 
-    Raises LateScans where one is certain and the user has given none, if these are to be corrected: large ones, for
-    smaller ones bend no map, and to match again takes a third of a run.
+    Raises LateScans where one is certain and the user has given none, if these are to be corrected: from `HINT_S` on.
+    Of smaller ones the clock of the odometry may be the wrong one as well, and a corrected trajectory no longer has
+    the stamps of the scans, which references are often made of. (Freiburg 079, 0.13 s, is mapped to 0.032 m as it is
+    and to 0.035 m corrected; with ACES' 0.04 s corrected its map with half the field of view is lost. On these two the
+    limit was chosen.)
     """
     if reading.stamps != "header":
         return {}
@@ -181,7 +183,7 @@ def offsets_of_mapping(
         found = {log.summary.scan_topic or "": offset}
         is_free = offset.is_certain and not _is_given(request)
         option = as_option(found, deskew=deskew) if is_free else None
-    is_large = any(each.is_certain and abs(each.seconds) >= LARGE_S for each in found.values())
+    is_large = any(each.is_certain and abs(each.seconds) >= HINT_S for each in found.values())
     if correct and option is not None and is_large:
         raise LateScans({name: each for name, each in found.items() if each.is_certain}, option)
     return found

@@ -94,21 +94,21 @@ def test_intel_is_mapped_better_than_published(data: Path) -> None:
 
 @pytest.mark.data
 def test_freiburg_is_not_built_twice(data: Path) -> None:
-    """In this log's odometry reversing looks like driving forward: 1.19 m, and not a word.
-
-    Its scans are stamped late, and the relations bear their stamps: the analysis compares them at the scans.
-    """
+    """In this log's odometry reversing looks like driving forward: 1.19 m, and not a word. Scans are 0.13 s late."""
     folder = data / "fr079"
     read = ReadOptions(laser_pose=Pose2(-0.04, 0.0, 0.0))
     found = run(RunRequest(logs=(folder / "fr079.clf.gz",), read=read, relations=folder / "fr079.relations"))
+    result = evaluate_relations(found.trajectory, read_relations(folder / "fr079.relations"))
+    assert result.statistics.trans_part.mean <= 0.036
+    assert found.mapping is not None
+    assert found.mapping.evidence.verdict == "good"
     metrics = analyse(found).metrics
     assert metrics.relations is not None
-    assert metrics.relations.matched == 1685
-    assert metrics.relations.statistics.trans_part.mean <= 0.036
-    assert metrics.verdict == "good"
+    assert metrics.relations.statistics.trans_part.mean == result.statistics.trans_part.mean
+    assert [reason.code for reason in metrics.verdict_reasons] == ["clock_offset_large"]
     assert metrics.log.clock_offsets is not None
     (offset,) = metrics.log.clock_offsets
-    assert offset.corrected
+    assert not offset.corrected
     assert offset.seconds == pytest.approx(0.13, abs=0.02)
 
 

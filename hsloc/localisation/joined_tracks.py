@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.track_consistency import MappedGround, Track, Way, right_tracks
+from hsloc.localisation.track_consistency import LEAST, MappedGround, Track, Way, right_tracks
 from hsloc.localisation.track_evidence import CONFIDENCE, PRIOR, States, TrackRow, entry_likelihoods, smooth
 from hsloc.model.estimate import Status
 
@@ -51,7 +51,8 @@ def _as_tracks(run: Scans, rows: Sequence[TrackRow], likelihoods: Sequence[State
     messages = np.maximum(np.array(counts) - 1, 0)
     sure = smooth(rows)[:, 0]
     tracks = []
-    for own, after, (right, alike, astray) in zip(scans, lost, likelihoods, strict=True):
+    for own, after, (likelihood, alike, astray) in zip(scans, lost, likelihoods, strict=True):
+        right = max(likelihood, LEAST)
         probabilities = sure[[owners[k] for k in own]]
         least = min(CONFIDENCE, float(probabilities.max()))
         leaves = own[int(np.flatnonzero(probabilities >= least)[-1])]

@@ -89,6 +89,8 @@ _LEAST_NOISE = 0.25
 """Least variance of the odometry's noise by the assumed one."""
 _LOOKED_AT = 6
 """Places of a search at which it is asked how well its way is known."""
+LEAST = 1e-100
+"""Weights and probabilities are this at least. Internal: what follows divides by them, and takes their logarithms."""
 _HORIZON = 12
 """Tracks between two right ones of which the odometry says anything, at most."""
 
@@ -278,7 +280,7 @@ def right_tracks(tracks: Sequence[Track], way: Way, ground: MappedGround, priors
     """
     n = len(tracks)
     pairs = _Pairs.of(tracks, way, ground)
-    own = np.array([each.wrong(priors) for each in tracks])
+    own = np.maximum([each.wrong(priors) for each in tracks], LEAST)
     look_alike = np.array([each.look_alike() if each.is_found else 0.0 for each in tracks])
     # Log weight of a step from one right track to the next, row and column 0 and n + 1 for none before and none after:
     # of the tracks between, which are wrong, and of the next one.
@@ -299,7 +301,7 @@ def right_tracks(tracks: Sequence[Track], way: Way, ground: MappedGround, priors
         backward[i] = np.logaddexp.reduce(backward[i + 1 :] + step[i, i + 1 :])
     other_map = log(_OTHER_MAP) + sum(log(each.on_another_map()) for each in tracks)
     total = np.logaddexp(forward[n + 1], other_map)
-    result: F64 = np.exp(np.minimum(forward[1:-1] + backward[1:-1] - total, 0.0))
+    result: F64 = np.exp(np.clip(forward[1:-1] + backward[1:-1] - total, log(LEAST), 0.0))
     return result
 
 
@@ -327,7 +329,8 @@ class _Pairs:
                 if j > i:
                     joined[i, j] = _joined(one, other, way, ground.volume, errors)
                 if j != i:
-                    unmapped[i, j] = _unmapped(one, other, way, ground, errors)
+                    start = (one.leaves, one.exit) if j > i else (one.enters, one.entry)
+                    unmapped[i, j] = _unmapped(start, other.messages, way, ground, errors)
                 if j >= i and len(other.lost):
                     lost[i, j] = _lost_way(one, other, way, ground, errors)
         return _Pairs(joined, unmapped, lost)
@@ -378,13 +381,13 @@ def _joined(one: Track, other: Track, way: Way, volume: float, errors: Errors) -
     return log(min(found, _MOST_SUPPORT) + _KIDNAPPED)
 
 
-def _unmapped(one: Track, other: Track, way: Way, ground: MappedGround, errors: Errors) -> float:
-    """Share of the second track's scans that are on ground off the map, the first track being right."""
-    later = other.enters > one.enters
-    start = (one.leaves, one.exit) if later else (one.enters, one.entry)
-    gone = _left_open(way, start, int(other.messages[-1 if later else 0]), ground, errors)
-    middle = int(other.messages[len(other.messages) // 2])
-    return way.known(start[0], middle, errors) * float(gone[abs(other.messages - start[0])].mean())
+def _unmapped(
+    start: tuple[int, Pose2], messages: NDArray[np.int64], way: Way, ground: MappedGround, errors: Errors
+) -> float:
+    """Share of the scans at `messages` that are on ground off the map, all before or all after a right pose."""
+    apart = np.abs(messages - start[0])
+    gone = _left_open(way, start, int(messages[apart.argmax()]), ground, errors)
+    return way.known(start[0], int(messages[len(messages) // 2]), errors) * float(gone[apart].mean())
 
 
 def _lost_way(one: Track, other: Track, way: Way, ground: MappedGround, errors: Errors) -> float:

@@ -125,6 +125,17 @@ def test_beams_behind_walls_and_places_that_fit_as_well_are_those_of_look_alikes
     assert rivalled.on_another_map() == pytest.approx(9.0 * weights[0])
 
 
+def test_evidence_that_is_overwhelming_stays_a_number() -> None:
+    # Several begin at one message, and none is joined to another.
+    misfit = [a_track(k // 3, (k + 1) // 3, Pose2(0, 0, k), said=said(0.5, 0.2, 0.99)) for k in range(150)]
+    other = [replace(each, alike=0.0, astray=0.0) for each in misfit[:5]]
+    for tracks in (misfit, other):
+        found = probabilities(*tracks)
+        assert np.isfinite(found).all()
+        assert min(found) > 0.0
+    assert max(probabilities(*misfit)) < 1e-9
+
+
 def test_all_subsets_are_summed() -> None:
     tracks = [
         a_track(0, 10, alike=0.3, astray=0.1, is_found=False),

@@ -127,6 +127,8 @@ class WarningCode(StrEnum):
     """Single scans of a built map that were rejected do not fit the scans around them: they are beside their place."""
     MAP_SCALE = "map_scale"
     """The map is larger or smaller than what the lidar measures: the resolution in its YAML may be wrong."""
+    MAP_MIRRORED = "map_mirrored"
+    """The mirrored scans fit the map better than the scans: its image is mirrored, or the angles of the laser are."""
     LASER_MISFIT = "laser_misfit"
     """The scans of one laser fit the map far worse than those of another."""
     EXTRINSICS_WRONG = "extrinsics_wrong"

@@ -37,6 +37,7 @@ _VERDICTS = {
     WarningCode.ODOMETRY_JUMPS: Verdict.CHECK,
     WarningCode.CLOCK_OFFSET_LARGE: Verdict.CHECK,
     WarningCode.MAP_SCALE: Verdict.CHECK,
+    WarningCode.MAP_MIRRORED: Verdict.FAILED,
 }
 """Warnings that concern the whole result, with the verdict that each alone gives."""
 
@@ -58,7 +59,7 @@ def quality_warnings(result: Result) -> list[RunWarning]:
         return _stray_warnings(result.mapping, result)
     if result.mode != "localise":
         return []
-    of_sensor = [*_scale_warnings(result), *_mounting_warnings(result)]
+    of_sensor = [*_mirror_warnings(result), *_scale_warnings(result), *_mounting_warnings(result)]
     without, scans = int(_without_place(result).sum()), len(result.diagnostics)
     if without <= _MAX_WITHOUT_PLACE * scans:
         return of_sensor
@@ -100,6 +101,19 @@ def _scale_warnings(result: Result) -> list[RunWarning]:
             f"the map is {100 * abs(scale.value - 1.0):.1f} % {size} than the lidar measures: scale {scale.value:.4f} "
             f"+- {scale.sigma:.4f}, so poses are off by {abs(scale.value - 1.0):.3f} m per metre from the map's corner",
             f"if the ranges are right, set resolution: {cell / scale.value:.5g} in the map's YAML (it is {cell:g})",
+        )
+    ]
+
+
+def _mirror_warnings(result: Result) -> list[RunWarning]:
+    if result.states is None or result.states.mirrored <= 0.5:
+        return []
+    return [
+        RunWarning(
+            WarningCode.MAP_MIRRORED,
+            f"the scans fit the map better when they are mirrored, at every place; with a probability of "
+            f"{100.0 * result.states.mirrored:.0f} % the image of the map or the laser is mirrored",
+            "flip the map's image; or, if the laser hangs upside down, state it (--laser-pose, /tf_static)",
         )
     ]
 

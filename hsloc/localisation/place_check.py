@@ -6,12 +6,15 @@ behind them or where nothing is mapped. And on a wrong map, or off the map, the 
 alike: the fittest other place on the whole map, divided by this one, is then about 1, where the right place of a map
 with some character leaves all others behind. One scan is not enough for that (half of them have a look-alike at 180
 deg), so the scans of the last metres are joined by the poses of the track.
+
+Rooms that are nearly symmetric fit on a mirrored map, too, and then nothing else does. There the mirrored scans fit
+better than the scans: at the robot's own place, seen in the mirror.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -21,6 +24,7 @@ from hsloc.localisation.hypotheses import Own, bounded_search, fittest_other
 from hsloc.matching.harmony_search import low_discrepancy_order
 from hsloc.matching.local_refinement import refine
 from hsloc.matching.window import Window
+from hsloc.model.pose2 import Pose2
 from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive
 
 if TYPE_CHECKING:
@@ -30,7 +34,6 @@ if TYPE_CHECKING:
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.model.events import PairedScan
     from hsloc.model.occupancy_grid import OccupancyGrid
-    from hsloc.model.pose2 import Pose2
 
     F64 = NDArray[np.float64]
 
@@ -75,8 +78,21 @@ _MARGIN_M = 0.1
 """A wall this near before a beam's end is the one that it ends at (m)."""
 _NEEDED = 0.85
 """Other places below this part of the own fitness are not looked for: they make no difference."""
+MIRRORED_NEEDED = 0.97
+"""The same for the mirrored scans: where they fit less well than this, the map is not mirrored."""
 _OWN_HALF, _OWN_HALF_ANGLE = 0.2, 0.1
 """The scans of the own place are moved as a whole within these half-widths (m, rad), as those of another one are."""
+
+
+class Comparison(NamedTuple):
+    """A place and the fittest other one: the fitness of that divided by that of this one, at least 0.85, and its pose.
+
+    `mirrored` is the same ratio for the mirrored scans at their fittest place, at least 0.97; NaN where not known.
+    """
+
+    rival: float
+    other: Pose2 | None
+    mirrored: float = float("nan")
 
 
 class PlaceCheck:
@@ -141,8 +157,8 @@ class PlaceCheck:
             self._search = bounded_search(self._grid, self._field)
         return self._search
 
-    def rival(self, scans: list[tuple[Pose2, F64]], pose: Pose2) -> tuple[float, Pose2 | None]:
-        """Fitness of the fittest other place on the map divided by that of this one, at least 0.85; and that place.
+    def compare(self, scans: list[tuple[Pose2, F64]], pose: Pose2) -> Comparison:
+        """A place with all others on the map.
 
         `scans` are poses of the base in the map and points (n, 2) seen from them, `pose` is the place in question.
         Where the work allowed does not suffice, the ratio is the bound that was reached, at most 1, without a place.
@@ -150,11 +166,18 @@ class PlaceCheck:
         p = self.parameters
         cloud = np.vstack([pose.between(other) @ points for other, points in scans])
         if len(cloud) == 0:
-            return 1.0, None
+            return Comparison(1.0, None)
         own = refine(cloud, self._field, Window(pose, _OWN_HALF, _OWN_HALF, _OWN_HALF_ANGLE)).fitness
         if own <= 0.0:
-            return 1.0, None
+            return Comparison(1.0, None)
         place = Own(pose, own, p.own_distance, p.own_angle, _NEEDED)
         other, fitness = fittest_other(self.search, self._field, cloud, place, p.max_boxes)
         ratio = max(fitness / own, _NEEDED)
-        return (min(ratio, 1.0) if other is None else ratio), other
+        return Comparison(min(ratio, 1.0) if other is None else ratio, other, self._mirrored(cloud, own))
+
+    def _mirrored(self, cloud: F64, own: float) -> float:
+        """Fitness of the fittest place for the mirrored points (n, 2) divided by `own`; NaN where it is not known."""
+        anywhere = Own(Pose2(), own, -1.0, -1.0, MIRRORED_NEEDED)
+        mirrored = cloud * np.array((1.0, -1.0))
+        place, fitness = fittest_other(self.search, self._field, mirrored, anywhere, self.parameters.max_boxes)
+        return fitness / own if place is not None or fitness < own else float("nan")

@@ -352,8 +352,8 @@ class Relocaliser:
         scans = [(pose, self._check.few(paired.points_base())) for _, pose, paired, _ in traced]
         path = sum(a[1].distance(b[1]) for a, b in pairwise(traced))
         means = np.mean([(e.fitness, e.short, e.through, e.unmapped) for e in said], axis=0)
-        rival, other = self._check.rival(scans, winner.pose @ motion)
-        return Evidence(path, float(means[0]), float(means[1]), float(means[2]), float(means[3]), rival, other)
+        compared = self._check.compare(scans, winner.pose @ motion)
+        return Evidence(path, float(means[0]), float(means[1]), float(means[2]), float(means[3]), *compared)
 
     def _retrace(self, winner: Hypothesis, motion: Pose2) -> tuple[tuple[tuple[int, Pose2], ...], bool]:
         """The scans seen while searching, localised backwards from where the robot is now known to be.

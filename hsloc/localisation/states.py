@@ -11,7 +11,7 @@ import numpy as np
 
 from hsloc.localisation.joined_tracks import joined_begins
 from hsloc.localisation.kalman_filter import predict_covariance
-from hsloc.localisation.track_evidence import CONFIDENCE, States, TrackRow, smooth, usual_explained
+from hsloc.localisation.track_evidence import CONFIDENCE, States, TrackRow, mirrored_map, smooth, usual_explained
 from hsloc.model.estimate import Ambiguity, Evidence, LikelyPlace, State, Status
 from hsloc.model.pose2 import Pose2
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
@@ -41,6 +41,7 @@ _SETTLED = 5
 _NAMED = 3
 """Places that are named where several fit."""
 _CONTRADICTED = "scans fit, but by the odometry other stretches of the run are elsewhere"
+_MIRRORED = "the scans fit the map better when they are mirrored"
 USABLE_SHARE = 0.5
 """Least share of localised poses of a result that is usable as a whole."""
 TOLERATED_SHARE = 0.01
@@ -63,13 +64,17 @@ _WORDS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateRows:
-    """Columns of n rows: states, their probability, standard deviations (n, 3) in m, m, rad, fitness and reason."""
+    """Columns of n rows: states, their probability, standard deviations (n, 3) in m, m, rad, fitness and reason.
+
+    `mirrored` is the probability that the map is mirrored, of all rows.
+    """
 
     state: tuple[State, ...]
     probability: F64
     sigma: F64
     fitness: F64
     reason: tuple[str, ...]
+    mirrored: float = 0.0
 
     def __len__(self) -> int:
         return len(self.state)
@@ -190,6 +195,7 @@ class StateLog:
             np.sqrt(variance + between),
             scans.fitness[before],
             tuple(scans.reason[i] for i in worse),
+            scans.mirrored,
         )
 
     def at_scans(self, smoothed: Mapping[int, F64] | None = None) -> StateRows:
@@ -197,6 +203,8 @@ class StateLog:
         rows, owners = self._tracks()
         probabilities = smooth(rows, self._begins)
         own = probabilities if self._begins is None else smooth(rows)
+        mirrored = mirrored_map(rows)
+        kept = min((1.0 - mirrored) / (1.0 - mirrored_map(())), 1.0)  # without evidence for it nothing changes
         usual = usual_explained(rows)
         sigma = self._sigma(owners, smoothed or {})
         states: list[State] = []
@@ -208,14 +216,14 @@ class StateLog:
                 states.append(estimate.state or State.LOST)
                 reasons.append(estimate.reason)
                 continue
-            probability[k] = probabilities[owner, 0]
+            probability[k] = probabilities[owner, 0] * kept
             state, reason = _judge(probabilities[owner], sigma[k], usual, rows[: owner + 1])
             if probability[k] < CONFIDENCE <= own[owner, 0]:
-                state, reason = State.LOST, _CONTRADICTED
+                state, reason = State.LOST, _MIRRORED if mirrored > 1.0 - CONFIDENCE else _CONTRADICTED
             states.append(state)
             reasons.append(reason or estimate.reason)
         fitness = np.array([np.nan if e.fitness is None else e.fitness for e in self._estimates])
-        return StateRows(tuple(states), probability, sigma, fitness, tuple(reasons))
+        return StateRows(tuple(states), probability, sigma, fitness, tuple(reasons), mirrored)
 
     def ambiguities(self) -> tuple[Ambiguity, ...]:
         """The stretches of the scans that are ambiguous, with the places between which they do not decide."""

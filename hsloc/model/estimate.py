@@ -58,7 +58,8 @@ class Evidence:
     `distance` is the path length since the scan before (m). `explained` is the mean score of the beams that no object
     in free space cut short, `short`, `through` and `unmapped` are the shares of all beams that end before a wall,
     behind one, or where the map has nothing. `rival` is the fitness of the fittest other place on the map divided by
-    that of this one, NaN where the places were not compared; `other` is that place, where one was found.
+    that of this one, NaN where the places were not compared; `other` is that place, where one was found. `mirrored` is
+    that of the fittest place for the mirrored scans, NaN where it is not known.
     """
 
     distance: float
@@ -68,6 +69,7 @@ class Evidence:
     unmapped: float = 0.0
     rival: float = float("nan")
     other: Pose2 | None = None
+    mirrored: float = float("nan")
 
 
 class LikelyPlace(NamedTuple):

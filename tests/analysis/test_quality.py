@@ -55,6 +55,16 @@ def test_a_laser_that_is_mounted_upside_down_unstated_is_warned_of(tmp_path: Pat
     assert 0.0 <= reason.times[0][0] <= reason.times[-1][1] <= 20.0
 
 
+def test_a_mirrored_map_is_named() -> None:
+    found = run(RunRequest(logs=(OFFICE,), read=ReadOptions(end_s=4.0)))
+    assert found.states is not None
+    assert found.states.mirrored < 0.1
+    found = replace(found, states=replace(found.states, mirrored=0.95))
+    (warning,) = quality_warnings(found)
+    assert (warning.code, "95 %" in warning.text) == (WarningCode.MAP_MIRRORED, True)
+    assert [reason.verdict for reason in verdict_reasons(found, [warning])] == ["failed"]
+
+
 def test_a_log_too_short_to_be_sure_is_all_guesses() -> None:
     found = run(RunRequest(logs=(OFFICE,), read=ReadOptions(end_s=0.5), unknown_start=True))
     assert not found.localised.any()

@@ -23,7 +23,7 @@ def check_of(occupancy: OccupancyGrid) -> PlaceCheck:
 
 def rival(check: PlaceCheck, places: list[Pose2]) -> float:
     scans = [(place, check.few(seen(L_SHAPE, place, place, 0.0).points_base())) for place in places]
-    return check.rival(scans, places[-1])[0]
+    return check.compare(scans, places[-1]).rival
 
 
 def test_a_room_that_exists_once_has_no_rival() -> None:
@@ -34,12 +34,26 @@ def test_a_room_that_exists_twice_rivals_itself() -> None:
     assert rival(check_of(grid(beside(L_SHAPE, 20.0), TWO)), PLACES) == pytest.approx(1.0, abs=0.06)
 
 
+def test_mirrored_scans_fit_a_mirrored_map() -> None:
+    right = grid(L_SHAPE, ONE)
+    scans = [(place, check_of(right).few(seen(L_SHAPE, place, place, 0.0).points_base())) for place in PLACES]
+    assert check_of(right).compare(scans, PLACES[-1]).mirrored <= 0.98
+    mirrored = replace(right, cells=right.cells[::-1].copy())
+    on_mirrored = check_of(mirrored)
+    top = 2.0 * right.origin.y + right.cells.shape[0] * right.resolution
+    fitting = [(Pose2(p.x, top - p.y, -p.theta), points * (1.0, -1.0)) for p, points in scans]
+    assert on_mirrored.compare(fitting, fitting[-1][0]).mirrored <= 0.98  # these have been mirrored, too
+    best = max((on_mirrored.compare(scans, place).mirrored for place, _ in fitting), default=0.0)
+    assert best > 1.1
+
+
 def test_a_wrong_place_is_beaten_by_the_right_one() -> None:
     check = check_of(grid(L_SHAPE, ONE))
     off = Pose2(4.6, -3.0, 0.9)
     scans = [(off @ place, check.few(seen(L_SHAPE, place, place, 0.0).points_base())) for place in PLACES]
-    ratio, other = check.rival(scans, off @ PLACES[-1])
+    ratio, other, mirrored = check.compare(scans, off @ PLACES[-1])
     assert ratio > 1.2
+    assert mirrored > 1.0
     assert other is not None
     assert other.distance(PLACES[-1]) < 0.1
 

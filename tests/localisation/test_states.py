@@ -44,6 +44,17 @@ def test_a_track_that_fits_is_localised() -> None:
     np.testing.assert_allclose(states.sigma[:, 0], 0.02)
 
 
+def test_on_a_mirrored_map_no_pose_is_known() -> None:
+    track = [estimate(k) for k in range(20)]
+    for k in (5, 12, 19):
+        track[k] = replace(track[k], evidence=Evidence(0.25, GOOD, rival=0.85, mirrored=1.3))
+    states = judged(*track)
+    assert set(states.state) == {State.LOST}
+    assert set(states.reason) == {"the scans fit the map better when they are mirrored"}
+    assert states.mirrored > 0.4
+    assert states.probability.max() < 0.6
+
+
 def test_a_pose_that_no_scan_holds_is_predicted() -> None:
     states = judged(*(estimate(k, sigma=0.3) for k in range(20)))
     assert set(states.state) == {State.PREDICTED}

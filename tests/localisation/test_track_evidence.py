@@ -18,6 +18,7 @@ from hsloc.localisation.track_evidence import (
     TrackFilter,
     TrackRow,
     fit_evidence,
+    mirrored_map,
     rival_evidence,
     smooth,
     usual_explained,
@@ -55,6 +56,17 @@ def test_a_comparison_is_evidence_only_where_one_place_is_clearly_behind() -> No
     assert rival_evidence(float("nan")) == 0.0
     assert rival_evidence(2.0) == -MOST_FROM_RIVAL
     assert rival_evidence(0.89) == pytest.approx(MOST_FROM_RIVAL / 2.0)
+
+
+def test_a_map_is_mirrored_where_the_mirrored_scans_fit_better_at_every_place() -> None:
+    def said(*ratios: float, rival: float = 0.9) -> float:
+        return mirrored_map([TrackRow(Status.MATCHED, Evidence(8.0, GOOD, rival=rival, mirrored=m)) for m in ratios])
+
+    assert said() == said(float("nan"), 1.0, 1.04) == pytest.approx(0.01)  # a symmetric hall
+    assert said(1.2) < 0.1 < said(1.2, 1.1) < 0.5 < said(1.2, 1.1, 1.3, 1.3) < 0.9 < said(*[1.06] * 5)
+    assert said(1.2, 1.2, rival=1.2) == said()  # another place fits as well: this one is wrong, and not the map
+    assert said(0.97, *[1.2] * 3) < 0.1
+    assert 0.0 < said(*[0.97] * 500) < said(*[1.2] * 500) <= 1.0
 
 
 def test_the_fit_counts_by_the_metre() -> None:

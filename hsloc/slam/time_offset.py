@@ -273,13 +273,15 @@ def _headings(pairs: list[tuple[int, float]]) -> Headings:
 
 def _is_sparse(headings: Headings, others: Headings) -> bool:
     """Whether headings are too far apart to be interpolated, and farther than others."""
+    if min(len(headings.theta), len(others.theta)) < 2:
+        return False
     interval_ns, other_ns = (float(np.median(np.diff(each.stamps_ns))) for each in (headings, others))
     return interval_ns > max(other_ns, _SPARSE_S * NANOSECONDS)
 
 
 def thinned(headings: Headings, step_s: float = 0.2) -> Headings:
     """Headings at least `step_s` apart."""
-    kept = [0]
+    kept = [0] if len(headings.theta) else []
     for k, stamp in enumerate(headings.stamps_ns.tolist()):
         if stamp - int(headings.stamps_ns[kept[-1]]) >= step_s * NANOSECONDS:
             kept.append(k)

@@ -186,3 +186,12 @@ def test_stamps_of_a_log_that_is_localised_are_corrected_unless_the_user_gives_t
     as_stamped = run(RunRequest(logs=(late,), read=ReadOptions(time_offset="/scan=0")))
     assert [each.code for each in analyse(as_stamped).metrics.warnings] == ["clock_offset_large"]
     assert evaluate(as_stamped.trajectory, result.reference).ape.trans_part.max > 0.15
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3])
+def test_a_few_headings_show_neither_offset_nor_drift(n: int) -> None:
+    few = Headings(np.arange(n) * 10**8, np.zeros(n))
+    many = Headings(np.arange(50) * 10**8, np.sin(np.arange(50)))
+    for scans, odometry in ((few, many), (many, few), (few, few)):
+        assert not find_offset(scans, odometry).is_significant
+        assert find_drift(scans, odometry, 0.0) == 0.0

@@ -187,7 +187,8 @@ def _localised(
     for event, estimate in replay(drive, localiser):
         history.add(event, estimate)
     trajectory, _ = history.trajectory()
-    states, reference = history.states(localiser.map_scale, None, grid), history.reference()
+    states = history.states(localiser.map_scale, history.mounting_error(), grid)
+    reference = history.reference()
     assert states is not None
     assert reference is not None
     off = trajectory.poses - reference.poses

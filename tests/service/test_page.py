@@ -274,7 +274,13 @@ def look_around_by_keyboard(page: Any) -> None:
     assert (page.text_content(".rv-now") or "").startswith("20.0 s")
     page.keyboard.press("Home")
     assert (page.text_content(".rv-now") or "").startswith("0.0 s")
-    page.keyboard.press("Space")
+    page.select_option("#view [data-do=speed]", "5")
+    page.click("#view [data-do=play]")
+    page.wait_for_function("() => parseFloat(document.querySelector('.rv-now').textContent) > 1.0")
+    page.click("#view [data-do=play]")
+    stopped = page.text_content(".rv-now")
+    page.wait_for_timeout(200)
+    assert page.text_content(".rv-now") == stopped
     with page.expect_download() as download:
         press(page, "#assets button >> text=metrics.json")
     assert download.value.suggested_filename == "metrics.json"

@@ -108,7 +108,7 @@ def _three_figures(value: float) -> str:
 
 
 def reason_texts(reasons: Sequence[VerdictReason]) -> list[str]:
-    """The texts of the reasons; a remedy that several in a row share stands in the last of them alone."""
+    """The texts of the reasons; a remedy that several in a row share is given with the last of them alone."""
     after = (*(reason.remedy for reason in reasons[1:]), "")
     return [
         reason_text(reason if reason.remedy != following else replace(reason, remedy=""))

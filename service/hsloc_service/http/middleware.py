@@ -1,9 +1,8 @@
 """What every request and its answer pass: time-outs, exceptions as answers, conditional and compressed answers.
 
 uvicorn alone never closes a connection whose request does not come: five hundred of them stay five hundred, and resets
-one whose request it has not read. Every error
-has the shape `{"code", "message", "details"}`. A client that polls gets 304 while nothing changes, and gzip where it
-does.
+one whose request it has not read. Every error has the shape `{"code", "message", "details"}`. A client that polls gets
+304 while nothing changes, and gzip where it does.
 """
 
 from __future__ import annotations

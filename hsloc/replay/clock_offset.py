@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.log import LONGEST_OFFSET_S, open_log
-from hsloc.model.estimate import Status
 from hsloc.options import AUTO
+from hsloc.replay.matched_scans import are_matched, is_lost
 from hsloc.slam.mounting_choice import with_chosen_mountings
 from hsloc.slam.time_offset import (
     HINT_S,
@@ -61,6 +61,13 @@ class LateScans(Exception):
         return whole
 
 
+MAPS_CORRECTED_FROM_S = 0.15
+"""Offset (s) from which on a map is built again with corrected stamps.
+
+Of smaller ones the clock of the odometry may be the wrong one as well, and a corrected trajectory no longer has the
+stamps of the scans, which references are often made of. Chosen on two logs: Freiburg 079, 0.13 s, is mapped to 0.032 m
+as it is and to 0.035 m corrected; with ACES' 0.04 s corrected its map with half the field of view is lost.
+"""
 KNOWN = (
     WarningCode.CLOCK_OFFSET,
     WarningCode.CLOCK_OFFSET_LARGE,
@@ -109,23 +116,12 @@ def matched_headings(scans: ScanDiagnostics, odometry: Trajectory, trajectory: T
     """Headings of the scans that were matched on a given map, by the result, and those of the odometry."""
     # A match corrects the poses from the next odometry message on.
     rows = np.searchsorted(odometry.stamps_ns, scans.stamps_ns)
-    matched = is_matched(scans) & (rows < len(odometry))
+    matched = are_matched(scans.status) & (rows < len(odometry))
     rows = np.minimum(rows, len(odometry) - 1)
     there = np.interp(scans.stamps_ns, odometry.stamps_ns, np.unwrap(odometry.poses[:, 2]))
     theta = trajectory.poses[rows, 2] - odometry.poses[rows, 2] + there
     turned = Headings.of(odometry.stamps_ns, odometry.poses[:, 2])
     return Headings.of(scans.stamps_ns[matched], theta[matched]), turned
-
-
-def is_matched(scans: ScanDiagnostics) -> NDArray[np.bool_]:
-    """Which scans were matched, shape (n,)."""
-    return np.isin(scans.status, (Status.MATCHED.value, Status.RELOCALISED.value))
-
-
-def is_lost(scans: ScanDiagnostics) -> bool:
-    """Whether most scans that were to be matched found no match; those the motion gate passed over were not to be."""
-    tried = len(scans.status) - scans.status.count(Status.PREDICTED)
-    return bool(2 * np.count_nonzero(is_matched(scans)) < tried)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +143,7 @@ class ClockEvidence:
     ) -> ClockEvidence:
         """Of a localiser's result with odometry; `localised` (n,) says which of its poses are."""
         offset = find_offset(*matched_headings(scans, odometry, trajectory))
-        return cls(offset, float(localised.mean()), is_lost(scans))
+        return cls(offset, float(localised.mean()), is_lost(scans.status))
 
     @property
     def hints(self) -> bool:
@@ -166,11 +162,8 @@ def offsets_of_mapping(
 ) -> dict[str, Offset]:
     """The offsets (s) by topic that a log shows which has been matched, before its map is solved.
 
-    Raises LateScans where one is certain and the user has given none, if these are to be corrected: from `HINT_S` on.
-    Of smaller ones the clock of the odometry may be the wrong one as well, and a corrected trajectory no longer has
-    the stamps of the scans, which references are often made of. (Freiburg 079, 0.13 s, is mapped to 0.032 m as it is
-    and to 0.035 m corrected; with ACES' 0.04 s corrected its map with half the field of view is lost. On these two the
-    limit was chosen.)
+    Raises LateScans where one is certain and the user has given none, if these are to be corrected: from
+    `MAPS_CORRECTED_FROM_S` on.
     """
     if reading.stamps != "header":
         return {}
@@ -183,7 +176,7 @@ def offsets_of_mapping(
         found = {log.summary.scan_topic or "": offset}
         is_free = offset.is_certain and not _is_given(request)
         option = as_option(found, deskew=deskew) if is_free else None
-    is_large = any(each.is_certain and abs(each.seconds) >= HINT_S for each in found.values())
+    is_large = any(each.is_certain and abs(each.seconds) >= MAPS_CORRECTED_FROM_S for each in found.values())
     if correct and option is not None and is_large:
         raise LateScans({name: each for name, each in found.items() if each.is_certain}, option)
     return found

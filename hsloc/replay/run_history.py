@@ -23,6 +23,7 @@ from hsloc.model.estimate import ScanDiagnostics, State, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
 from hsloc.model.pose2 import Pose2, compose_poses
 from hsloc.model.trajectory import Trajectory
+from hsloc.replay.matched_scans import are_matched, is_lost
 from hsloc.slam.time_offset import (
     LEAST_AGREEMENT,
     NANOSECONDS,
@@ -183,9 +184,8 @@ class RunHistory:
         None where these say nothing: most scans found no match, as with an offset of seconds, or turn unlike the
         odometry. `sweeps` says that scans are stamped when they begin, and show the robot in their middle.
         """
-        matched = np.isin(np.array(self._status), (Status.MATCHED.value, Status.RELOCALISED.value))
-        tried = len(matched) - self._status.count(Status.PREDICTED.value)
-        if len(matched) == 0 or 2 * np.count_nonzero(matched) < tried:
+        matched = are_matched(self._status)
+        if len(matched) == 0 or is_lost(self._status):
             return None
         half_ns = round(float(np.median(np.array(self._half_sweeps_ns)))) if sweeps else 0
         stamps = np.array(self._scan_stamps, dtype=np.int64)[matched] + half_ns

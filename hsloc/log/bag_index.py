@@ -1,15 +1,22 @@
-"""A new index for a ROS 1 bag that has none (wiki.ros.org/Bags/Format/2.0): what is whole of it becomes another bag."""
+"""A new index for a ROS 1 bag without one, or with damage (wiki.ros.org/Bags/Format/2.0).
+
+What is whole of it becomes another bag.
+"""
 
 from __future__ import annotations
 
 import bz2
 import io
 import struct
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
-    from collections.abc import Sized
+    from collections.abc import Iterator, Sized
+    from io import BufferedReader
     from pathlib import Path
+
+    Connections = dict[bytes, tuple[bytes, bytes]]
+    """Header and data of the record of each connection, by its number."""
 
 _BAG_MAGIC, _BAG_HEADER_BYTES = b"#ROSBAG V2.0\n", 4096
 _MOST_HEADER, _MOST_CHUNK = 1 << 20, 1 << 28
@@ -19,29 +26,47 @@ _PIECE = 1 << 14
 _MESSAGE, _INDEX_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = b"\x02", b"\x03", b"\x04", b"\x05", b"\x06", b"\x07"
 
 
-def reindex(source: Path, target: Path) -> int:
-    """Write a bag of the chunks of another, with a new index; the number of chunks.
+_OP_CHUNK = b"\x04\x00\x00\x00op=" + _CHUNK
+_SEARCHED = 1 << 16
+"""Bytes that are searched at once for the next chunk. Internal: time alone."""
+_CHUNK_HEADER = 128
+"""Largest header of a chunk: it has the fields op, compression and size."""
+_MOST_SEARCHES = 100
+"""Number of damaged places behind which the next chunk is searched for. Internal: bounds the time."""
 
-    Of a chunk that was cut, or cannot be unpacked to its end, the records before that are kept.
+
+class Reindexed(NamedTuple):
+    """Number of chunks of a new bag, and of those of the old one that are not whole; whether that had an index."""
+
+    chunks: int
+    damaged: int
+    had_index: bool
+
+
+def reindex(source: Path, target: Path) -> Reindexed:
+    """Write a bag of the chunks of another, with a new index.
+
+    Of a chunk that was cut, or cannot be unpacked or read to its end, the records before that are kept.
     """
-    connections: dict[bytes, tuple[bytes, bytes]] = {}
+    connections: Connections = {}
     infos: list[bytes] = []
+    damaged = 0
     with source.open("rb") as stream, target.open("wb") as out:
         if stream.read(len(_BAG_MAGIC)) != _BAG_MAGIC:
-            return 0
+            return Reindexed(0, 0, False)
         out.write(_BAG_MAGIC + b" " * _BAG_HEADER_BYTES)
-        while (record := _bag_record(stream, may_be_cut=True)) is not None:
-            fields, data = _bag_fields(record[0]), record[1]
-            if fields.get(b"op") == _CONNECTION:
-                connections.setdefault(fields.get(b"conn", b""), record)
-            content = _chunk_content(fields, data) if fields.get(b"op") == _CHUNK else b""
-            if not content:
+        had_index = _note_connections(stream, connections)
+        for fields, data in _chunks(stream, connections):
+            content = _chunk_content(fields, data)
+            entries, whole = _chunk_index(content, connections)
+            size = int.from_bytes(fields.get(b"size", b""), "little")
+            damaged += whole < size or not fields
+            if not whole:
                 continue
-            if len(content) != int.from_bytes(fields.get(b"size", b""), "little"):
-                content = _whole_records(content)
-                head = {b"op": _CHUNK, b"compression": b"none", b"size": _count_of(content)}
-                record = _bag_header(head), content
-            entries = _chunk_index(content, connections)
+            record = _bag_header(fields), data
+            if len(content) != size:
+                head = {b"op": _CHUNK, b"compression": b"none", b"size": whole.to_bytes(4, "little")}
+                record = _bag_header(head), content[:whole]
             at = struct.pack("<Q", out.tell())
             out.write(_packed(*record))
             version = {b"ver": struct.pack("<I", 1)}
@@ -63,7 +88,51 @@ def reindex(source: Path, target: Path) -> int:
         )  # fmt: skip
         out.seek(len(_BAG_MAGIC))
         out.write(_packed(header, b" " * (_BAG_HEADER_BYTES - 8 - len(header))))
-    return len(infos)
+    return Reindexed(len(infos), damaged, had_index)
+
+
+def _note_connections(stream: BufferedReader, connections: Connections) -> bool:
+    """The connections that stand behind the last chunk, if the bag says where; whether it does.
+
+    Each has another record where it begins, which a damaged chunk may hold.
+    """
+    begin = stream.tell()
+    head = _bag_record(stream)
+    if head is not None:
+        begin = stream.tell()
+        place = int.from_bytes(_bag_fields(head[0]).get(b"index_pos", b""), "little")
+        stream.seek(min(place, stream.seek(0, io.SEEK_END)))
+        while (record := _bag_record(stream)) is not None:
+            fields = _bag_fields(record[0])
+            if fields.get(b"op") != _CONNECTION:
+                break
+            connections.setdefault(fields.get(b"conn", b""), record)
+    stream.seek(begin)
+    return bool(connections)
+
+
+def _chunks(stream: BufferedReader, connections: Connections) -> Iterator[tuple[dict[bytes, bytes], bytes]]:
+    """Header and data of each chunk; behind what is damaged, from the next header of one on. Connections are noted.
+
+    What is between and no record gives an empty header.
+    """
+    for _ in range(_MOST_SEARCHES):
+        is_sound = True
+        while is_sound:
+            begin = stream.tell()
+            record = _bag_record(stream, may_be_cut=True)
+            fields = {} if record is None else _bag_fields(record[0])
+            op = fields.get(b"op")
+            if record is not None and op == _CHUNK:
+                yield fields, record[1]
+            elif record is not None and op == _CONNECTION:
+                connections.setdefault(fields.get(b"conn", b""), record)
+            # A chunk that goes on to the end may state a size that is wrong.
+            is_sound = op is not None and not (op == _CHUNK and not stream.peek(1))
+        if op is None and begin < stream.seek(0, io.SEEK_END):
+            yield {}, b""
+        if not _seek_chunk(stream, begin + 1):
+            return
 
 
 def _bag_record(stream: IO[bytes], may_be_cut: bool = False) -> tuple[bytes, bytes] | None:
@@ -79,12 +148,27 @@ def _bag_record(stream: IO[bytes], may_be_cut: bool = False) -> tuple[bytes, byt
     return (parts[0], parts[1]) if parts[0] else None
 
 
-def _whole_records(content: bytes) -> bytes:
-    """The records of a chunk up to the first that is not whole."""
-    stream, end = io.BytesIO(content), 0
-    while _bag_record(stream) is not None:
-        end = stream.tell()
-    return content[:end]
+def _seek_chunk(stream: BufferedReader, begin: int) -> bool:
+    """Go to the next chunk whose header is whole, from a place on; whether there is one."""
+    while True:
+        stream.seek(begin)
+        piece = stream.read(_SEARCHED + _CHUNK_HEADER)
+        if (found := piece.find(_OP_CHUNK, 0)) < 0:
+            if len(piece) <= _CHUNK_HEADER:
+                return False
+            begin += max(len(piece) - _CHUNK_HEADER, 1)
+            continue
+        for back in range(4, _CHUNK_HEADER):
+            at = begin + found - back
+            if at < begin:
+                break
+            stream.seek(at)
+            size = int.from_bytes(stream.read(4), "little")
+            header = _bag_fields(stream.read(size)) if back - 4 <= size <= _CHUNK_HEADER else {}
+            if header.keys() == {b"op", b"compression", b"size"}:
+                stream.seek(at)
+                return True
+        begin += found + 1
 
 
 def _bag_fields(header: bytes) -> dict[bytes, bytes]:
@@ -134,8 +218,10 @@ def _chunk_content(fields: dict[bytes, bytes], data: bytes) -> bytes:
     return bytes(found)
 
 
-def _chunk_index(content: bytes, connections: dict[bytes, tuple[bytes, bytes]]) -> dict[bytes, list[bytes]]:
-    """Time (8 bytes) and place (4) of each message of a chunk, by connection; connections are noted."""
+def _chunk_index(content: bytes, connections: Connections) -> tuple[dict[bytes, list[bytes]], int]:
+    """Time (8 bytes) and place (4) of each message of a chunk, by connection, and where the first record that is not
+    whole begins; connections are noted.
+    """
     found: dict[bytes, list[bytes]] = {}
     stream = io.BytesIO(content)
     at = 0
@@ -147,4 +233,4 @@ def _chunk_index(content: bytes, connections: dict[bytes, tuple[bytes, bytes]]) 
         elif fields.get(b"op") == _MESSAGE and conn in connections and len(time) == 8:
             found.setdefault(conn, []).append(time + at.to_bytes(4, "little"))
         at = stream.tell()
-    return found
+    return found, at

@@ -3,7 +3,8 @@
 A database that was copied while its recorder ran, or whose recorder was killed, keeps its newest messages in the
 write-ahead log beside it (`-wal`). The two are copied into a temporary folder and read together, so that nothing beside
 the user's file is created or changed. A ROS 1 bag without an index, because its recorder was stopped
-hard or the file was cut, gets one in a temporary copy, as `rosbag reindex` makes it (wiki.ros.org/Bags/Format/2.0).
+hard or the file was cut, gets one in a temporary copy, as `rosbag reindex` makes it (wiki.ros.org/Bags/Format/2.0);
+so does one with a damaged chunk, which would end it otherwise.
 """
 
 from __future__ import annotations
@@ -93,23 +94,27 @@ class BagContainer(_Bag):
         self._file = path
         self._scratch = Scratch()
         try:
-            self._open()
+            is_damaged = self._open()
         except LogFormatError:
             if not self._is_reindexed():
                 raise
             self._open()
+        else:
+            if is_damaged and self._is_reindexed():
+                self._open()
 
-    def _open(self) -> None:
+    def _open(self) -> bool:
+        """Whether the bag is damaged on the way."""
         with self._guarded(), self._reader() as reader:
             self.channels = {k: self._channel(k, each) for k, each in enumerate(reader.connections)}
             self.statistics = {}
-            self._count(reader)
+            return self._count(reader)
 
     def _is_reindexed(self) -> bool:
-        """Whether a bag with an index could be made of what is whole of a file without one; it is read from then on."""
+        """Whether a sound bag could be made of what is whole of a file; it is read from then on."""
         copy = self._scratch.folder / "reindexed.bag"
         try:
-            chunks = reindex(self._file, copy)
+            chunks, damaged, had_index = reindex(self._file, copy)
         except OSError as error:
             raise LogError(
                 f"{self.path}: has no index, and a copy with one cannot be written ({error.strerror or error}); set "
@@ -118,10 +123,13 @@ class BagContainer(_Bag):
         if not chunks:
             return False
         self._file = copy
-        self.losses_at_opening.truncated_files += 1
-        self.losses_at_opening.note(
-            f"{self.path}: has no index, or a wrong one: its {chunks} chunks are read as far as they go"
-        )
+        losses = self.losses_at_opening
+        if had_index and damaged:
+            losses.damaged_chunks += damaged
+            losses.note(f"{self.path}: {damaged} of its chunks are damaged: {chunks} are read as far as they go")
+        else:
+            losses.truncated_files += 1
+            losses.note(f"{self.path}: has no index, or a wrong one: its {chunks} chunks are read as far as they go")
         return True
 
     def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
@@ -156,7 +164,8 @@ class BagContainer(_Bag):
         topic, typename = str(connection.topic), long_name(str(connection.msgtype))
         return Channel(number, topic, typename, "ros1", form, definition.data.encode())
 
-    def _count(self, reader: _Reader) -> None:
+    def _count(self, reader: _Reader) -> bool:
+        """Statistics of each topic; whether the bag is damaged on the way."""
         numbers = self._numbers(reader)
         damage = Losses()
         with self._guarded(damage):
@@ -168,6 +177,7 @@ class BagContainer(_Bag):
         if not damage.reasons and counted < promised:
             self.losses_at_opening.truncated_files += 1
             self.losses_at_opening.note(f"{self.path}: holds {counted} messages of {promised} that it speaks of")
+        return bool(damage.reasons)
 
     def _guarded(self, losses: Losses | None = None) -> AbstractContextManager[None]:
         remedy = "`rosbag reindex` (or of version 1.2 `rosbag fix`)"

@@ -102,6 +102,24 @@ def test_a_bag_without_its_index_is_read_as_far_as_it_goes(tmp_path: Path, mcap:
     assert "chunks are read as far as they go" in " ".join(log.losses.reasons)
 
 
+@pytest.mark.parametrize(("compression", "in_header"), [("", True), ("", False), ("BZ2", False)])
+def test_a_damaged_chunk_of_a_bag_is_lost_alone(tmp_path: Path, mcap: Path, compression: str, in_header: bool) -> None:
+    path = log_formats.bag1(mcap, tmp_path / "whole.bag", chunk_bytes=2000, compression=compression)
+    expected = list(map(describe, open_log(path).events()))
+    data = bytearray(path.read_bytes())
+    chunk = data.index(b"op=\x05", len(data) // 2)
+    begin = chunk - (8 if in_header else -80)
+    data[begin : begin + 60] = b"\x55" * 60
+    path.write_bytes(data)
+    log = open_log(path)
+    found = list(map(describe, log.events()))
+    assert len(expected) - 20 < len(found) < len(expected)
+    assert set(found) < set(expected)
+    assert found[-1] == expected[-1]
+    assert log.losses.damaged_chunks == 1
+    assert log.losses.truncated_files == 0
+
+
 @pytest.mark.parametrize(("compression", "least"), [("", 0.45), ("LZ4", 0.2)])
 def test_the_whole_records_of_a_chunk_that_was_cut_are_read(tmp_path: Path, compression: str, least: float) -> None:
     mcap = write_run(tmp_path / "run.mcap", scans=200)

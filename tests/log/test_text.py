@@ -123,6 +123,14 @@ def test_scans_with_an_offset_are_in_the_order_of_their_corrected_stamps(
         assert [event.stamp_ns for event in events] == sorted(event.stamp_ns for event in events)
 
 
+def test_odometry_with_an_offset_takes_its_place_among_the_scans(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.clf", [odom("1"), odom("2"), flaser("2.1", [1.0] * 181), odom("3")])
+    events = list(open_log(path, ReadOptions(time_offset="ODOM=0.25")).events())
+    assert [event.stamp_ns / SECOND for event in events] == [1.25, 2.1, 2.25, 3.25]
+    with pytest.raises(TopicError, match="no lines odom that --time-offset could move; it has FLASER, ODOM"):
+        open_log(path, ReadOptions(time_offset="/odom=0.25"))
+
+
 def test_laser_lines_give_odometry_only_where_nothing_else_does(tmp_path: Path) -> None:
     path = write(tmp_path / "log.clf", [flaser("1", [1.0] * 180, x=1.0), flaser("2", [1.0] * 180, x=2.0)])
     log = open_log(path)

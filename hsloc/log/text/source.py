@@ -107,6 +107,7 @@ class TextSource:
         self._rule = RangeRule()
         self._code = NoReturnCode()
         self._laser_lines_count = False
+        self._scan_offset_ns = self._odometry_offset_ns = 0
         self._kept: list[tuple[str, Line]] = []
         self._kept_losses: Losses | None = None
         self.losses_at_opening = Losses()
@@ -153,7 +154,9 @@ class TextSource:
 
     def _events_of(self, line: Line) -> Iterator[Event]:
         if line.odometry is not None and (line.scan is not None) == self._laser_lines_count:
-            yield line.odometry
+            offset_ns = self._odometry_offset_ns
+            odometry = line.odometry
+            yield replace(odometry, stamp_ns=odometry.stamp_ns + offset_ns) if offset_ns else odometry
         if line.scan is not None:
             scan = line.scan
             yield Scan(  # All fields by name: a copy by `replace` takes as long as the line.
@@ -213,17 +216,26 @@ class TextSource:
         others = [keyword for keyword in kinds["odometry"] if keyword not in kinds["scan"]]
         self._laser_lines_count = bool(of_lasers) and (self._format.laser_odometry or not others)
         kinds["odometry"] = dict.fromkeys(of_lasers if self._laser_lines_count else others)
-        self._calibrate(kinds["scan"])
+        self._calibrate(kinds["scan"], kinds["odometry"])
         return self._summary(topics, kinds, first_ns or 0, latest, first_scan, scan_keyword)
 
-    def _calibrate(self, scan_keywords: Collection[str]) -> None:
-        """Mounting and offset of the laser: its lines, which may have several keywords, are of one laser and clock."""
+    def _calibrate(self, scans: Collection[str], odometry: Collection[str]) -> None:
+        """Mounting and offset of the laser: its lines, which may have several keywords, are of one laser and clock.
+
+        Raises TopicError where an offset is given for what is not in the log.
+        """
         calibration, offsets = self._options.calibration, replace(self._options, calibration=None).offsets_s()
         lidars = () if calibration is None else calibration.lidars
-        lidar = next((each for topic, each in lidars if topic.lstrip("/") in scan_keywords), LidarCalibration())
+        lidar = next((each for topic, each in lidars if topic.lstrip("/") in scans), LidarCalibration())
         self._given_mounting = self._options.laser_pose or lidar.T_base_laser
-        offset_s = lidar.time_offset_s + sum(value for name, value in offsets.items() if name != "ODOM")
-        self._scan_offset_ns = round(1e9 * offset_s)
+        unknown = [name for name in offsets if name not in scans and name not in odometry]
+        if unknown:
+            names = ", ".join((*scans, *(name for name in odometry if name not in scans)))
+            raise TopicError(f"{self._shown}: no lines {unknown[0]} that --time-offset could move; it has {names}")
+        # A keyword of both is the laser's: its stamps are those that come late.
+        of_scans = sum(value for name, value in offsets.items() if name in scans)
+        self._scan_offset_ns = round(1e9 * (lidar.time_offset_s + of_scans))
+        self._odometry_offset_ns = round(1e9 * sum(value for name, value in offsets.items() if name not in scans))
 
     def _summary(
         self,
@@ -286,12 +298,14 @@ class TextSource:
     def events(self, losses: Losses) -> Iterator[tuple[int, Event]]:
         """As `Source.events`: in the order of the lines; effective stamps are the running maximum.
 
-        Scans with an offset take the place among the other lines that their corrected stamps have.
+        Events with an offset take the place among the other lines that their corrected stamps have.
         """
         latest: int | None = None
         last: dict[tuple[str, type], int] = {}
         recent: dict[tuple[str, type], deque[int]] = {}
         number = 0
+        offsets = {Scan: self._scan_offset_ns, Odometry: self._odometry_offset_ns}
+        earliest = min(*offsets.values(), 0)
         waiting: list[tuple[int, int, Event]] = []
         for keyword, line in self._parsed(losses):
             for event in self._events_of(line):
@@ -303,13 +317,13 @@ class TextSource:
                 around.append(event.stamp_ns)
                 if len(around) == 2 * AGREEING and (step := _step_back(around)) is not None:
                     losses.clock_steps.setdefault(keyword, []).append((step, around[AGREEING - 1]))
-                offset_ns = self._scan_offset_ns if isinstance(event, Scan) else 0
+                offset_ns = offsets.get(type(event), 0)
                 as_written = event.stamp_ns - offset_ns
                 latest = as_written if latest is None else max(latest, as_written)
                 number += 1
                 heappush(waiting, (latest + offset_ns, number, event))
                 # No line to come is earlier than that.
-                while waiting and waiting[0][0] <= latest + min(self._scan_offset_ns, 0):
+                while waiting and waiting[0][0] <= latest + earliest:
                     effective, _, first = heappop(waiting)
                     yield effective, first
         while waiting:

@@ -52,9 +52,10 @@ def run(arguments: argparse.Namespace) -> int:
     with ProgressLine(arguments.quiet or arguments.json or arguments.no_progress) as line:
         report = check_log(log, lambda log_time: line.show("check", (log_time - start) / span))
     options, findings = _with_choices(read_options(arguments), log, report.findings)
-    # An offset is none where a clock was set in the middle.
-    offsets = {} if report.losses.clock_steps else _offsets(options, log)
-    report = replace(report, findings=(*findings, *_of_clocks(offsets)))
+    of_odometry = _of_odometry(log)
+    # An offset is none where a clock was set in the middle, or to odometry that says nothing.
+    offsets = {} if report.losses.clock_steps or of_odometry else _offsets(options, log)
+    report = replace(report, findings=(*findings, *of_odometry, *_of_clocks(offsets)))
     seconds = {topic: offset.seconds for topic, offset in offsets.items()}
     unkept = [] if profile is None else violations(profile, log.summary, report, seconds)
     if arguments.json:
@@ -90,6 +91,25 @@ def _with_choices(
         return options, findings
     kept = [f for f in findings if not warnings or f.code != WarningCode.EXTRINSICS_RESTATED]
     return options, (*kept, *(Finding(w.code, Severity.WARNING, "", w.text, w.remedy, 1) for w in warnings))
+
+
+def _of_odometry(log: Log) -> list[Finding]:
+    """A finding where the odometry proves unusable, so that a run would go on without it."""
+    from hsloc.log import Finding, Severity
+    from hsloc.preprocessing.odometry import OdometryWatch, UnusableOdometry
+    from hsloc.warnings import WarningCode
+
+    topic = log.summary.odom_topic
+    if log.summary.scan_topic is None or topic is None:
+        return []
+    try:
+        for _ in OdometryWatch(log.events()):
+            pass
+    except UnusableOdometry as error:
+        remedy = "repair its source, or name another with --odom-topic; a run ignores it"
+        text = f"the odometry cannot be used: {error}"
+        return [Finding(WarningCode.ODOMETRY_UNUSABLE, Severity.ERROR, topic, text, remedy, 1)]
+    return []
 
 
 def _offsets(options: ReadOptions, log: Log) -> dict[str, Offset]:

@@ -340,7 +340,7 @@ class Losses:
             ("messages without stamp; the log's time was taken", self.stamps_zero),
             ("messages without stamp were dropped", self.stamps_zero_dropped),
             (
-                "orientations are no rotations (zeros, no w, or angles beside w = 1): left out between others",
+                "orientations are no rotations (zeros, NaN, no w, or angles beside w = 1): left out between others",
                 self.orientations_unset,
             ),
         )

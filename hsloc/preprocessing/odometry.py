@@ -171,7 +171,7 @@ class OdometryWatch:
             return
         # Between others a few are left out when the log is read; those that come have none around them.
         if self._had_heading or hypot(pose.x - self._start[0], pose.y - self._start[1]) > _UNSET_WAY:
-            raise UnusableOdometry("its orientations are not set (zeros, no w, or angles beside w = 1)")
+            raise UnusableOdometry("its orientations are not set (zeros, NaN, no w, or angles beside w = 1)")
 
     def _compare(self, scan: Scan) -> None:
         """Count the time for which the scans change and the odometry does not."""

@@ -221,7 +221,7 @@ def _run_with(
     begin = time.perf_counter()
     log, reading, of_log = open_as_meant(request, lidar_only, time_offset)
     warnings = (*warnings, *of_log)
-    lidar_only = lidar_only or log.summary.heading_topic is not None
+    lidar_only = lidar_only or log.summary.odom_topic is None
     of_reference: list[RunWarning] = []
     reference = None if request.reference is None else read_reference(request.reference, request.logs, of_reference)
     grid, of_map = find_map(request, log)

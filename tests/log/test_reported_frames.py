@@ -17,7 +17,7 @@ from hsloc.log import LogWriter, ReadOptions, check_log, convert_log, open_log
 from hsloc.log.messages import definitions
 from hsloc.log.summary import Losses
 from hsloc.log.transforms import Transform3
-from hsloc.model import OccupancyGrid, Pose2
+from hsloc.model import OccupancyGrid, Pose2, Scan
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -152,6 +152,21 @@ def test_a_frame_with_two_parents_is_looked_up_by_the_one_that_leads_to_the_base
     assert any("camera_mount" in str(warning) for warning in summary.warnings)
 
 
+def test_a_static_transform_is_no_odometry(tmp_path: Path) -> None:
+    path = tmp_path / "static.mcap"
+    with LogWriter(path) as log:
+        log.transforms(START, [("odom", "base_link", Pose2()), ("base_link", "laser", MOUNTING)], static=True)
+        for number in range(5):
+            log.scan(make_scan(START + number * SECOND, number))
+    found = open_log(path)
+    assert found.summary.odom_topic is None
+    (warning,) = found.summary.warnings
+    assert warning.code == "odometry_unusable"
+    assert "odom -> base_link is a static transform" in warning.text
+    assert [finding.code for finding in check_log(found).findings] == ["odometry_unusable"]
+    assert all(isinstance(event, Scan) for event in found.events())
+
+
 def test_a_mounting_that_was_assumed_stays_an_assumption_after_conversion(tmp_path: Path) -> None:
     source = write_run(tmp_path / "a.mcap", mounting=None)
     convert_log(open_log(source), tmp_path / "b.mcap")
@@ -243,8 +258,15 @@ def test_a_start_pose_in_the_frame_of_the_odometry_is_moved_or_left_out(tmp_path
 
 @pytest.mark.parametrize(
     "quaternion",
-    [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.3, 0.0), (0.001, 0.0, 0.3, 0.0), (0.0, 0.0, 45.0, 1.0), (0.0, 0.1, -0.4, 1.0)],
-    ids=["zeros", "z alone", "no w", "degrees", "angles"],
+    [
+        (0.0, 0.0, 0.0, 0.0),
+        (float("nan"),) * 4,
+        (0.0, 0.0, 0.3, 0.0),
+        (0.001, 0.0, 0.3, 0.0),
+        (0.0, 0.0, 45.0, 1.0),
+        (0.0, 0.1, -0.4, 1.0),
+    ],
+    ids=["zeros", "nan", "z alone", "no w", "degrees", "angles"],
 )
 def test_orientations_that_were_never_filled_are_counted(
     tmp_path: Path, plain: Path, quaternion: tuple[float, ...]

@@ -10,6 +10,7 @@ import log_formats
 import numpy as np
 import pytest
 
+from hsloc.cli.main import main
 from hsloc.evaluation import evaluate
 from hsloc.log import ReadOptions, open_log
 from hsloc.log.messages import definitions, encode
@@ -81,12 +82,16 @@ def test_sound_odometry_is_kept(tmp_path: Path) -> None:
     assert result.warnings == ()
 
 
-def test_a_map_is_built_without_the_odometry_that_does_not_move(tmp_path: Path) -> None:
+def test_a_map_is_built_without_the_odometry_that_does_not_move(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     log = rewritten(tmp_path / "log.mcap", lambda number, pose: Pose2(0.0, 0.0, 0.0))
     result = run(RunRequest(logs=(log,), read=END, mode="slam"))
     assert any(warning.code == "odometry_unusable" for warning in result.warnings)
     assert result.reference is not None
     assert evaluate(result.trajectory, result.reference, alignment="se2").ape.trans_part.rmse < 0.03
+    assert main(["check", str(log), "-q"]) == 1
+    assert "error: /odom: the odometry cannot be used: it does not move" in capsys.readouterr().out
 
 
 def test_lidar_alone_on_a_given_map_gives_the_same_bytes_twice() -> None:

@@ -141,7 +141,8 @@ def _check_summary(summary: LogSummary, has_scans: bool, findings: Findings) -> 
         findings.add(
             Severity.WARNING, "scan_ambiguous", "", "several scan topics", "choose with --scan-topic, or name them all"
         )
-    if summary.odom_topic is None and summary.heading_topic is None:
+    is_fixed = any(warning.code == WarningCode.ODOMETRY_UNUSABLE for warning in summary.warnings)
+    if summary.odom_topic is None and summary.heading_topic is None and not is_fixed:
         findings.add(
             Severity.WARNING, "no_odometry", "", "no odometry on a topic of its own or in /tf that would be chosen",
             "choose with --odom-topic, or map without it: --no-odom",

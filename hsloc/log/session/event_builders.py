@@ -240,17 +240,21 @@ class OdometryFeed:
         stamp = self._clock.stamp(message.stamp_ns, log_time_ns)
         if stamp is None:
             return ()
-        if not is_usable(message.pose):
+        pose = message.pose
+        has_heading = isfinite(pose.theta) and states_rotation(getattr(message, "quaternion", _NO_ROTATION))
+        if not (has_heading or self.is_truth or isfinite(pose.theta)):
+            pose = Pose2(pose.x, pose.y, 0.0)
+        if not is_usable(pose):
             self._losses.invalid_messages[self.topic] += 1
             self._losses.note(f"{self.topic}: poses hold NaN or infinity, or are beyond {MAX_ABS:g} m")
             return ()
-        pose = message.pose if self._T_child_base is None else message.pose @ self._T_child_base
+        place = pose
+        pose = pose if self._T_child_base is None else pose @ self._T_child_base
         if self.is_truth:
             return ((self._clock, Truth(stamp, pose)),)
-        has_heading = states_rotation(getattr(message, "quaternion", _NO_ROTATION))
         if not has_heading:
             self._losses.orientations_unset[self.topic] += 1
-        if self._gaps.is_gap(message.pose, has_heading):
+        if self._gaps.is_gap(place, has_heading):
             return ()
         return ((self._clock, Odometry(stamp, pose, message.covariance, has_heading)),)
 

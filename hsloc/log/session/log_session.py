@@ -94,7 +94,7 @@ class LogSession:
         )
         self._warnings += self.transforms.warnings
         self.tf_frames = self.transforms.odometry
-        self.choice = choose_topics(where, self.active, options, self.tf_frames is not None)
+        self.choice = choose_topics(where, self.active, options, self.transforms)
         self._warnings += self.choice.warnings
         odom = self.choice.odom
         self._parts, of_parts = check_parts(

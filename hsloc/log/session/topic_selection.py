@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from hsloc.log.container import Channel
     from hsloc.log.messages.decode import GridMessage
     from hsloc.log.messages.odometry_kind import OdometryKind
+    from hsloc.log.session.transform_topics import TransformTopics
     from hsloc.log.summary import ReadOptions
 
 TF, TF_STATIC = "/tf", "/tf_static"
@@ -70,9 +71,11 @@ def names_transforms(channels: Sequence[Channel], name: str | None) -> str | Non
 
 
 def choose_topics(
-    where: str, channels: Sequence[Channel], options: ReadOptions, tf_has_odometry: bool
+    where: str, channels: Sequence[Channel], options: ReadOptions, transforms: TransformTopics
 ) -> TopicSelection:
     """Take the topics that the options name, else the only ones of their type.
+
+    A log whose odometry is a static transform is read without: a run goes by its scans alone.
 
     `channels` are those that have messages. Raises TopicError, naming the candidates and the flag to choose with,
     where a required topic is missing or ambiguous, and always where a named one does not exist.
@@ -89,8 +92,13 @@ def choose_topics(
         own = {namespace(topic) for topic in choice.scans}
         near = [topic for topic in candidates if {namespace(topic)} == own != {""}]
         candidates = near if len(near) == 1 and not named else candidates  # of several robots the one with these scans
-        if not named and tf_has_odometry and rank > Rank.TRANSFORMS:
+        if not named and transforms.odometry is not None and rank > Rank.TRANSFORMS:
             choice.odom = TF
+        elif not (named or candidates) and transforms.fixed_odometry is not None:
+            parent, child = transforms.fixed_odometry
+            text = f"the odometry is ignored: {parent} -> {child} is a static transform, which does not move"
+            remedy = _remedy_of_none("odom", channels, options)
+            choice.warnings.append(RunWarning(WarningCode.ODOMETRY_UNUSABLE, text, remedy))
         elif not named and candidates and (says := _kind_on(others, candidates[0]).says):
             choice.odom = candidates[0]
             choice.warnings.append(

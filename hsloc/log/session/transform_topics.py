@@ -97,14 +97,16 @@ def read_links(
 class TransformTopics:
     """The topics of transforms that are read, and what they say of odometry.
 
-    `odometry` is (parent, child) of the link that is odometry, None without one; `has_map_to_odometry` whether a
-    localiser published its correction. `stated` are the parent and the first pose of each frame on the dynamic topics.
-    `warnings` are what had to be decided.
+    `odometry` is (parent, child) of the link that is odometry, None without one; `fixed_odometry` that of a static link
+    which has its place, where there is none. `has_map_to_odometry` says whether a localiser published its correction.
+    `stated` are the parent and the first pose of each frame on the dynamic topics. `warnings` are what had to be
+    decided.
     """
 
     dynamic: frozenset[str] = frozenset()
     static: frozenset[str] = frozenset()
     odometry: tuple[str, str] | None = None
+    fixed_odometry: tuple[str, str] | None = None
     has_map_to_odometry: bool = False
     stated: dict[str, tuple[str, Transform3]] = field(default_factory=dict)
     warnings: list[RunWarning] = field(default_factory=list)
@@ -148,6 +150,8 @@ def choose_transforms(
     found.odometry = odometry_link(moving, resting, lasers, base)
     if found.odometry is None and named is not None:
         found.odometry = _topmost_link(moving, resting, lasers, base)
+    if found.odometry is None:
+        found.fixed_odometry = odometry_link(resting, (), lasers, base)
     for topic in sorted(found.dynamic):
         found.stated.update({child: (parent, first) for (parent, child), first in links[topic].items()})
     found.has_map_to_odometry = any(is_map_frame(parent) for parent, _ in moving) or any(

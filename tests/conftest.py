@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import pkgutil
 import warnings
+from functools import cache
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from coverage import Coverage
 from hypothesis import HealthCheck, settings
 from paths import DATA, RECORDINGS, ROOT
 
@@ -17,6 +21,8 @@ from paths import DATA, RECORDINGS, ROOT
 os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / "build" / "numba"))
 os.environ.setdefault("MPLCONFIGDIR", str(ROOT / "build" / "matplotlib"))
 
+import hsloc
+import hsloc_service
 from hsloc.trajectory_io.tum import write_tum
 
 # How long an example takes depends on how busy the machine is.
@@ -24,7 +30,7 @@ settings.register_profile("hsloc", deadline=None, suppress_health_check=[HealthC
 settings.load_profile("hsloc")
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Generator
     from pathlib import Path
 
 
@@ -36,6 +42,32 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first; a file's tests stay together and in order."""
     folders = {item: item.path.parent.name for item in items}
     items.sort(key=lambda item: folders[item] not in _LONGEST_FIRST)
+
+
+@cache
+def _import_every_module() -> None:
+    """One that a test without coverage imports first would not count."""
+    for package in (hsloc, hsloc_service):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if not module.name.startswith("hsloc_service.db.scripts."):  # Alembic's: run, never imported
+                importlib.import_module(module.name)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Measure no coverage of an `unmeasured` test with its fixtures, nor in the processes that they start."""
+    measured = Coverage.current()
+    if measured is None or item.get_closest_marker("unmeasured") is None:
+        return (yield)
+    _import_every_module()
+    of_processes = os.environ.pop("COVERAGE_PROCESS_CONFIG", None)
+    measured.stop()
+    try:
+        return (yield)
+    finally:
+        measured.start()
+        if of_processes is not None:
+            os.environ["COVERAGE_PROCESS_CONFIG"] = of_processes
 
 
 @pytest.fixture(scope="session")

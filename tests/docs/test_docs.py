@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
-import pkgutil
 import re
 import shlex
 import subprocess
@@ -15,7 +13,6 @@ from typing import Any
 import pytest
 from paths import ROOT
 
-import hsloc
 from hsloc.cli.main import COMMANDS, build_parser, main
 from hsloc.config import Config, to_dict
 
@@ -38,18 +35,10 @@ def commands(path: Path) -> list[str]:
     return [line for line in lines if line.strip() and not line.startswith("#")]
 
 
-@pytest.fixture(scope="module")
-def every_module() -> None:
-    """All modules are imported with tracing: one that a test without tracing imports first would not count."""
-    for module in pkgutil.walk_packages(hsloc.__path__, "hsloc."):
-        importlib.import_module(module.name)
-
-
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recordings: Path, every_module: None) -> Path:
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recordings: Path) -> Path:
     (tmp_path / "recordings").symlink_to(recordings, target_is_directory=True)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)  # processes that are started are not traced, either
     return tmp_path
 
 
@@ -69,7 +58,7 @@ def run_line(line: str, capsys: pytest.CaptureFixture[str]) -> int:
     return status
 
 
-@pytest.mark.no_cover  # what they run has tests of its own; tracing it takes half as long again
+@pytest.mark.unmeasured
 @pytest.mark.parametrize("path", [path for path in GUIDES if commands(path)], ids=lambda path: path.name)
 def test_every_command_of_a_guide_works_as_described(
     path: Path, here: Path, capsys: pytest.CaptureFixture[str]
@@ -82,7 +71,7 @@ def test_every_command_of_a_guide_works_as_described(
         assert "Traceback" not in printed.err
 
 
-@pytest.mark.no_cover
+@pytest.mark.unmeasured
 @pytest.mark.parametrize("path", [path for path in GUIDES if blocks(path, "python")], ids=lambda path: path.name)
 def test_the_examples_run_from_top_to_bottom(path: Path, here: Path) -> None:
     names: dict[str, object] = {"__name__": "example"}

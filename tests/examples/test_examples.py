@@ -15,6 +15,8 @@ from paths import RECORDINGS, ROOT
 if TYPE_CHECKING:
     from pathlib import Path
 
+pytestmark = pytest.mark.unmeasured
+
 EXAMPLES = ROOT / "examples"
 OFFICE = str(RECORDINGS / "office.mcap")
 

@@ -19,6 +19,8 @@ from hsloc.simulation.presets import CORRIDOR_LOOP, DRIFTING, OFFICE
 from hsloc.simulation.simulator import events
 from hsloc.simulation.world import World
 
+pytestmark = pytest.mark.unmeasured
+
 WRONG_M, WRONG_RAD = 0.25, np.radians(5.0)
 PLAIN = World(
     "plain",

@@ -28,6 +28,8 @@ from hsloc_service.http.schemas import UUID_PATTERN
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+pytestmark = pytest.mark.unmeasured
+
 TOKEN = "a-token-of-the-operator-0123456789"
 FEW = {"Config": ("matcher", "hide"), "RunRequest": ("mode", "seed"), "SweepOptions": ("matcher", "priority")}
 """Of the parameters, which one table checks, some will do; `/v1/run` takes what `/v1/jobs` does, which is all tried."""

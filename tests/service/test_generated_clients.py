@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from live_service import Live
 
+pytestmark = pytest.mark.unmeasured
+
 TOKEN = "a-token-of-the-operator-0123456789"
 PYTHON_CLIENT = """
 import hashlib, io, sys, time

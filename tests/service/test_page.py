@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 from xml.etree import ElementTree
 
+import pytest
 from live_service import upload
 from paths import RECORDINGS
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from live_service import Live
+
+pytestmark = pytest.mark.unmeasured
 
 REAL = ",".join(Settings().worker_command)
 NASTY = "<img src=x onerror=alert(1)>.mcap"

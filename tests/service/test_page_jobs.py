@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
+import pytest
 from live_service import submit, wait
 from paths import RECORDINGS
 
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from live_service import Live
+
+pytestmark = pytest.mark.unmeasured
 
 
 def test_the_form_offers_what_the_server_does(

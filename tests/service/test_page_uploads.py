@@ -6,11 +6,15 @@ import hashlib
 import os
 from typing import TYPE_CHECKING, Any
 
+import pytest
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
     from live_service import Live
+
+pytestmark = pytest.mark.unmeasured
 
 
 def test_a_token_is_required(make_live: Callable[..., Live], open_page: Callable[..., Any]) -> None:

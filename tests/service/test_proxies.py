@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     from live_service import Live
 
+pytestmark = pytest.mark.unmeasured
+
 NGINX = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")
 CADDY = shutil.which("caddy")
 NGINX_CONFIG = """

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from live_service import Live
 
+pytestmark = pytest.mark.unmeasured
+
 KINDS = ["bubblewrap", "landlock"]
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 
@@ -83,13 +85,13 @@ def test_a_job_in_a_sandbox_computes_the_same(
     make_client: Callable[..., TestClient], tmp_path: Path, kind: str
 ) -> None:
     need(kind)
-    content = (RECORDINGS / "paper.mcap").read_bytes()
+    content = (RECORDINGS / "office.mcap").read_bytes()
     digests = []
     for chosen in (kind, "none"):
         client = make_client(
             data=tmp_path / chosen, sandbox=chosen, worker_command=Settings().worker_command, job_memory_bytes=4 << 30
         )
-        log = upload(client, content, "paper.mcap")
+        log = upload(client, content, "office.mcap")
         job = client.post("/v1/jobs", json={"log": log, "read": {"end_s": 3.0}}).json()["id"]
         ended = wait(client, job, 120.0)
         assert ended["state"] == "succeeded", ended

@@ -15,7 +15,7 @@ from hsloc.request import RunRequest
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = pytest.mark.data
+pytestmark = [pytest.mark.data, pytest.mark.unmeasured]
 
 
 @pytest.mark.parametrize(("name", "seed"), [("robotdata1", 0), ("robotdata1", 2), ("robotdata1", 3), ("robotdata3", 0)])

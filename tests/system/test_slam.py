@@ -23,6 +23,8 @@ from hsloc.request import RunRequest
 if TYPE_CHECKING:
     from pathlib import Path
 
+pytestmark = pytest.mark.unmeasured
+
 
 def ape(found: Result) -> Statistics:
     return evaluate(found.trajectory, found.reference, alignment="se2").ape.trans_part  # type: ignore[arg-type]

@@ -19,7 +19,13 @@ from hsloc.analysis.metrics import (
     scan_counts,
 )
 from hsloc.analysis.quality import offset_warnings, quality_warnings, verdict_reasons
-from hsloc.analysis.scan_statistics import ConvergenceSample, ExtrinsicsCheck, Residuals, ScanOverlayBuilder
+from hsloc.analysis.scan_statistics import (
+    ConvergenceSample,
+    CoverageCounter,
+    ExtrinsicsCheck,
+    Residuals,
+    ScanOverlayBuilder,
+)
 from hsloc.analysis.second_pass import posed_events
 from hsloc.errors import EvaluationError
 from hsloc.evaluation import evaluate_relations, read_relations
@@ -40,7 +46,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hsloc.analysis.scan_statistics import ScanOverlay
+    from hsloc.analysis.scan_statistics import Coverage, ScanOverlay
     from hsloc.analysis.second_pass import PosedEvent
     from hsloc.evaluation import Comparison, RelationsResult
     from hsloc.replay.run import Result
@@ -60,7 +66,8 @@ class Analysis:
     `comparison` pairs the trajectory with the reference, and `odometry_alone` the odometry: None where there is no
     reference, or where they do not meet in time. `odometry` is the odometry in the frame of the map, moved as a whole
     to the trajectory's first localised pose. `convergence` holds, by heading, the median best fitness over the
-    evaluations of the search. `overlay` are the scans to be looked at on the map.
+    evaluations of the search. `overlay` are the scans to be looked at on the map, and
+    `coverage` counts how many of those with a known pose saw each place of it.
     Whatever shows errors over time uses these pairs: association happens here alone.
     """
 
@@ -70,6 +77,7 @@ class Analysis:
     odometry: Trajectory | None
     convergence: Convergence
     overlay: ScanOverlay
+    coverage: Coverage
 
     def __repr__(self) -> str:
         compared = "no reference" if self.comparison is None else repr(self.comparison)
@@ -94,6 +102,7 @@ def analyse(
     check = ExtrinsicsCheck(likelihood, matcher, scans, lasers)
     sample = ConvergenceSample(likelihood, matcher, scans)
     overlay = ScanOverlayBuilder(scans, _not_matched(result))
+    coverage = CoverageCounter(result.grid)
     for posed in posed_events(result, progress):
         if observer is not None:
             observer(posed)
@@ -102,6 +111,7 @@ def analyse(
             distance = residuals.distances(scan, T_map_base)
             if posed.localised:
                 residuals.add(scan, distance)
+                coverage.add(scan, T_map_base)
                 check.add(scan, T_map_base)
                 sample.add(scan, T_map_base)
             overlay.add(scan, T_map_base, distance)
@@ -142,6 +152,7 @@ def analyse(
         odometry=errors.odometry,
         convergence=sample.curves(request.matcher_name.upper()),
         overlay=overlay.overlay(),
+        coverage=coverage.coverage(),
     )
 
 

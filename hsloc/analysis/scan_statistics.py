@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.beams import look_up
+from hsloc.kernels.beams import look_up, trace
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2
@@ -58,6 +58,9 @@ SHOWN_NOT_MATCHED = 200
 """At most this many of the scans that were not matched keep them as well."""
 SHOWN_POINTS = 120
 """Points of a scan that are kept, about."""
+
+COVERAGE_CELL_M, COVERAGE_CELLS = 0.25, 256
+"""Least side of a cell in which scans are counted: narrower than a door; and cells along the map, at most."""
 
 
 class Residuals:
@@ -301,3 +304,42 @@ class ScanOverlayBuilder:
             points=tuple(self._points),
             distances=tuple(self._distances),
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coverage:
+    """By how many scans each place of the map was seen: a beam passed through the cell, or ended in it."""
+
+    counts: NDArray[np.int32]
+    """Scans (h, w) for each cell, the row at the lower edge of the map first."""
+    side: float
+    """Side of a cell [m]."""
+    T_map_corner: Pose2
+    """The lower left corner, and the direction of the rows."""
+
+
+class CoverageCounter:
+    """Counts a `Coverage` of the map's extent, over all beams with a return; what they saw beyond it is left out."""
+
+    def __init__(self, grid: OccupancyGrid) -> None:
+        height, width = (n * grid.resolution for n in grid.cells.shape)
+        self._side = max(COVERAGE_CELL_M, max(height, width) / COVERAGE_CELLS)
+        shape = (max(int(np.ceil(height / self._side)), 1), max(int(np.ceil(width / self._side)), 1))
+        self._counts = np.zeros(shape, dtype=np.int32)
+        self._hits, self._passes = np.zeros(shape, dtype=np.int32), np.zeros(shape, dtype=np.int32)
+        self._T_map_corner = grid.origin
+        self._T_corner_map = grid.origin.inverse()
+
+    def add(self, scan: Scan, T_map_base: Pose2) -> None:
+        """A scan, and the pose of the base at its stamp."""
+        T_corner_base = self._T_corner_map @ T_map_base
+        laser = T_corner_base @ scan.T_base_laser
+        ends = (T_corner_base @ scan.points_base()) / self._side
+        origins = np.broadcast_to(np.array((laser.x, laser.y)) / self._side, ends.shape)
+        self._hits[:], self._passes[:] = 0, 0
+        trace(self._hits, self._passes, origins, ends, np.ones(len(ends), dtype=np.uint8))
+        self._counts += (self._hits + self._passes) > 0
+
+    def coverage(self) -> Coverage:
+        """What was counted."""
+        return Coverage(self._counts, self._side, self._T_map_corner)

@@ -155,6 +155,7 @@ def report_parts(result: Result, analysis: Analysis) -> ReportParts:
         states=None if result.states is None else tuple(str(state) for state in result.states.state),
         covariances=result.pose_covariances(),
         overlay=analysis.overlay,
+        coverage=analysis.coverage,
         mapping=result.mapping,
         provenance=provenance(result),
         ambiguities=result.ambiguities,

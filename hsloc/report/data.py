@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hsloc.analysis.scan_statistics import ScanOverlay
+    from hsloc.analysis.scan_statistics import Coverage, ScanOverlay
     from hsloc.evaluation import Comparison
     from hsloc.model import OccupancyGrid, ScanDiagnostics, Trajectory
     from hsloc.model.estimate import Ambiguity
@@ -74,6 +74,8 @@ class ReportParts:
     """Covariance (n, 3, 3) of each pose over x, y, theta (m^2, m rad, rad^2); NaN where unknown."""
     overlay: ScanOverlay | None = None
     """The scans, to be drawn on the map."""
+    coverage: Coverage | None = None
+    """By how many scans each place of the map was seen."""
     mapping: MappingResult | None = None
     """Loops and keyscans of a map that the run built."""
     points: Floats | None = None

@@ -16,7 +16,7 @@ from evaluation_paths import diagnostics_of
 from PIL import Image
 from report_parts import NOTHING, parts, view_in
 
-from hsloc.analysis.scan_statistics import ScanOverlay
+from hsloc.analysis.scan_statistics import Coverage, ScanOverlay
 from hsloc.errors import OutputError
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
 from hsloc.model.estimate import Ambiguity, LikelyPlace
@@ -230,6 +230,18 @@ def test_scans_lie_where_they_were_taken(run: dict[str, Any]) -> None:
     assert scans["status"][0]
     (far,) = [chart for chart in view["charts"] if chart["name"] == "far_cm"]
     assert (far["t"], far["v"]) == ([2.0, 10.0], [2.0, None])  # the line breaks where the pose was lost
+
+
+def test_coverage_holds_counts_of_any_size(run: dict[str, Any], tmp_path: Path) -> None:
+    counts = np.array([[0, 1, 7], [1000, 60_000, 0]], dtype=np.int32)
+    shown = {**run, "coverage": Coverage(counts, 0.25, Pose2(-1.0, 2.0, 0.5))}
+    coverage = view_in(write(tmp_path, **shown)[0])["coverage"]
+    assert (coverage["side"], coverage["width"], coverage["height"], coverage["most"]) == (0.25, 3, 2, 60_000)
+    assert coverage["corner"] == [-1.0, 2.0, 0.5]
+    levels = np.frombuffer(base64.b64decode(coverage["levels"]), dtype=np.uint8).reshape(2, 3)
+    np.testing.assert_allclose(2.0 ** (levels[::-1] / 16) - 1.0, counts, rtol=0.05)  # the top row first
+    nothing = replace(shown["coverage"], counts=np.zeros_like(counts))
+    assert view_of(ReportParts(title="", **run, coverage=nothing)).values["coverage"] is None
 
 
 def test_places_between_which_a_run_does_not_decide_are_drawn(run: dict[str, Any], tmp_path: Path) -> None:

@@ -147,6 +147,13 @@ def share_by_a_link(page: Any, open_page: Callable[..., Any]) -> None:
     page.wait_for_selector("#shares li")
     link = page.input_value("#share-link")
     page.context.route("https://lichtblick-suite.github.io/**", lambda route: route.fulfill(body="a viewer"))
+    page.context.route("https://app.foxglove.dev/**", lambda route: route.fulfill(body="a viewer"))
+    with page.expect_popup() as popup:
+        page.click("#job-buttons >> text=Open in Foxglove")
+    popup.value.wait_for_url(
+        re.compile(r"/~/view\?ds=remote-file&ds\.url=http%3A.*%2Fhss_[\w-]{43}%2Fresults%2Frun\.mcap$")
+    )
+    popup.value.close()
     with page.expect_popup() as popup:
         page.click("#job-buttons >> text=Open in Lichtblick")
     popup.value.wait_for_url(
@@ -170,7 +177,7 @@ def share_by_a_link(page: Any, open_page: Callable[..., Any]) -> None:
         visitor.click("text=trajectory.tum")
     assert download.value.suggested_filename == "trajectory.tum"
     picture(visitor, "9-shared")
-    for left in (1, 0):
+    for left in (2, 1, 0):
         page.click("#shares button")  # revokes
         page.wait_for_function("(n) => document.querySelectorAll('#shares li').length === n", arg=left)
     visitor.close()
@@ -324,6 +331,12 @@ def look_around_by_mouse(page: Any) -> None:
     page.check("#view [data-layer=heat]")
     assert drawn(page) != seen
     page.uncheck("#view [data-layer=heat]")
+    page.check("#view [data-layer=coverage]")
+    assert drawn(page) != seen
+    assert re.search(r"scans that saw a place: 1 10 \d\d+ · without", page.text_content("#view .rv-layers") or "")
+    page.hover("#view .rv-over")
+    assert re.search(r"· seen by \d+ scans|· never seen", page.text_content("#view .rv-place") or "")
+    page.uncheck("#view [data-layer=coverage]")
     drag_a_start_pose(page, x, y)
 
 

@@ -212,9 +212,35 @@ PLACES = """async () => {
   return found.map((pose) => pose.map((value) => Math.round(1000 * value) / 1000 + 0)); }"""
 
 
-def test_curves_of_single_values_and_places_that_may_be_right(
+# A map that is panned over several tiles, against the same drawn at once: the share of values that differ.
+TILES = """async () => {
+  const root = document.createElement("div"), frame = () => new Promise(requestAnimationFrame);
+  root.style.width = "600px"; document.body.append(root);
+  const t = [...Array(500).keys()], x = t.map((k) => 50 + 40 * Math.cos(k / 20)), y = t.map((k) => 50 + k / 20);
+  const trajectory = { t, x, y, theta: t, breaks: [], state: t.map(() => 0), states: ["localised"] };
+  const data = { extent: [0, 0, 100, 100], end: 500, trajectory, events: [], charts: [], status: [], lost: [],
+      marks: [{ status: "rejected", label: "refused", t, x, y, reason: t }] };
+  const view = new ResultView(root, data, null, document.createElement("div"));
+  const values = () => {
+    const { width, height } = view.$base;
+    return view.$base.getContext("2d").getImageData(0, 0, width, height).data; };
+  view.zoom(8); view.drawNow();
+  const before = values();
+  for (let k = 0; k < 30; k += 1) { view.move(-29, -12); await frame(); await frame(); }
+  const panned = values();
+  view.drawNow();
+  const whole = values();
+  const share = (other) => whole.reduce((n, v, k) => n + (Math.abs(v - other[k]) > 64), 0) / whole.length;
+  view.end();
+  return [share(before), share(panned)]; }"""
+
+
+def test_curves_of_single_values_places_that_may_be_right_and_tiles(
     make_live: Callable[..., Live], open_page: Callable[..., Any]
 ) -> None:
     page = open_page(make_live().url)
     assert page.evaluate(SPARSE)
     assert page.evaluate(PLACES) == [[1, 0, 0], [7, 2, 1.571], [1, 0, 0]]
+    moved, differing = page.evaluate(TILES)
+    assert moved > 0.005
+    assert differing < 0.01 * moved

@@ -39,18 +39,16 @@
     const { width, height } = view.$base, { ratio, scale } = view, data = view.data;
     const [tx, ty] = view.pixels(0, 0), on = (name) => view.shown.has(name);
     const world = node("g", { transform: `matrix(${scale} 0 0 ${-scale} ${tx} ${ty})`, fill: "none", "stroke-linejoin": "round", "stroke-linecap": "round" });
-    if (on("map") && view.image && data.map) {
-      const { side, width: w, height: h, corner: [x, y, theta] } = data.map, canvas = document.createElement("canvas");
+    const cells = (image, { side, width: w, height: h, corner: [x, y, theta] }) => {
+      const canvas = document.createElement("canvas"), [lx, ly] = view.local(x, y);
       canvas.width = w; canvas.height = h;
-      canvas.getContext("2d").drawImage(view.dark.matches ? view.invert() : view.image, 0, 0);
-      const [lx, ly] = view.local(x, y);
+      canvas.getContext("2d").drawImage(image, 0, 0);
       world.append(node("image", { href: canvas.toDataURL(), width: w, height: h, "image-rendering": "pixelated",
         transform: `translate(${lx} ${ly}) rotate(${180 * theta / Math.PI}) scale(${side} ${-side}) translate(0 ${-h})` }));
-    }
-    if (on("heat")) {
-      const { side, cells } = view.heat();
-      for (const [x, y, mean] of cells) world.append(node("rect", { x: fixed(x), y: fixed(y), width: fixed(side), height: fixed(side), fill: view.heatInk(mean) }));
-    }
+    };
+    if (on("map") && view.image && data.map) cells(view.mapPicture(), data.map);
+    if (on("coverage")) cells(view.coverage(), data.coverage);
+    if (on("heat")) cells(view.heat().picture, view.heat());
     const stroke = (d, ink, pixels, dash = []) => world.append(node("path", { d, stroke: ink, "stroke-width": pixels * ratio,
       "stroke-dasharray": dash.map((n) => n * ratio).join(" "), "vector-effect": "non-scaling-stroke" }));
     const clouds = new Map();
@@ -70,11 +68,9 @@
       page.append(node("polygon", { points: outline.map((xy) => xy.map(fixed).join(",")).join(" "), fill: view.ink("orange"), stroke: view.ink("ink"), "stroke-width": 1.4 * ratio }));
       text(words, ...at, view.ink("ink"), 13);
     }
-    const path = data.trajectory, n = path.x.length;
-    for (const [k, words, ink] of n && on("trajectory") ? [[n - 1, "end", "vermillion"], [0, "start", "green"]] : []) {
-      const [x, y] = view.pixels(...view.local(path.x[k], path.y[k])), r = 6 * ratio;
-      page.append(node("circle", { cx: fixed(x), cy: fixed(y), r, fill: view.ink(ink), stroke: view.ink("halo"), "stroke-width": 2 * ratio }));
-      text(words, x + 1.5 * r, y - 1.5 * r, view.ink("ink"), 13, "start");
+    for (const { name, colour, at: [cx, cy], align, text: place } of view.endMarks()) {
+      page.append(node("circle", { cx: fixed(cx), cy: fixed(cy), r: 6 * ratio, fill: view.ink(colour), stroke: view.ink("halo"), "stroke-width": 2 * ratio }));
+      text(name, ...place, view.ink("ink"), 13, align === "left" ? "start" : "end");
     }
     const bar = view.$scale.firstChild.getBoundingClientRect().width * ratio, y = height - 12 * ratio, x = width - 12 * ratio - bar;
     page.append(node("rect", { x: fixed(x), y, width: fixed(bar), height: 4 * ratio, fill: view.ink("ink") }));

@@ -19,6 +19,8 @@ globalThis.listenToView = (view) => {
     if (k !== null) words.push(`${path.t[k].toFixed(1)} s, ${path.states[path.state[k]].replaceAll("_", " ")}`);
     const start = place(px, py), reason = view.reasonAt(px, py);
     if (reason) words.push(reason);
+    const seen = view.scansAt(x, y);
+    if (seen !== null) words.push(seen ? `seen by ${seen} scans` : "never seen");
     if (start) words.push("click: run again, with the start that leads to this place");
     view.$over.classList.toggle("rv-hit", Boolean(start));
     if (view.measure?.length) { const [a, b = [x, y]] = view.measure; words.push(`distance ${globalThis.lengthText(Math.hypot(b[0] - a[0], b[1] - a[1]))}`); }

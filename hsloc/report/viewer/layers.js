@@ -9,12 +9,14 @@
   const PLACE = [[13, 0], [-9, 8], [-5, 0], [-9, -8]]; // an arrow, in pixels
   const PIECE = 256, THIN_PX = 0.5; // points or ellipses that are stroked at once; points that are closer (pixels) are joined
   const HEAT_M = 0.3, HEAT_CELLS = 240; // where the scale ends; cells along the longer side of the extent
+  const LEVELS = 16; // steps of a count for each doubling, as in view.py
   const make = (tag, attributes = {}, ...children) => {
     const made = document.createElement(tag);
     for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
     made.append(...children);
     return made;
   };
+  const scaleKey = (share, text) => { const key = make("i", { class: "rv-key" }); key.style.borderColor = inkOf(share); return [key, `${text} `]; };
   const length = globalThis.lengthText;
   // The last row whose time is not after t.
   const before = (times, t) => {
@@ -22,6 +24,10 @@
     while (low < high) { const middle = (low + high + 1) >> 1; if (times[middle] <= t) low = middle; else high = middle - 1; }
     return low;
   };
+
+  const within = (x, y, [x0, y0, x1, y1]) => x >= x0 && x <= x1 && y >= y0 && y <= y1;
+  // Colour from a scale for a share of its length.
+  const inkOf = (share) => SCALE[Math.max(Math.min(Math.floor(SCALE.length * share), SCALE.length - 1), 0)];
 
   // Lines and ellipses in metres: strokes on a canvas, and the same as text for a drawing.
   class Path {
@@ -92,36 +98,87 @@
       if (on("ellipses")) found.push([paths.ellipses, this.ink("purple"), 1.2]);
       return found;
     },
+    mapPicture() { return this.dark.matches ? (this.inverted ??= this.invert()) : this.image; },
+    invert() {
+      const canvas = make("canvas"), c = canvas.getContext("2d");
+      canvas.width = this.data.map.width; canvas.height = this.data.map.height;
+      c.drawImage(this.image, 0, 0);
+      const pixels = c.getImageData(0, 0, canvas.width, canvas.height);
+      for (let k = 0; k < pixels.data.length; k += 4) for (let i = 0; i < 3; i += 1) pixels.data[k + i] = 242 - 0.88 * pixels.data[k + i];
+      c.putImageData(pixels, 0, 0);
+      return canvas;
+    },
+    // A picture of cells with this side (m); the corner is the lower left one, and the direction of the rows.
+    drawGrid(c, picture, { side, width, height, corner: [x, y, theta] }) {
+      c.save();
+      c.translate(...this.local(x, y));
+      c.rotate(theta);
+      c.scale(side, -side);
+      c.imageSmoothingEnabled = this.scale * side < 1.5;
+      c.drawImage(picture, 0, -height, width, height);
+      c.restore();
+    },
+    // A picture of cells, each with a colour of the scale (0 to 1); those without a share are clear.
+    painted(width, height, shares, alpha) {
+      const canvas = make("canvas"), c = canvas.getContext("2d");
+      canvas.width = width; canvas.height = height;
+      const pixels = c.createImageData(width, height);
+      for (const [at, share] of shares) {
+        const ink = inkOf(share);
+        for (let i = 0; i < 3; i += 1) pixels.data[4 * at + i] = parseInt(ink.slice(1 + 2 * i, 3 + 2 * i), 16);
+        pixels.data[4 * at + 3] = Math.round(255 * alpha);
+      }
+      c.putImageData(pixels, 0, 0);
+      return canvas;
+    },
+    // By how many scans each place was seen, by doublings; walls stay visible below. Made once.
+    coverage() {
+      if (!this.covered) {
+        const { width, height, most } = this.data.coverage, shares = new Map();
+        this.levels = Uint8Array.from(atob(this.data.coverage.levels), (letter) => letter.charCodeAt(0));
+        for (const [at, level] of this.levels.entries()) if (level) shares.set(at, level / (LEVELS * Math.log2(1 + most)));
+        this.covered = this.painted(width, height, shares, 0.7);
+      }
+      return this.covered;
+    },
+    // Scans that saw a place (m, from the middle), or null where the layer is not shown.
+    scansAt(lx, ly) {
+      if (!this.shown.has("coverage")) return null;
+      const { side, width, height, corner: [x, y, theta] } = this.data.coverage, dx = lx + this.ox - x, dy = ly + this.oy - y;
+      const cos = Math.cos(theta), sin = Math.sin(theta), column = Math.floor((cos * dx + sin * dy) / side), row = Math.floor((cos * dy - sin * dx) / side);
+      if (column < 0 || row < 0 || column >= width || row >= height) return 0;
+      this.coverage();
+      return Math.round(2 ** (this.levels[(height - 1 - row) * width + column] / LEVELS) - 1);
+    },
+    coverageLegend() {
+      const made = make("span", { class: "rv-legend", hidden: "" }), { most = 1 } = this.data.coverage ?? {}, steps = [];
+      for (let n = 1; n < most / 2; n *= 10) steps.push(n);
+      made.append("scans that saw a place: ", ...[...steps, most].flatMap((n) => scaleKey(Math.log2(1 + n) / Math.log2(1 + most), n)), "· without colour: never seen");
+      return made;
+    },
     // Mean distance to the map of the scans' points in each cell; made once.
     heat() {
       if (this.cells) return this.cells;
       const [x0, y0, x1, y1] = this.data.extent, side = Math.max(x1 - x0, y1 - y0) / HEAT_CELLS;
-      const width = Math.ceil((x1 - x0) / side), sums = new Map();
+      const width = Math.ceil((x1 - x0) / side), height = Math.ceil((y1 - y0) / side), sums = new Map();
       for (const k of this.data.scans.x.keys()) this.eachPoint(k, (x, y, i) => {
         const column = Math.floor((x - x0) / side), row = Math.floor((y - y0) / side);
-        if (column < 0 || row < 0 || column >= width) return;
-        const cell = sums.get(row * width + column) ?? [0, 0];
+        if (column < 0 || row < 0 || column >= width || row >= height) return;
+        const at = (height - 1 - row) * width + column, cell = sums.get(at) ?? [0, 0];
         cell[0] += this.near[i] / 100; cell[1] += 1;
-        sums.set(row * width + column, cell);
+        sums.set(at, cell);
       });
-      this.cells = { side, cells: [...sums].map(([at, [sum, n]]) => [...this.local(x0 + (at % width) * side, y0 + Math.floor(at / width) * side), sum / n]) };
+      const shares = [...sums].map(([at, [sum, n]]) => [at, sum / n / HEAT_M]);
+      this.cells = { side, width, height, corner: [x0, y0, 0], picture: this.painted(width, height, shares, 1) };
       return this.cells;
-    },
-    heatInk: (mean) => SCALE[Math.min(Math.floor(SCALE.length * mean / HEAT_M), SCALE.length - 1)],
-    drawHeat(c) {
-      const { side, cells } = this.heat(), edge = Math.max(side, 3 * this.ratio / this.scale);
-      for (const [x, y, mean] of cells) { c.fillStyle = this.heatInk(mean); c.fillRect(x, y, edge, edge); }
     },
     heatLegend() {
       const made = make("span", { class: "rv-legend", hidden: "" }, "mean distance to the map ");
-      for (let k = 0; k < SCALE.length; k += 2) {
-        const key = make("i", { class: "rv-key" });
-        key.style.borderColor = SCALE[k];
-        made.append(key, `${k ? length(HEAT_M * k / SCALE.length) : "0"} `);
-      }
+      for (let k = 0; k < SCALE.length; k += 2) made.append(...scaleKey(k / SCALE.length, k ? length(HEAT_M * k / SCALE.length) : "0"));
       made.append("and more");
       return made;
     },
+    showLegends() { for (const [name, legend] of Object.entries(this.$legends)) legend.hidden = !this.shown.has(name); },
     // Where the frame of the map has its origin, and its axes.
     drawAxes(c) {
       this.flat(c);
@@ -146,7 +203,7 @@
       } else if (by !== "plain") {
         const values = by === "time" ? path.t : path[by], known = values.filter((v) => v !== null).sort((a, b) => a - b);
         const low = by === "time" ? 0 : Math.min(known[0] ?? 0, 0), high = (by === "time" ? known.at(-1) : known[Math.floor(0.98 * (known.length - 1))]) || 1;
-        colour = (k) => values[k] === null ? this.ink("muted") : SCALE[Math.min(Math.max(Math.floor(SCALE.length * (values[k] - low) / (high - low)), 0), SCALE.length - 1)];
+        colour = (k) => values[k] === null ? this.ink("muted") : inkOf((values[k] - low) / (high - low));
         const text = (v) => by === "time" ? `${v.toFixed(0)} s` : length(v);
         entry(SCALE[0], text(low)); entry(SCALE[4], text((low + high) / 2)); entry(SCALE[7], by === "time" ? text(high) : `${text(high)} and more`);
       }
@@ -195,6 +252,15 @@
         c.fillStyle = this.ink("ink"); c.fillText(text, ...at);
       }
     },
+    // The last and the first pose in pixels, with their labels; where the two are near, these lie on different sides.
+    endMarks() {
+      const { x, y } = this.data.trajectory, n = x.length, r = 9 * this.ratio;
+      if (!n || !this.shown.has("trajectory")) return [];
+      const [first, last] = [0, n - 1].map((k) => this.pixels(...this.local(x[k], y[k])));
+      const near = Math.abs(first[0] - last[0]) < 60 * this.ratio && Math.abs(first[1] - last[1]) < 20 * this.ratio, left = near && first[0] < last[0];
+      const mark = (name, colour, at, isLeft) => ({ name, colour, at, align: isLeft ? "right" : "left", text: [at[0] + (isLeft ? -r : r), at[1] - r] });
+      return [mark("end", "vermillion", last, near && !left), mark("start", "green", first, left)];
+    },
     markInk: (mark) => ["rejected", "to_check"].includes(mark.status) ? "vermillion" : "orange",
     // The reason of the verdict that was found at a pixel.
     reasonAt(px, py) {
@@ -204,7 +270,7 @@
       }
       return null;
     },
-    drawMarks(c) {
+    drawMarks(c, bounds) {
       this.flat(c);
       c.textAlign = "center"; c.textBaseline = "middle";
       for (const mark of this.data.marks) {
@@ -213,19 +279,19 @@
         c.fillStyle = this.ink(this.markInk(mark));
         c.strokeStyle = this.ink("halo"); c.lineWidth = 4 * this.ratio;
         for (const k of mark.t.keys()) {
-          const at = this.pixels(...this.local(mark.x[k], mark.y[k]));
+          const place = this.local(mark.x[k], mark.y[k]), at = this.pixels(...place);
+          if (!within(...place, bounds)) continue;
           if (mark.status === "to_check") c.strokeText(MARKS[mark.status], ...at);
           c.fillText(MARKS[mark.status], ...at);
         }
       }
-      const path = this.data.trajectory, n = path.x.length, end = (k, name, colour) => {
-        const [px, py] = this.pixels(...this.local(path.x[k], path.y[k])), r = 6 * this.ratio;
+      for (const { name, colour, at: [px, py], align, text } of this.endMarks()) {
+        const r = 6 * this.ratio;
         c.beginPath(); c.arc(px, py, r, 0, 2 * Math.PI); c.fillStyle = this.ink(colour); c.fill();
         c.strokeStyle = this.ink("halo"); c.lineWidth = 2 * this.ratio; c.stroke();
-        c.font = `600 ${13 * this.ratio}px system-ui, sans-serif`; c.textAlign = "left"; c.lineWidth = 3 * this.ratio;
-        c.strokeText(name, px + 1.5 * r, py - 1.5 * r); c.fillStyle = this.ink("ink"); c.fillText(name, px + 1.5 * r, py - 1.5 * r);
-      };
-      if (n && this.shown.has("trajectory")) { end(n - 1, "end", "vermillion"); end(0, "start", "green"); }
+        c.font = `600 ${13 * this.ratio}px system-ui, sans-serif`; c.textAlign = align; c.lineWidth = 3 * this.ratio;
+        c.strokeText(name, ...text); c.fillStyle = this.ink("ink"); c.fillText(name, ...text);
+      }
       this.drawPlaces(c);
     },
     drawScale() {
@@ -259,5 +325,5 @@
       c.restore();
     },
   };
-  globalThis.ResultLayers = { MARKS, Path, before, make, methods };
+  globalThis.ResultLayers = { MARKS, Path, before, make, within, methods };
 })();

@@ -3,9 +3,10 @@
 // hsloc/report/view.py. Text from the run goes in as text, never as markup. Needs charts.js, layers.js, export.js
 // and input.js, and view.css.
 (() => {
-  const { MARKS, Path, before, make } = globalThis.ResultLayers;
+  const { MARKS, Path, before, make, within } = globalThis.ResultLayers;
   const NEAR_CM = 5, FAR_CM = 15;
-  const MARGIN = 0.25, REST_MS = 150; // drawn beyond each edge, as a share of the view; without a move for so long, the map rests
+  const TILE = 512, REST_MS = 150; // pixels; without a move for so long, the map rests
+  const EVERYWHERE = [-Infinity, -Infinity, Infinity, Infinity];
   const KINDS = [["", "any event"], ["warning", "warning"], ["loss", "loss"], ["ambiguous", "several places fit"], ["loop", "loop"], ["rejected", "refused scan"]];
 
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
@@ -16,7 +17,7 @@
     constructor(root, data, image, charts) {
       this.$charts = charts;
       this.root = root; this.data = data; this.image = image;
-      this.time = 0; this.fingers = new Map(); this.measure = null; this.picked = this.stated = []; this.playing = null; this.speed = 10;
+      this.time = 0; this.fingers = new Map(); this.measure = null; this.picked = this.stated = []; this.playing = null; this.speed = 10; this.shift = [0, 0];
       this.ox = (data.extent[0] + data.extent[2]) / 2;
       this.oy = (data.extent[1] + data.extent[3]) / 2;
       this.local = (x, y) => [x - this.ox, y - this.oy];
@@ -51,6 +52,7 @@
     end() {
       this.stop();
       clearTimeout(this.resting);
+      cancelAnimationFrame(this.drawn);
       this.observer.disconnect();
       this.listening.abort();
       this.charts.end();
@@ -70,7 +72,6 @@
     build() {
       const button = (name, text, title) => make("button", { type: "button", "data-do": name, title, "aria-label": title }, text);
       this.$base = make("canvas", { class: "rv-base", "aria-hidden": "true" });
-      this.$still = make("canvas");
       this.$over = make("canvas", { class: "rv-over", tabindex: "0", role: "img", "aria-label":
         "Map with the trajectory. Arrow keys move, plus and minus zoom, 0 shows all, comma and full stop step by scan, n and p go to the next and previous event." });
       this.$place = make("div", { class: "rv-place" });
@@ -110,7 +111,7 @@
         ["loops", `loops (${d.loops ? d.loops.accepted.length - refused : 0})`, d.loops && d.loops.accepted.length > refused, true],
         ["refused", `refused loops (${refused})`, refused, false], ["graph", `pose graph (${d.graph?.total} edges)`, d.graph, false], ["ellipses", "2σ ellipses", d.ellipses, false],
         ["places", `places that may be right (${d.ambiguities?.reduce((n, each) => n + each.p.length, 0)})`, d.ambiguities?.length, true],
-        ["heat", "distance of scans to the map", d.scans && d.map, false],
+        ["heat", "distance of scans to the map", d.scans && d.map, false], ["coverage", "coverage: what the lidar has seen", d.coverage, false],
         ...d.marks.map((mark) => [mark.status, `${mark.status === "to_check" ? "" : "scan "}${mark.label} (${mark.t.length})`, true, true]),
       ];
       this.shown = new Set();
@@ -118,7 +119,7 @@
         if (!there) continue;
         const box = make("input", { type: "checkbox", "data-layer": name, ...(on ? { checked: "" } : {}) });
         if (on) this.shown.add(name);
-        box.addEventListener("change", () => { if (box.checked) this.shown.add(name); else this.shown.delete(name); this.$heat.hidden = !this.shown.has("heat"); this.draw(); });
+        box.addEventListener("change", () => { if (box.checked) this.shown.add(name); else this.shown.delete(name); this.showLegends(); this.draw(); });
         const key = make("i", { class: `rv-key rv-${name}` }, MARKS[name] || "");
         if (ink) key.style.borderColor = `var(--rv-${ink})`;
         this.$layers.append(make("label", {}, box, key, text));
@@ -130,8 +131,8 @@
       this.colourBy = d.trajectory.states.some((state) => state !== "localised") ? "state" : "plain";
       select.value = this.colourBy;
       this.$legend = make("span", { class: "rv-legend" });
-      this.$heat = this.heatLegend();
-      this.$layers.append(make("label", {}, "colour by ", select), this.$legend, this.$heat);
+      this.$legends = { heat: this.heatLegend(), coverage: this.coverageLegend() };
+      this.$layers.append(make("label", {}, "colour by ", select), this.$legend, ...Object.values(this.$legends));
     }
 
     // --- view: metres (x, y) from the middle at the centre of the canvas, and pixels a metre ---------------------------
@@ -174,17 +175,13 @@
       clearTimeout(this.resting);
       this.resting = setTimeout(() => this.rest(), REST_MS);
     }
-    // Drawn sharp, and with a whole margin on each side, once nothing moves.
-    rest() {
-      const { x, y, scale } = this.still ?? {}, near = (a, b, size) => Math.abs(a - b) * this.scale < 0.5 * MARGIN * size;
-      if (scale !== this.scale || !near(x, this.x, this.$base.width) || !near(y, this.y, this.$base.height)) this.draw();
-    }
+    // Drawn sharp once nothing moves.
+    rest() { if (this.still?.scale !== this.scale) this.draw(); }
     metres(px, py) { return [this.x + (px - this.$base.width / 2) / this.scale, this.y - (py - this.$base.height / 2) / this.scale]; }
     pixels(x, y) { return [this.$base.width / 2 + (x - this.x) * this.scale, this.$base.height / 2 - (y - this.y) * this.scale]; }
-    // The canvas that is kept has a margin on each side.
-    margin(c) { return [(c.canvas.width - this.$base.width) / 2, (c.canvas.height - this.$base.height) / 2]; }
-    flat(c) { c.setTransform(1, 0, 0, 1, ...this.margin(c)); }
-    world(c) { const [x, y] = this.pixels(0, 0), [left, top] = this.margin(c); c.setTransform(this.scale, 0, 0, -this.scale, left + x, top + y); }
+    // `shift` is where a tile lies.
+    flat(c) { c.setTransform(1, 0, 0, 1, ...this.shift); }
+    world(c) { const [x, y] = this.pixels(0, 0), [left, top] = this.shift; c.setTransform(this.scale, 0, 0, -this.scale, left + x, top + y); }
 
     // --- drawing -------------------------------------------------------------------------------------------------------
     ink(name) {
@@ -203,65 +200,65 @@
     }
     // What is printed is taken before the next frame.
     drawNow() { this.still = null; if (this.scale) { this.drawBase(); this.drawOver(); } }
-    // While the map moves, what was drawn last is shown at its new place; it is drawn again once it does not cover the view.
+    // The map is kept in tiles, in pixels from a place (x, y) at one scale. A pan draws those that come in, and those around
+    // the view in advance, one in each frame; while the scale changes, they are shown larger or smaller as long as they cover.
     drawBase() {
-      const c = this.$base.getContext("2d"), { width, height } = c.canvas;
+      const c = this.$base.getContext("2d"), { width, height } = c.canvas, fresh = () => { this.still = { x: this.x, y: this.y, scale: this.scale, tiles: new Map() }; };
       const place = () => {
-        const { width: w, height: h } = this.$still, factor = this.scale / this.still.scale, [x, y] = this.pixels(this.still.x, this.still.y);
-        const corner = [x - factor * w / 2, y - factor * h / 2].map((at) => factor === 1 ? Math.round(at) : at);
-        return [...corner, factor * w, factor * h, factor];
+        const { x, y, scale, tiles } = this.still, factor = this.scale / scale, size = TILE * factor, [left, top] = this.pixels(x, y).map(Math.round);
+        const [i0, j0, i1, j1] = [-left, -top, width - 1 - left, height - 1 - top].map((at) => Math.floor(at / size));
+        return { tiles, factor, left, top, i0, j0, i1, j1, missing: this.missing(i0, j0, i1, j1) };
       };
-      const covers = () => { const [x, y, w, h, factor] = place(); return factor < 3 && x <= 0 && y <= 0 && x + w >= width && y + h >= height; };
-      if (!this.still || !covers()) this.render();
-      const [x, y, w, h] = place();
+      if (!this.still) fresh();
+      let { tiles, factor, left, top, i0, j0, i1, j1, missing } = place();
+      if (factor !== 1 && (missing.length || factor > 3 || factor < 0.3)) { fresh(); ({ tiles, factor, left, top, i0, j0, i1, j1, missing } = place()); }
+      for (const at of missing) this.drawTile(...at);
       c.setTransform(1, 0, 0, 1, 0, 0);
       c.clearRect(0, 0, width, height);
-      c.drawImage(this.$still, x, y, w, h);
+      const edge = (from, at) => Math.round(from + at * TILE * factor);
+      for (let j = j0; j <= j1; j += 1) for (let i = i0; i <= i1; i += 1) {
+        c.drawImage(tiles.get(`${i} ${j}`), edge(left, i), edge(top, j), edge(left, i + 1) - edge(left, i), edge(top, j + 1) - edge(top, j));
+      }
       this.drawScale();
+      if (factor !== 1) return;
+      for (const key of tiles.keys()) { const [i, j] = key.split(" ").map(Number); if (i < i0 - 2 || i > i1 + 2 || j < j0 - 2 || j > j1 + 2) tiles.delete(key); }
+      const next = this.missing(i0 - 1, j0 - 1, i1 + 1, j1 + 1);
+      if (!next.length) return;
+      if (!missing.length) this.drawTile(...next[0]);
+      this.frame();
     }
-    render() {
-      const { width, height } = this.$base, c = this.$still.getContext("2d"), d = this.data;
-      this.$still.width = width + 2 * Math.ceil(MARGIN * width); this.$still.height = height + 2 * Math.ceil(MARGIN * height); // and clears it
-      this.still = { x: this.x, y: this.y, scale: this.scale };
-      const [left, top] = this.margin(c), bounds = [...this.metres(-left - 20, height + top + 20), ...this.metres(width + left + 20, -top - 20)];
+    // Tiles of the columns i0 to i1 and rows j0 to j1 that are not drawn.
+    missing(i0, j0, i1, j1) {
+      const found = [];
+      for (let j = j0; j <= j1; j += 1) for (let i = i0; i <= i1; i += 1) if (!this.still.tiles.has(`${i} ${j}`)) found.push([i, j]);
+      return found;
+    }
+    drawTile(i, j) {
+      const { x, y } = this, { still, data: d } = this, canvas = make("canvas", { width: TILE, height: TILE }), c = canvas.getContext("2d");
+      still.tiles.set(`${i} ${j}`, canvas);
+      [this.x, this.y] = [still.x, still.y];
+      this.shift = [-this.$base.width / 2 - TILE * i, -this.$base.height / 2 - TILE * j];
+      const [left, top] = this.shift, bounds = [...this.metres(-left - 20, TILE - top + 20), ...this.metres(TILE - left + 20, -top - 20)];
       this.world(c);
-      if (this.shown.has("map")) this.drawMap(c);
+      if (this.shown.has("map") && this.image && d.map) this.drawGrid(c, this.mapPicture(), d.map);
+      if (this.shown.has("coverage")) this.drawGrid(c, this.coverage(), d.coverage);
       this.ink("ink");
       this.paths ??= this.makePaths();
       const px = this.ratio / this.scale, stroke = (path, colour, width, dash = []) => {
         c.strokeStyle = colour; c.lineWidth = width * px; c.setLineDash(dash.map((n) => n * px)); path.stroke(c, this.scale, bounds); c.setLineDash([]);
       };
       c.lineJoin = "bevel"; c.lineCap = "round"; // round joins of thousands of points take twice as long
-      if (this.shown.has("heat")) this.drawHeat(c);
-      if (this.shown.has("scans")) for (const k of d.scans.t.keys()) this.drawScan(c, k, 1.2 * px);
-      if (this.shown.has("points")) this.dots(c, d.points, this.ink("ink"), 3 * px);
+      if (this.shown.has("heat")) this.drawGrid(c, this.heat().picture, this.heat());
+      if (this.shown.has("scans")) for (const k of d.scans.t.keys()) this.drawScan(c, k, 1.2 * px, bounds);
+      if (this.shown.has("points")) this.dots(c, d.points, this.ink("ink"), 3 * px, bounds);
       for (const each of this.strokes()) stroke(...each);
       this.drawAxes(c);
-      this.drawMarks(c);
+      this.drawMarks(c, bounds);
+      [this.x, this.y, this.shift] = [x, y, [0, 0]];
     }
-    drawMap(c) {
-      if (!this.image || !this.data.map) return;
-      const { side, width, height, corner: [x, y, theta] } = this.data.map;
-      c.save();
-      c.translate(...this.local(x, y));
-      c.rotate(theta);
-      c.scale(side, -side);
-      c.imageSmoothingEnabled = this.scale * side < 1.5;
-      c.drawImage(this.dark.matches ? (this.inverted ??= this.invert()) : this.image, 0, -height, width, height);
-      c.restore();
-    }
-    invert() {
-      const canvas = make("canvas"), c = canvas.getContext("2d");
-      canvas.width = this.data.map.width; canvas.height = this.data.map.height;
-      c.drawImage(this.image, 0, 0);
-      const pixels = c.getImageData(0, 0, canvas.width, canvas.height);
-      for (let k = 0; k < pixels.data.length; k += 4) for (let i = 0; i < 3; i += 1) pixels.data[k + i] = 242 - 0.88 * pixels.data[k + i];
-      c.putImageData(pixels, 0, 0);
-      return canvas;
-    }
-    dots(c, columns, colour, size) {
+    dots(c, columns, colour, size, bounds) {
       c.fillStyle = colour;
-      for (const k of columns.x.keys()) { const [x, y] = this.local(columns.x[k], columns.y[k]); c.fillRect(x - size / 2, y - size / 2, size, size); }
+      for (const k of columns.x.keys()) { const [x, y] = this.local(columns.x[k], columns.y[k]); if (within(x, y, bounds)) c.fillRect(x - size / 2, y - size / 2, size, size); }
     }
     polyline(columns) {
       const path = new Path(), breaks = new Set(columns?.breaks);
@@ -300,9 +297,11 @@
         work(x[k] + cos * bx - sin * by, y[k] + sin * bx + cos * by, i);
       }
     }
-    drawScan(c, k, size) {
-      const left = this.ox + size / 2, low = this.oy + size / 2;
-      this.eachPoint(k, (x, y, i) => { c.fillStyle = this.pointInk(i); c.fillRect(x - left, y - low, size, size); });
+    drawScan(c, k, size, bounds = EVERYWHERE) {
+      this.eachPoint(k, (mx, my, i) => {
+        const [x, y] = this.local(mx, my);
+        if (within(x, y, bounds)) { c.fillStyle = this.pointInk(i); c.fillRect(x - size / 2, y - size / 2, size, size); }
+      });
     }
     drawOver() {
       const c = this.$over.getContext("2d"), path = this.data.trajectory, scans = this.data.scans, px = this.ratio / this.scale;

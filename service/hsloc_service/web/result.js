@@ -154,7 +154,7 @@ async function showResult(job, base, mine, time) {
   if (isShared) zip.hidden = true;
   else zip.append(button("all files (.zip)", () => download(`${base}.zip`, "results.zip")));
   if (!isShared) share.show(job.id);
-  if (!isShared && names.has("run.mcap")) $("job-buttons").append(share.viewerButton(job.id));
+  if (!isShared && names.has("run.mcap")) $("job-buttons").append(...share.viewerButtons(job.id));
   if (names.has("report.html") && (isShared || !hasToken())) {
     const item = element("li"), link = element("a", "open the report");
     link.href = `${base}/report.html?download=false`;

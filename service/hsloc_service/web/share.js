@@ -3,7 +3,8 @@
 import { get, post, request } from "./api.js";
 import { $, button, element, guarded, when } from "./dom.js";
 
-const VIEWER = "https://lichtblick-suite.github.io/lichtblick/"; // runs in the browser: the file goes nowhere else
+// Both run in the browser: the file goes nowhere else. Foxglove needs an account.
+const VIEWERS = [["Lichtblick", "https://lichtblick-suite.github.io/lichtblick/"], ["Foxglove", "https://app.foxglove.dev/~/view"]];
 const VIEWER_DAYS = 1;
 let shown = null; // id of the job
 
@@ -29,17 +30,17 @@ export function show(id) {
 
 export function leave() { shown = null; $("job-share").hidden = true; }
 
-// A button that opens run.mcap in Lichtblick, by a link of its own that is valid for a day.
-export const viewerButton = (id) => button("Open in Lichtblick", async () => {
+// Buttons that open run.mcap in a viewer, each by a link of its own that is valid for a day.
+export const viewerButtons = (id) => VIEWERS.map(([name, address]) => button(`Open in ${name}`, async () => {
   // Opened before the link is there: a browser opens no window that comes later than the click.
   const opened = open("about:blank", "_blank");
   const { secret } = await make(id, VIEWER_DAYS), file = `${location.origin}/v1/shared/${secret}/results/run.mcap`;
   if (opened) {
     opened.opener = null;
-    opened.location = `${VIEWER}?ds=remote-file&ds.url=${encodeURIComponent(file)}`;
+    opened.location = `${address}?ds=remote-file&ds.url=${encodeURIComponent(file)}`;
   }
   if ($("job-share").open) await list();
-});
+}));
 
 export function listen() {
   $("job-share").addEventListener("toggle", () => { if ($("job-share").open && shown) guarded(list); });

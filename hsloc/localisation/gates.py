@@ -110,6 +110,10 @@ class MatchGate:
         self.refusals = 0
         self.usual = fitness if self.usual is None else self.usual + _WEIGHT_OF_NEW * (fitness - self.usual)
 
+    def accept_hidden(self) -> None:
+        """Count a match in which something hid the walls: it is no refusal, and no measure of what is usual."""
+        self.refusals = 0
+
     def refuse(self) -> int:
         """Count a refused match; the number of refusals in a row."""
         self.refusals += 1

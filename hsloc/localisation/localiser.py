@@ -237,7 +237,8 @@ class Localiser:
             return Estimate(scan.stamp_ns, predicted, Status.NO_RETURNS, covariance, reason=reason, evidence=evidence)
         match, evaluations = self._match(points, predicted, covariance)
         reason = self._match_gate.refusal(match.fitness)
-        if reason:
+        is_hidden = bool(reason) and self._is_hidden(paired, match)
+        if reason and not is_hidden:
             return self._refuse(paired, predicted, covariance, match, evaluations, reason)
         information = match_information(points, self._field, match.pose, self._wall_variance())
         if p.fuse:
@@ -248,7 +249,10 @@ class Localiser:
         else:
             pose, covariance = match.pose, match.covariance
         is_usual = self._match_gate.fits_as_usual(match.fitness)
-        self._match_gate.accept(match.fitness)
+        if is_hidden:
+            self._match_gate.accept_hidden()
+        else:
+            self._match_gate.accept(match.fitness)
         self._take(pose, covariance, T_odom_base)
         evidence = None if self._monitor is None else self._monitor.matched(paired, pose, points)
         if self._map_scale is not None:
@@ -271,6 +275,12 @@ class Localiser:
             noise_scale=self._innovations.noise_scale,
             fits_as_usual=is_usual,
         )
+
+    def _is_hidden(self, paired: PairedScan, match: Match) -> bool:
+        """Whether a match that would be refused is right but for what hides the walls."""
+        if self._monitor is None or match.fitness < self._parameters.min_fitness:
+            return False
+        return self._monitor.is_hidden(paired, match.pose)
 
     def _wall_variance(self) -> float | None:
         """What the scans so far show of how walls are drawn (m^2)."""

@@ -88,7 +88,7 @@ def mounting_error(anchors: Sequence[Anchor]) -> MountingError | None:
     step, seen = relative_poses(odometry[:-1], odometry[1:]), relative_poses(matched[:-1], matched[1:])
     usable = ~np.array([anchor.begins for anchor in anchors[1:]]) & (np.hypot(step[:, 0], step[:, 1]) < _LONGEST_M)
     step, seen = step[usable], seen[usable]
-    turned = wrap_angles(step[:, 2])
+    turned = wrap_angles(seen[:, 2])  # noise of the odometry turns its translation, too: it would show as a place
     if len(step) < _FEWEST:
         return None
     other_side = min(turned[turned > 0.0].sum(), -turned[turned < 0.0].sum())

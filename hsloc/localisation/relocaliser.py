@@ -360,23 +360,21 @@ class Relocaliser:
 
         As far as they fit, and whether that is all of them: where several in a row do not, the trace is lost.
         """
-        traced = self._trace(winner, motion, REMEMBERED)
-        fits = max(self._parameters.min_fitness, _FITS * winner.fitness)
         track: list[tuple[int, Pose2]] = []
         misses = 0
-        for count, pose, paired, fitness in traced:
-            misses = 0 if fitness >= fits else misses + 1
+        for count, pose, paired, fits in self._trace(winner, motion, REMEMBERED):
+            misses = 0 if fits else misses + 1
             track.append((count, pose @ paired.T_odom_base.inverse()))
             if misses == _TRACE_LOST:
                 return tuple(reversed(track[:-misses])), False
         whole = len(self._seen) < REMEMBERED
         return tuple(reversed(track[: len(track) - misses])), whole and misses == 0
 
-    def _trace(self, winner: Hypothesis, motion: Pose2, most: int) -> list[tuple[int, Pose2, PairedScan, float]]:
-        """(odometry messages before, T_map_base, scan, fitness) of the last scans, backwards; ends where none fits."""
+    def _trace(self, winner: Hypothesis, motion: Pose2, most: int) -> list[tuple[int, Pose2, PairedScan, bool]]:
+        """(odometry messages before, T_map_base, scan, whether it fits) of the last scans, back to where none does."""
         pose, covariance = winner.pose @ motion, winner.covariance
-        fits = max(self._parameters.min_fitness, _FITS * winner.fitness)
-        traced: list[tuple[int, Pose2, PairedScan, float]] = []
+        least = max(self._parameters.min_fitness, _FITS * winner.fitness)
+        traced: list[tuple[int, Pose2, PairedScan, bool]] = []
         misses = 0
         T_odom_next: Pose2 | None = None
         for count, points, paired in reversed(self._seen):
@@ -388,11 +386,15 @@ class Relocaliser:
             T_odom_next = T_odom_base
             match = self._matcher.match(points, self._field, Window(pose, *_STEP_WINDOW), self._rng)
             misses += 1
-            if match.fitness >= fits:
+            # What hides the walls is no reason to lose the trace.
+            fits = match.fitness >= least or (
+                self._check is not None and self._check.is_hidden(paired, match.pose, self._usual)
+            )
+            if fits:
                 information = match_information(points, self._field, match.pose)
                 pose, covariance = fuse_match(pose, covariance, match, information)
                 misses = 0
-            traced.append((count, pose, paired, match.fitness))
+            traced.append((count, pose, paired, fits))
             if misses == _TRACE_LOST or len(traced) == most:
                 break
         return traced

@@ -322,6 +322,10 @@ class TrackMonitor:
         """A scan could not be matched: it says nothing."""
         return Evidence(self._distance())
 
+    def is_hidden(self, paired: PairedScan, pose: Pose2) -> bool:
+        """See `PlaceCheck.is_hidden`."""
+        return self._check.is_hidden(paired, pose, self.usual_explained)
+
     def refused(self) -> Evidence:
         """The match of a scan was refused."""
         evidence = Evidence(self._distance())

@@ -47,6 +47,8 @@ def test_refusals_are_counted_in_a_row() -> None:
     assert not gate.is_fresh
     gate.accept(0.9)
     assert gate.refuse() == 1
+    gate.accept_hidden()
+    assert (gate.refusals, gate.usual) == (0, 0.9)
 
 
 def test_a_wide_match_must_gain_and_reach_most_of_the_usual_fitness() -> None:

@@ -10,9 +10,12 @@ from hsloc.localisation.mounting_error import mounting_error
 from hsloc.model.pose2 import IDENTITY, Pose2
 
 
-def drive(wrong_by: Pose2, seed: int, left: float = 0.5) -> list[Anchor]:
-    """200 matches 0.2 m apart, each with 5 mm and 2 mrad of noise; the odometry has 1 % of scale and noise, too."""
-    rng = np.random.default_rng(seed)
+def drive(wrong_by: Pose2, seed: int, left: float = 0.5, turned: float = 0.0) -> list[Anchor]:
+    """200 matches 0.2 m apart, each with 5 mm and 2 mrad of noise; the odometry has 1 % of scale and noise, too.
+
+    `turned` is the standard deviation of turns that the odometry reports before each step (rad), and there are none.
+    """
+    rng, other = np.random.default_rng(seed), np.random.default_rng(seed + 100)
     pose, odometry, anchors = Pose2(3.0, 4.0, 1.0), IDENTITY, []
     for k in range(200):
         turn = 0.2 if rng.random() < left else -0.2
@@ -21,7 +24,11 @@ def drive(wrong_by: Pose2, seed: int, left: float = 0.5) -> list[Anchor]:
         seen = (pose @ wrong_by).to_array() + noise[:3]
         anchors.append(Anchor(k, odometry, Pose2.from_array(seen), np.eye(3), begins=k == 0))
         pose = pose @ Pose2(0.2, 0.0, turn)
-        odometry = odometry @ Pose2(0.202 + float(noise[3]), 0.0, turn + float(noise[5]))
+        odometry = (
+            odometry
+            @ Pose2(0.0, 0.0, float(other.normal(0.0, turned)))
+            @ Pose2(0.202 + float(noise[3]), 0.0, turn + float(noise[5]))
+        )
     return anchors
 
 
@@ -42,6 +49,14 @@ def test_a_laser_that_is_where_it_is_said_to_be_is_not_reported(seed: int) -> No
     assert found is not None
     assert not found.is_significant
     assert not found.pose_errors(np.ones((2, 3))).any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_of_the_odometry_that_turns_its_steps_is_no_place_of_the_laser(seed: int) -> None:
+    found = mounting_error(drive(IDENTITY, seed, turned=0.1))
+    assert found is not None
+    assert not found.is_displaced
+    assert abs(found.error.x) < 0.035  # by the turns of the odometry it would be 0.05
 
 
 def test_few_matches_say_nothing_and_turns_to_one_side_only_the_yaw() -> None:

@@ -74,6 +74,10 @@ def test_a_crowd_hides_walls_but_does_not_contradict_them() -> None:
     assert (clear.short, clear.through) == (0.0, 0.0)
     assert crowd.fitness == pytest.approx(clear.fitness, abs=0.05)
     assert crowd.short > 0.3
+    hidden = crowded(seen(L_SHAPE, place, Pose2(), 0.0), 0.5)
+    assert check.is_hidden(hidden, place, clear.fitness)
+    assert not check.is_hidden(crowded(hidden, 1.0), place, clear.fitness)
+    assert not check.is_hidden(hidden, place @ Pose2(0.3, 0.2), clear.fitness)
 
 
 def test_at_a_wrong_place_beams_end_behind_walls() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from hsloc.kernels.beams import look_up, trace
 from hsloc.matching.harmony_search import HarmonySearch
+from hsloc.matching.likelihood_field import distances_to_walls
 from hsloc.matching.window import Window
 from hsloc.model.pose2 import Pose2
 from hsloc.run_metrics import LaserResiduals, ResidualMetrics
@@ -67,10 +68,10 @@ class Residuals:
     """Distances to the nearest occupied cell, counted in bins of 5 mm, so that memory does not grow."""
 
     def __init__(self, grid: OccupancyGrid) -> None:
-        from scipy.ndimage import distance_transform_edt
-
         self._grid = grid
-        self._distance = (distance_transform_edt(~grid.occupied()) * grid.resolution).astype(np.float32)
+        self._distance = np.empty(grid.cells.shape, dtype=np.float32)
+        for row, distance in distances_to_walls(grid.occupied()):
+            self._distance[row : row + len(distance)] = distance * grid.resolution
         self._T_grid_map = grid.origin.inverse()
         self._by_laser: dict[str, NDArray[np.int64]] = {}
 

@@ -18,6 +18,8 @@ from hsloc.kernels.score_field import column_distances, squared_distances
 from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from hsloc.model.occupancy_grid import OccupancyGrid
@@ -29,6 +31,20 @@ _MOST_CELLS = 2e8
 """Maximum number of cells of a field. Internal: 22 bytes a cell while it is made, 4.4 GB."""
 _ROWS = 64
 """Rows of a map whose distances are worked out in one go. Internal: bounds the memory."""
+
+
+def distances_to_walls(occupied: NDArray[np.bool_], overlap: int = 0) -> Iterator[tuple[int, F64]]:
+    """Of cells (h, w) the distance in cells to the nearest occupied one, some rows (k, w) at a time.
+
+    Yields the number of the first of these rows, and the distances; `overlap` rows at the end are those that come next.
+    All at once would take more memory than what is made of them.
+    """
+    height, width = occupied.shape
+    far = height + width
+    columns = np.empty(occupied.shape, dtype=np.uint16 if far < 1 << 16 else np.int32)
+    column_distances(occupied, far, columns)
+    for row in range(0, height - overlap, _ROWS):
+        yield row, np.sqrt(squared_distances(columns[row : row + _ROWS + overlap]))
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
@@ -80,17 +96,10 @@ class LikelihoodField:
             )
         walls = grid.centres(occupied)
         padded = np.pad(occupied, pad)
-        del occupied
         height, width = padded.shape
-        far = height + width
-        columns = np.empty(padded.shape, dtype=np.uint16 if far < 1 << 16 else np.int32)
-        column_distances(padded, far, columns)
-        del padded
         packed = np.empty((height - 1, width - 1, 4), dtype=np.float32)
-        # A few rows at a time: the distances and scores of a large map would take more memory than the field itself.
-        for row in range(0, height - 1, _ROWS):
-            distance = np.sqrt(squared_distances(columns[row : row + _ROWS + 1])) * grid.resolution
-            scores = np.exp(-distance / sigma).astype(np.float32)
+        for row, distance in distances_to_walls(padded, overlap=1):
+            scores = np.exp(-(distance * grid.resolution) / sigma).astype(np.float32)
             pack(scores, packed[row : row + _ROWS], 0, len(scores) - 1, 0, width - 1)
         corner = (0.5 - pad) * grid.resolution
         T_map_field = grid.origin @ Pose2(corner, corner, 0.0)

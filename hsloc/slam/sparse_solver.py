@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import bsr_array, csc_array
-from scipy.sparse.linalg import splu
 
 from hsloc.kernels.block_cholesky import Factor, factor_columns, factorise, selected_inverse, solve_factor, sum_blocks
 
@@ -73,6 +71,10 @@ class BlockSystem:
         return sums
 
     def _factor(self, diagonal: F64, off_diagonal: F64) -> SuperLU:
+        # Imported where it is used: localising does without it, and it takes half a second.
+        from scipy.sparse import bsr_array, csc_array
+        from scipy.sparse.linalg import splu
+
         data = self._summed(diagonal, off_diagonal)
         matrix = csc_array(bsr_array((data, self._indices, self._indptr), shape=(3 * self._size, 3 * self._size)))
         return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
@@ -134,6 +136,9 @@ class _Elimination:
 
 def _minimum_degree(indptr: I64, indices: I64) -> I64:
     """An order of elimination (n,) with little fill, of a symmetric pattern whose diagonal is full."""
+    from scipy.sparse import csc_array
+    from scipy.sparse.linalg import splu
+
     size = len(indptr) - 1
     # SuperLU orders by the pattern alone; the values only have to be factorised without pivoting.
     values = np.ones(len(indices))

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from fastapi.testclient import TestClient
 
-pytestmark = pytest.mark.unmeasured
-
 REAL = Settings().worker_command
 
 

@@ -143,11 +143,13 @@ def name_and_label(page: Any) -> None:
 
 def test_a_page_goes_on_when_the_server_was_restarted(make_live: Callable[..., Live], browser: Any) -> None:
     live = make_live()
-    with live.client() as client:
-        job = submit(client, b"slow 4")
     context = browser.new_context()
     page = context.new_page()  # refused connections are in the console, as they should be
-    page.goto(f"{live.url}/#job={job}")
+    page.goto(live.url)
+    page.wait_for_selector("#jobs")
+    with live.client() as client:
+        job = submit(client, b"slow 6")
+    page.evaluate(f"location.hash = 'job={job}'")
     page.wait_for_selector("#job-state .running")
     assert live.end() == 0  # the stream ends in good order, and the job does not
     page.wait_for_timeout(1000)

@@ -203,7 +203,7 @@ def _open_joints(r: Recorded, bridged: Bools) -> Reason | None:
             wrong.append((first, last))
     if not wrong:
         return None
-    text = f"{len(wrong)} joint(s) are held by odometry alone: the scans refused it, fewer than two loops span it"
+    text = f"odometry alone holds {_count(len(wrong), 'joint')}: the scans refused it, fewer than two loops span it"
     return _reason(r, "open-joint", text, wrong, failed=False)
 
 
@@ -242,7 +242,7 @@ def _second_visits(r: Recorded) -> Reason | None:
     if not wrong:
         return None
     share = sum(last - first + 1 for first, last in wrong) / int(known.sum())
-    text = f"{100.0 * share:.0f} % of the second visits look through walls of the first, in {len(wrong)} stretch(es)"
+    text = f"{100.0 * share:.0f} % of second visits look through walls of the first, in {_count(len(wrong), 'stretch')}"
     return _reason(r, "second-visit", text, wrong, failed=share > _FAILED_SHARE)
 
 
@@ -271,7 +271,7 @@ def _against_odometry(r: Recorded, bridged: Bools) -> Reason | None:
     wrong = [(first, last) for first, last in ends if not bridged[first + 1 : last + 1].all()]
     if not wrong:
         return None
-    text = f"map and odometry contradict each other over {len(wrong)} stretch(es) that no loop spans"
+    text = f"map and odometry contradict each other over {_count(len(wrong), 'stretch')} that no loop spans"
     return _reason(r, "odometry", text, wrong, failed=False)
 
 
@@ -283,7 +283,7 @@ def _slips(r: Recorded) -> Reason | None:
     if _number(harmful) < _LIKELY:
         return None
     runs, sigma = _most_likely(r, slipped, harmful)
-    text = f"the wheels slipped in {len(runs)} stretch(es) in which the scans fix the motion to {sigma:.2f} m only"
+    text = f"the wheels slipped in {_count(len(runs), 'stretch')} in which the scans fix the motion to {sigma:.2f} m only"
     return _reason(r, "slip", text, runs, failed=False)
 
 
@@ -307,7 +307,7 @@ def _unobserved(r: Recorded) -> Reason | None:
         return None
     runs, sigma = _most_likely(r, quiet, harmful)
     text = (
-        f"in {len(runs)} stretch(es) the scans and the rest of the map fix the motion to {sigma:.2f} m only: "
+        f"in {_count(len(runs), 'stretch')} the scans and the rest of the map fix the motion to {sigma:.2f} m only: "
         "the position along them rests on the odometry, and a slip would not be noticed"
     )
     return _reason(r, "unobserved", text, runs, failed=False)
@@ -375,6 +375,10 @@ def _no_returns(r: Recorded) -> Reason | None:
         return None
     text = f"{100.0 * r.no_return_share:.0f} % of the beams met nothing: where that is a fault they erase walls"
     return Reason("no-returns", text, "check")
+
+
+def _count(n: int, word: str) -> str:
+    return f"{n} {word}" if n == 1 else f"{n} {word}{'es' if word.endswith('ch') else 's'}"
 
 
 def _reason(r: Recorded, code: str, text: str, runs: list[tuple[int, int]], *, failed: bool) -> Reason:

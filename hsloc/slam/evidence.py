@@ -283,7 +283,7 @@ def _slips(r: Recorded) -> Reason | None:
     if _number(harmful) < _LIKELY:
         return None
     runs, sigma = _most_likely(r, slipped, harmful)
-    text = f"the wheels slipped in {_count(len(runs), 'stretch')} in which the scans fix the motion to {sigma:.2f} m only"
+    text = f"the wheels slipped in {_count(len(runs), 'stretch')} where the scans fix the motion to {sigma:.2f} m only"
     return _reason(r, "slip", text, runs, failed=False)
 
 

@@ -7,17 +7,18 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
+
 from hsloc.errors import HslocError, LogFormatError
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from hsloc.log.summary import Losses, TopicStatistics
-    from hsloc.warnings import RunWarning
 
 RawMessage = tuple[int, int, int, "memoryview | bytes"]
 """(log time in ns, position in the file, id of the channel, payload). Positions are unique in a file."""
@@ -58,6 +59,62 @@ def plausible_times(ordered: Sequence[int] | NDArray[np.uint64]) -> tuple[int, i
     low, high = int(ordered[cut]), int(ordered[-1 - cut])
     margin = 2 * (high - low) + _HOUR_NS
     return low - margin, min(high + margin, (1 << 63) - 1)
+
+
+STEP_NS = 1_000_000_000
+"""Least step of a clock that is reported. chrony sets a clock that is wrong by more (`makestep 1 3` is its default in
+distributions), others it slows down or speeds up; stamps of Intel's log run backwards by up to 0.9 s without one."""
+AGREEING = 10
+"""Messages in a row that must show a step, where single ones may be wrong."""
+_MARGIN_S = 0.1
+"""Distance (s) of a cut from times that are there twice: they are stated to a tenth."""
+
+
+class RecorderClock:
+    """Whether the recorder's own clock was set back: log times, in the order of writing, that step back.
+
+    `AGREEING` messages on either side must show it, and a channel must have some on both: files are also put together
+    topic by topic.
+    """
+
+    def __init__(self) -> None:
+        self._steps: list[tuple[int, int]] = []
+        self._first_ns: int | None = None
+        self._channels = np.zeros(0, dtype=np.int64)
+        self._times = np.zeros(0, dtype=np.int64)
+
+    def take(self, channels: NDArray[np.int64], times: NDArray[np.int64]) -> None:
+        """The next messages: their channels (n,) and log times (n,) in ns."""
+        if self._first_ns is None and len(times):
+            self._first_ns = int(times[0])
+        channels, times = np.concatenate((self._channels, channels)), np.concatenate((self._times, times))
+        for k in np.flatnonzero(np.diff(times) < -STEP_NS).tolist():
+            before, after = slice(k + 1 - AGREEING, k + 1), slice(k + 1, k + 1 + AGREEING)
+            if k + 1 < AGREEING or k + 1 + AGREEING > len(times):
+                continue
+            shared = np.isin(channels[before], channels[after]).any()
+            if shared and times[after].max() < times[before].min():
+                self._steps.append((int(times[k]), int(times[k + 1])))
+        left = 2 * AGREEING - 1
+        self._channels, self._times = channels[-left:], times[-left:]
+
+    def warnings(self, path: Path, statistics: Iterable[TopicStatistics]) -> list[RunWarning]:
+        """A warning of the first step, with the parts of the log that are in order; `statistics` are of all topics."""
+        starts = [each.first_ns for each in statistics if each.first_ns is not None]
+        if not self._steps or not starts or self._first_ns is None:
+            return []
+        last, following = self._steps[0]
+        # What came before the step, and what came after it, may have the same times.
+        begin, end = max(following, self._first_ns), min(last, int(self._times[-1]))
+        margin_s = _MARGIN_S if begin <= end else 0.0
+        low, high = ((each - min(starts)) / 1e9 for each in sorted((begin, end)))
+        more = f", the first of {len(self._steps)} steps" if len(self._steps) > 1 else ""
+        text = (
+            f"{path}: the log's times step back by {(last - following) / 1e9:.1f} s{more}: the recorder's clock was "
+            "set, and what came before and after is out of order"
+        )
+        remedy = f"cut the log: --end {low - margin_s:.1f}, or --start {high + margin_s:.1f}, has one of both alone"
+        return [RunWarning(WarningCode.CLOCK_SET, text, remedy)]
 
 
 @contextmanager

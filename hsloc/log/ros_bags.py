@@ -17,9 +17,11 @@ from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any, Protocol, cast
 from urllib.parse import quote
 
+import numpy as np
+
 from hsloc.errors import LogError, LogFormatError
 from hsloc.log.bag_index import reindex
-from hsloc.log.container import Channel, RawMessage, guarded, in_runs, plausible_times
+from hsloc.log.container import Channel, RawMessage, RecorderClock, guarded, in_runs, plausible_times
 from hsloc.log.files import Scratch
 from hsloc.log.messages.definitions import long_name
 from hsloc.log.summary import Losses, TopicStatistics
@@ -29,10 +31,13 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
     from hsloc.warnings import RunWarning
 
     class _Reader(Protocol):
         connections: list[Any]
+        indexes: dict[int, list[Any]]
         message_count: int
 
         def __enter__(self) -> _Reader: ...
@@ -42,6 +47,8 @@ if TYPE_CHECKING:
 
 _RUN = 1024
 """Messages in one run."""
+_WRITTEN = [("channel", "i8"), ("time", "i8")]
+"""Channel and log time (ns) of a message."""
 
 
 class _Bag(ABC):
@@ -69,6 +76,12 @@ class _Bag(ABC):
         for _ in self.messages(self.channels, losses):
             pass
         return losses
+
+    def _note_steps(self, written: NDArray[np.void]) -> None:
+        """A warning where messages (n,) in the order of writing, of `_WRITTEN`, show that the clock was set back."""
+        clock = RecorderClock()
+        clock.take(written["channel"], written["time"])
+        self.warnings = clock.warnings(self.path, self.statistics.values())
 
     def _require_some(self, damage: Losses) -> None:
         """Raise LogFormatError where counting met damage before the first message.
@@ -173,6 +186,9 @@ class BagContainer(_Bag):
                 number = numbers[self._key(connection)]
                 self.statistics.setdefault(number, TopicStatistics()).add(log_time, log_time, 1, 0)
         self._require_some(damage)
+        entries = ((each.chunk_pos, each.offset, k, each.time) for k, index in reader.indexes.items() for each in index)
+        written = np.sort(np.fromiter(entries, dtype=[("chunk", "i8"), ("offset", "i8"), *_WRITTEN]))
+        self._note_steps(written)
         counted, promised = sum(item.count for item in self.statistics.values()), reader.message_count
         if not damage.reasons and counted < promised:
             self.losses_at_opening.truncated_files += 1
@@ -288,6 +304,8 @@ class Db3Container(_Bag):
                     log_time = last.get(number, low)
                 last[number] = log_time
                 statistics.add(max(log_time, 0), max(log_time, 0), 1, 0)
+            rows = connection.execute("SELECT topic_id, timestamp FROM messages ORDER BY id")
+            self._note_steps(np.fromiter(rows, dtype=_WRITTEN))
         self._require_some(damage)
 
     def _guarded(self, losses: Losses | None = None) -> AbstractContextManager[None]:

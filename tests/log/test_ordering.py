@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_builders import SECOND, START, describe, make_scan
 
+from hsloc.log.container import RecorderClock
 from hsloc.log.session.ordering import KIND_ODOMETRY, KIND_SCAN, WINDOW_NS, Arrivals, Reorder, TopicClock
-from hsloc.log.summary import LogSummary, Losses
+from hsloc.log.summary import LogSummary, Losses, TopicStatistics
 from hsloc.model import Odometry, Pose2
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from hsloc.model import Event
 
@@ -206,3 +209,35 @@ def test_delays_and_gaps_are_no_steps_of_a_clock(size: int) -> None:
     stamps[300] -= 3 * SECOND  # a single one
     _, losses = order([("odometry", *times) for times in zip(stamps, log_times, strict=True)], size)
     assert losses.clock_steps == {}
+
+
+@pytest.mark.parametrize(
+    ("step_s", "by_topic", "cut"),
+    [(-3.0, False, ("6.9", "10.0")), (-40.0, False, ("9.9", "30.0")), (-3.0, True, None), (5.0, False, None)],
+)
+def test_a_clock_of_the_recorder_that_was_set_back_is_found(
+    tmp_path: Path, step_s: float, by_topic: bool, cut: tuple[str, str] | None
+) -> None:
+    """20 s at 10 Hz, set at 10 s; a file that was put together topic by topic looks alike, and is none."""
+    seconds = np.arange(200) / 10.0
+    times = START + np.round((seconds + (seconds >= 10.0) * step_s) * SECOND).astype(np.int64)
+    channels = (np.arange(200) >= 100) * 1 if by_topic else np.arange(200) % 2
+    clock = RecorderClock()
+    for k in range(0, 200, 33):
+        clock.take(channels[k : k + 33], times[k : k + 33])
+    statistics = TopicStatistics()
+    statistics.add(int(times.min()), int(times.max()), 200, 0)
+    warnings = clock.warnings(tmp_path / "log", [statistics])
+    assert [warning.code for warning in warnings] == ["clock_set"] * (cut is not None)
+    for warning in warnings:
+        assert f"step back by {-step_s - 0.1:.1f} s" in warning.text
+        assert cut is not None
+        assert f"--end {cut[0]}, or --start {cut[1]}," in warning.remedy
+
+
+def test_one_wrong_log_time_is_no_step_of_the_clock(tmp_path: Path) -> None:
+    times = START + np.arange(100) * SECOND // 10
+    times[50] -= 100 * SECOND
+    clock = RecorderClock()
+    clock.take(np.zeros(100, np.int64), times)
+    assert clock.warnings(tmp_path, [TopicStatistics(100, START, START + 10 * SECOND)]) == []

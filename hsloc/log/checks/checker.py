@@ -158,7 +158,8 @@ def _check_summary(summary: LogSummary, has_scans: bool, findings: Findings) -> 
         if warning.code == WarningCode.EXTRINSICS_ASSUMED and not summary.lasers:  # a text log
             findings.add(Severity.WARNING, "no_extrinsic", "", warning.text, warning.remedy)
         elif warning.code not in _CHECKED_HERE:
-            findings.add(Severity.WARNING, warning.code, "", warning.text, warning.remedy or "see `hsloc info`")
+            severity = Severity.ERROR if warning.code == WarningCode.CLOCK_SET else Severity.WARNING
+            findings.add(severity, warning.code, "", warning.text, warning.remedy or "see `hsloc info`")
 
 
 def _check_damage(log: Log, losses: Losses, findings: Findings) -> None:

@@ -59,6 +59,7 @@ class McapContainer:
             raise LogFormatError(f"{self.path}: cannot be read ({error.strerror or error})") from error
         self.profile = self._directory.profile
         self.statistics = self._directory.statistics
+        self.warnings += self._directory.clock.warnings(self.path, self.statistics.values())
         self.metadata = self._directory.metadata
         self.losses_at_opening = self._directory.losses
         self.channels = {number: self._channel(record) for number, record in sorted(self._directory.channels.items())}

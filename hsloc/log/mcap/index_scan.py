@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 import numpy as np
 
 from hsloc.errors import LogFormatError
-from hsloc.log.container import plausible_times
+from hsloc.log.container import RecorderClock, plausible_times
 from hsloc.log.mcap import records
 from hsloc.log.mcap.records import ChunkHead, Damage, Opcode
 from hsloc.log.summary import Losses, TopicStatistics
@@ -58,6 +58,7 @@ class ChunkIndex:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     segments: list[Segment] = field(default_factory=list)
     losses: Losses = field(default_factory=Losses)
+    clock: RecorderClock = field(default_factory=RecorderClock)
     plausible_ns: tuple[int, int] = (0, (1 << 63) - 1)
     """Between which log times messages are believed."""
 
@@ -105,6 +106,7 @@ class IndexScan:
         self.loose: list[tuple[int, int, int, int]] = []
         self.chunk: Segment | None = None
         self.index: dict[int, NDArray[np.uint64]] = {}
+        self.places: dict[int, NDArray[np.uint64]] = {}
         self.index_is_whole = True
         self.chunks_of_summary: list[int] | None = None
         self._samples: list[int] = []
@@ -236,6 +238,8 @@ class IndexScan:
         for *_, channel, log_time in self.loose:
             by_channel.setdefault(channel, []).append(log_time)
         self._count({channel: np.array(times, dtype=np.uint64) for channel, times in by_channel.items()})
+        channels, written = ([each[k] for each in self.loose] for k in (2, 3))
+        self.directory.clock.take(np.array(channels, np.int64), np.array(written, np.uint64).astype(np.int64))
         self.directory.segments.append(Segment(start, first, last + size - first, None, frozenset(by_channel)))
         self.loose = []
 
@@ -255,8 +259,9 @@ class IndexScan:
         content = self._content(at, length, limit=64 << 20)
         if length < 6 or (length - 6) % 16:
             raise Damage("message index of an odd size")
-        times = np.frombuffer(content, dtype="<u8", offset=6)[::2] if length > 6 else np.zeros(0, np.uint64)
-        self.index[records.NUMBER.unpack_from(content)[0]] = times
+        rows = np.frombuffer(content, dtype="<u8", offset=6) if length > 6 else np.zeros(0, np.uint64)
+        channel = records.NUMBER.unpack_from(content)[0]
+        self.index[channel], self.places[channel] = rows[::2], rows[1::2]
 
     def _close_chunk(self) -> None:
         """The chunk's indexes are complete when something else follows."""
@@ -264,9 +269,13 @@ class IndexScan:
             channels = frozenset(self.index) if self.index and self.index_is_whole else None
             if channels:
                 self._count({channel: self.index[channel] for channel in channels})
+                order = np.argsort(np.concatenate([self.places[channel] for channel in self.index]), kind="stable")
+                times = np.concatenate([*self.index.values()]).astype(np.int64)
+                numbers = np.repeat([*self.index], [len(each) for each in self.index.values()])
+                self.directory.clock.take(numbers[order], times[order])
             self.directory.segments.append(self.chunk._replace(channels=channels))
         self.chunk = None
-        self.index = {}
+        self.index, self.places = {}, {}
         self.index_is_whole = True
 
     def _resume(self, at: int) -> int | None:

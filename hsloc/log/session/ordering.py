@@ -16,6 +16,8 @@ from itertools import repeat
 from operator import sub
 from typing import TYPE_CHECKING, NamedTuple
 
+from hsloc.log.container import AGREEING, STEP_NS
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
@@ -32,15 +34,9 @@ JUMP_NS = 10_000_000_000
 the next one agrees with it."""
 MAX_PENDING = 20_000
 """Maximum number of events that wait. Internal: bounds the memory."""
-STEP_NS = 1_000_000_000
-"""Least step of a clock that is reported. chrony sets a clock that is wrong by more (`makestep 1 3` is its default in
-distributions), others it slows down or speeds up; stamps of Intel's log run backwards by up to 0.9 s without one."""
 _LEAST_KNOWN_NS = 1_000_000_000
 """Least time (of the log) over which messages must have come with a delay for it to be the usual one: a recorder that
 has just started may get what was kept for it."""
-
-AGREEING = 10
-"""Messages in a row that must show a step, where single ones may be wrong."""
 
 
 class StepDetector:

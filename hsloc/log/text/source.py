@@ -15,10 +15,10 @@ from io import BufferedReader
 from typing import TYPE_CHECKING, BinaryIO, cast
 
 from hsloc.errors import LogFormatError, TopicError
+from hsloc.log.container import AGREEING, STEP_NS
 from hsloc.log.messages.decode import OdometryMessage, ScanMessage
 from hsloc.log.packing import GZIP
 from hsloc.log.range_codes import NO_RETURN_CM, RANGE_MIN, NoReturnCode, RangeRule
-from hsloc.log.session.ordering import AGREEING, STEP_NS
 from hsloc.log.source import Observation
 from hsloc.log.summary import LogSummary, Losses, ReadOptions, TopicStatistics, TopicSummary
 from hsloc.log.text.formats import Carmen, Wean

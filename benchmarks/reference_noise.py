@@ -96,16 +96,16 @@ def main() -> None:
         # Of n samples that are as noisy the fit of three numbers leaves a noise of its own.
         noise = rms / np.sqrt(1.0 + 1.5 / (2 * half))
         print(f"windows of {2 * half + 1:>2} samples: off by {1000 * rms:.1f} mm rms, noise {1000 * noise:.1f} mm")
-    fast_parts = []
+    fast_parts: list[F64] = []
     for name, source in (("trajectory", trajectory), ("odometry", odometry)):
         points, truth, stamps = sampled(source, offset)
         errors = np.array([fitted(points, truth, point) for point in points]) - truth
         slow, fast = parted(errors, stamps)
         fast_parts.append(fast)
         print(f"{name}: off by {rms_mm(errors):.1f} mm rms, slow part {rms_mm(slow):.1f}, fast {rms_mm(fast):.1f} mm")
-    correlation = float(np.corrcoef(*(fast.ravel() for fast in fast_parts))[0, 1])
-    apart = rms_mm(fast_parts[0] - fast_parts[1])
-    print(f"fast parts of both: correlation {correlation:.3f}, {apart:.1f} mm rms apart")
+    ours, raw = fast_parts
+    correlation = float(np.corrcoef(ours.ravel(), raw.ravel())[0, 1])
+    print(f"fast parts of both: correlation {correlation:.3f}, {rms_mm(ours - raw):.1f} mm rms apart")
 
 
 if __name__ == "__main__":

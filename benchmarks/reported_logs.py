@@ -147,8 +147,9 @@ def rows(own: Cases) -> Iterator[tuple[str, str, Callable[[], str]]]:
 
 
 def edited(own: Cases, name: str, change: Callable[[Any], None]) -> list[str]:
-    """A log whose scans were changed."""
-    return [str(own.scans(f"{name}.mcap", change))]
+    """A log whose scans were changed; beams that were measured one after the other are in the case of S05."""
+    source = own.cases / "S05-scan-time-thousandth/scan.mcap" if name == "S05" else None
+    return [str(own.scans(f"{name}.mcap", change, source))]
 
 
 def compared_made(own: Cases, make: Callable[[Cases], list[str]]) -> str:

@@ -181,6 +181,11 @@ def share_by_a_link(page: Any, open_page: Callable[..., Any]) -> None:
         page.click("#shares button")  # revokes
         page.wait_for_function("(n) => document.querySelectorAll('#shares li').length === n", arg=left)
     visitor.close()
+    late = page.context.new_page()  # whose console may say 404
+    late.goto(link)
+    late.wait_for_selector("#notice >> text=revoked")
+    assert late.is_hidden("#job")
+    late.close()
 
 
 def compare_two(page: Any, need_accessible: Callable[[Any], None]) -> None:

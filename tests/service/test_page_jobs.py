@@ -221,7 +221,9 @@ TILES = """async () => {
   const t = [...Array(500).keys()], x = t.map((k) => 50 + 40 * Math.cos(k / 20)), y = t.map((k) => 50 + k / 20);
   const trajectory = { t, x, y, theta: t, breaks: [], state: t.map(() => 0), states: ["localised"] };
   const data = { extent: [0, 0, 100, 100], end: 500, trajectory, events: [], charts: [], status: [], lost: [],
-      marks: [{ status: "rejected", label: "refused", t, x, y, reason: t }] };
+      marks: [{ status: "rejected", label: "refused", t, x, y, reason: t }],
+      loops: { t: [9, 9], x0: [0, 0], y0: [20, 80], x1: [90, 90], y1: [20, 80], accepted: [true, false],
+        reason: ["", "too far"] } };
   const view = new ResultView(root, data, null, document.createElement("div"));
   const values = () => {
     const { width, height } = view.$base;
@@ -233,8 +235,10 @@ TILES = """async () => {
   view.drawNow();
   const whole = values();
   const share = (other) => whole.reduce((n, v, k) => n + (Math.abs(v - other[k]) > 64), 0) / whole.length;
+  view.all(); view.shown.add("refused");
+  const reasons = [20, 80, 5].map((y) => view.reasonAt(...view.pixels(...view.local(30, y))));
   view.end();
-  return [share(before), share(panned)]; }"""
+  return [share(before), share(panned), ...reasons]; }"""
 
 
 def test_curves_of_single_values_places_that_may_be_right_and_tiles(
@@ -243,6 +247,7 @@ def test_curves_of_single_values_places_that_may_be_right_and_tiles(
     page = open_page(make_live().url)
     assert page.evaluate(SPARSE)
     assert page.evaluate(PLACES) == [[1, 0, 0], [7, 2, 1.571], [1, 0, 0]]
-    moved, differing = page.evaluate(TILES)
+    moved, differing, *reasons = page.evaluate(TILES)
+    assert reasons == ["loop closed", "loop refused: too far", None]
     assert moved > 0.005
     assert differing < 0.01 * moved

@@ -262,11 +262,18 @@
       return [mark("end", "vermillion", last, near && !left), mark("start", "green", first, left)];
     },
     markInk: (mark) => ["rejected", "to_check"].includes(mark.status) ? "vermillion" : "orange",
-    // The reason of the verdict that was found at a pixel.
+    // Why there is a mark at a pixel, or why a loop through it was refused; null where nothing is.
     reasonAt(px, py) {
-      for (const mark of this.data.marks) if (mark.status === "to_check" && this.shown.has(mark.status)) for (const k of mark.t.keys()) {
-        const [x, y] = this.pixels(...this.local(mark.x[k], mark.y[k]));
-        if (Math.hypot(px - x, py - y) < 14 * this.ratio) return mark.reason[k];
+      const { marks, loops } = this.data, at = (x, y) => this.pixels(...this.local(x, y));
+      for (const mark of marks) for (const k of this.shown.has(mark.status) ? mark.t.keys() : []) {
+        const [x, y] = at(mark.x[k], mark.y[k]);
+        if (Math.hypot(px - x, py - y) < 14 * this.ratio && mark.reason?.[k]) return mark.reason[k];
+      }
+      for (const k of loops?.t.keys() ?? []) {
+        if (!this.shown.has(loops.accepted[k] ? "loops" : "refused")) continue;
+        const [x, y] = at(loops.x0[k], loops.y0[k]), [ex, ey] = at(loops.x1[k], loops.y1[k]), dx = ex - x, dy = ey - y;
+        const along = Math.min(Math.max(((px - x) * dx + (py - y) * dy) / (dx * dx + dy * dy || 1), 0), 1);
+        if (Math.hypot(px - x - along * dx, py - y - along * dy) < 6 * this.ratio) return loops.accepted[k] ? "loop closed" : `loop refused: ${loops.reason[k]}`;
       }
       return null;
     },

@@ -17,6 +17,7 @@ import * as sweeps from "./sweeps.js";
 const EVERY_MS = 3000;
 const ID = /^[0-9a-f-]{36}$/; // of a job: what is in the address becomes part of a request's path
 const SECRET = /^hss_[\w-]{43}$/; // of a link
+const OF_FILES = ["log", "map", "reference", "relations", "calibration", "resume", "webhook"]; // ids that say nothing to people
 let comparison = null;
 
 // --- token -----------------------------------------------------------------------------------------------------------
@@ -68,7 +69,8 @@ function route(event) {
   else if (part === "sweep") sweeps.show(ids[0]);
   else if (part === "sweeps") guarded(sweeps.list);
   else if (part === "files") guarded(() => files.show(useAgain));
-  else guarded(async () => { await labels.known(); await jobs.refresh(name === "label" ? decodeURIComponent(value) : undefined); });
+  else if (name === "label") guarded(async () => { await labels.known(); await jobs.refresh(decodeURIComponent(value)); });
+  else guarded(() => Promise.all([labels.known(), jobs.refresh()]));
 }
 
 async function compare(ids) {
@@ -76,11 +78,25 @@ async function compare(ids) {
   for (const id of ids.slice(0, 12)) {
     const job = await get(`/v1/jobs/${id}`), loaded = job.state === "succeeded" ? await result.load(`/v1/jobs/${id}/results`) : null;
     if (location.hash !== address) return; // something else is shown by now
-    if (loaded) runs.push({ name: `${job.title ?? job.log}, seed ${job.request.seed}`, href: `#job=${id}`, ...loaded });
+    if (loaded) runs.push({ name: `${job.title ?? job.log}, seed ${job.request.seed}`, href: `#job=${id}`, request: job.request, ...loaded });
     else notice(`${job.log}: ${job.state === "succeeded" ? "made by an earlier version; run it again to compare it" : "it has no result to compare"}`);
   }
+  tellApart(runs);
   const seeds = runs.length > 1 ? await get(`/v1/compare?${new URLSearchParams(ids.slice(0, 12).map((id) => ["job", id]))}`) : null;
   if (runs.length && location.hash === address) comparison = new globalThis.ResultComparison($("comparison"), runs, seeds?.names.length ? seeds : null);
+}
+
+// Runs of one name get what their settings differ in, else their number.
+function tellApart(runs) {
+  const text = (key, value) => [key.replaceAll("_", " "), ...(value === true ? [] : [typeof value === "object" ? JSON.stringify(value) : value])].join(" ");
+  const setting = (run, key) => run.request[key] && !OF_FILES.includes(key) ? text(key, run.request[key]) : "";
+  for (const name of new Set(runs.map((run) => run.name))) {
+    const alike = runs.filter((run) => run.name === name), keys = [...new Set(alike.flatMap((run) => Object.keys(run.request)))];
+    if (alike.length < 2) continue;
+    const differing = keys.filter((key) => new Set(alike.map((run) => setting(run, key))).size > 1);
+    const settings = alike.map((run) => differing.map((key) => setting(run, key)).filter(Boolean).join(", "));
+    alike.forEach((run, k) => { run.name += new Set(settings).size < alike.length ? ` (${k + 1})` : settings[k] && `, ${settings[k]}`; });
+  }
 }
 
 form.listen((made) => { if (made.sweep) location.hash = `sweep=${made.sweep}`; else if (made.length === 1) location.hash = `job=${made[0].id}`; else guarded(jobs.refresh); });

@@ -25,6 +25,12 @@ function figures(found) {
 // Small pictures of results, as object URLs by job; null where one could not be had.
 const pictures = new Map();
 
+// Those that come into sight are loaded, with some that are near.
+const wanted = new WeakMap();
+const sight = new IntersectionObserver((seen) => {
+  for (const { target } of seen.filter((each) => each.isIntersecting)) { sight.unobserve(target); picture(target, ...wanted.get(target)); }
+}, { rootMargin: "300px" });
+
 async function picture(image, id, name) {
   if (!pictures.has(id)) {
     const answer = request(`/v1/jobs/${id}/results/${name}`);
@@ -38,7 +44,8 @@ function thumbnail(job) {
   if (!job.summary?.thumbnail) return []; // jobs of earlier versions have none
   const image = element("img");
   Object.assign(image, { alt: "", width: 72, height: 48 });
-  picture(image, job.id, job.summary.thumbnail);
+  wanted.set(image, [job.id, job.summary.thumbnail]);
+  sight.observe(image);
   return [image];
 }
 

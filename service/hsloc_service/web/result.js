@@ -25,7 +25,7 @@ export async function show(id, focus, time = 0) {
   const mine = begin();
   shownJob = id;
   const job = await guarded(() => get(`/v1/jobs/${id}`));
-  if (!job || mine.aborted) return;
+  if (!isThere(job, mine)) return;
   render(job);
   if (focus) $("job-title").focus();
   const ending = follow(job, mine);
@@ -40,9 +40,15 @@ export async function show(id, focus, time = 0) {
 // The job that a link shows, read-only.
 export async function showShared(secret, time = 0) {
   const mine = begin(), job = await guarded(() => get(`/v1/shared/${secret}`));
-  if (!job || mine.aborted) return;
+  if (!isThere(job, mine)) return;
   render(job, false);
   if (job.state === "succeeded") await guarded(() => showResult(job, `/v1/shared/${secret}/results`, mine, time));
+}
+
+// Of a job that is deleted, or a link that is revoked, there is the notice alone.
+function isThere(job, mine) {
+  if (!mine.aborted) $("job").hidden = !job;
+  return Boolean(job) && !mine.aborted;
 }
 
 function begin() {

@@ -296,7 +296,7 @@ class Relocaliser:
         ratio = 0.0 if alone else self._hypotheses[1].mean / max(best.mean, 1e-9)
         ahead = len(best.history) >= p.min_scans and best.mean >= p.min_fitness and lead >= p.min_margin
         pose = best.pose @ motion
-        reason = f"places: {len(self._hypotheses)}; best fitness {best.mean:.2f} of {best.scans} scans, {lead:.2f} ahead"
+        reason = f"places: {len(self._hypotheses)}; fitness {best.mean:.2f} of {best.scans} scans, {lead:.2f} ahead"
         evidence: Evidence | None = None
         if fresh:
             self._state = self._judge(best, pose)

@@ -37,6 +37,9 @@ _CLEARED = 4.0
 """Depth (m) up to which a beam without a return has looked through. Internal: as where the map is built; beyond, a wall
 may have been out of range, or of glass."""
 
+_ACROSS = 0.25
+"""Squared cosine between a normal and an axis that a wall across has. Internal: far above the noise of normals."""
+
 
 class ScanArrays(NamedTuple):
     """Scans one after the other, and which of their hits are used.
@@ -328,11 +331,14 @@ def pair_terms(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_agreement(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scale: float, sums: F64) -> None:
+def add_agreement(
+    i: int, j: int, rel: F64, axis: tuple[float, float], scans: ScanArrays, gate: float, scale: float, sums: F64
+) -> None:
     """Add to `sums` (2,) the agreement of scan i with scan j, and the number of points that j can judge.
 
     The agreement is the weight of points on walls of j, less the number of points that j looked through. What is out
-    of the view of j, behind a wall, or beyond 4 m where j has no return, it cannot judge.
+    of the view of j, behind a wall, or beyond 4 m where j has no return, it cannot judge. With an `axis` in the frame
+    of j only points on walls across it count, within 60 degrees, each as the squared cosine; (0, 0): all count alike.
     """
     c = cos(rel[2])
     s = sin(rel[2])
@@ -351,8 +357,8 @@ def add_agreement(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scal
     spacing = abs(geometry[4])
     projected = np.empty((4, len(rows)))
     project(own_points, rows, rel, geometry, projected)
-    agreement = 0.0
-    judged = 0
+    agreement = judged = 0.0
+    is_directed = axis[0] != 0.0 or axis[1] != 0.0
     for q in range(len(rows)):
         a = rows[q]
         mx = np.float64(own_normals[a, 0])
@@ -361,6 +367,9 @@ def add_agreement(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scal
         y = rel[1] + projected[1, q]
         ox = c * mx - s * my
         oy = s * mx + c * my
+        counts_as = (ox * axis[0] + oy * axis[1]) ** 2 if is_directed else 1.0
+        if counts_as < _ACROSS:
+            continue
         # From behind a wall j cannot have seen this face of it.
         if ox * (x - geometry[0]) + oy * (y - geometry[1]) >= 0.0:
             continue
@@ -371,8 +380,8 @@ def add_agreement(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scal
         chosen, best = nearest_hit(x, y, middle, gate, spacing * depth, hit_of_beam, points)
         known, nearest, farthest = ends_around(middle, ranges)
         if best > gate * gate and known >= 2 and depth + THROUGH < nearest:
-            judged += 1
-            agreement -= 1.0
+            judged += counts_as
+            agreement -= counts_as
             continue
         if chosen >= 0 and best <= gate * gate + (2.0 * spacing * depth) ** 2:
             nx = np.float64(normals[chosen, 0])
@@ -381,11 +390,11 @@ def add_agreement(i: int, j: int, rel: F64, scans: ScanArrays, gate: float, scal
             ey = y - np.float64(centroids[chosen, 1])
             distance = nx * ex + ny * ey
             if nx * ox + ny * oy >= SAME_FACE and abs(distance) <= gate:
-                judged += 1
-                agreement += 1.0 / (1.0 + (distance / scale) ** 2) ** 2
+                judged += counts_as
+                agreement += counts_as / (1.0 + (distance / scale) ** 2) ** 2
                 continue
         # A wall near the point that is not the point's, unless j does not know.
         if chosen >= 0 and known >= 2 and depth <= farthest + THROUGH:
-            judged += 1
+            judged += counts_as
     sums[0] += agreement
     sums[1] += judged

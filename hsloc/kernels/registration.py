@@ -327,24 +327,38 @@ def composed_motions(steps: F64, step_covariances: F64, windows: I64, motions: F
 
 @njit(cache=True, nogil=True)
 def displaced_agreement(
-    poses: F64, groups: tuple[I64, I64], displacements: F64, scans: ScanArrays, gate: float, scale: float, out: F64
+    poses: F64,
+    groups: tuple[I64, I64],
+    displacements: F64,
+    axis: tuple[float, float],
+    scans: ScanArrays,
+    gate: float,
+    scale: float,
+    out: F64,
 ) -> None:
-    """Write to `out` (m,) the agreement of two groups of scans with the second displaced by (m, 2) in the map (m).
+    """Write the agreement of two groups of scans with the second displaced by (m, 2) in the map (m).
 
-    It is a part of the points that the other side can judge: near 1 where all lie on walls.
+    To `out` (m, 2): the sum of `add_agreement`, and that over the points which the other side can judge, equal where
+    all of them lie on walls. With an `axis` in the map only points on walls across it count; (0, 0): all.
     """
     rel = np.empty(3)
     moved = np.empty(3)
-    sums = np.empty(2)
     for k in range(len(displacements)):
-        sums[:] = 0.0
+        out[k] = 0.0
         for a in groups[0]:
             for b in groups[1]:
                 moved[0] = poses[b, 0] + displacements[k, 0]
                 moved[1] = poses[b, 1] + displacements[k, 1]
                 moved[2] = poses[b, 2]
                 relative(poses[a], moved, rel)
-                add_agreement(b, a, rel, scans, gate, scale, sums)
+                add_agreement(b, a, rel, _seen_from(axis, poses[a, 2]), scans, gate, scale, out[k])
                 relative(moved, poses[a], rel)
-                add_agreement(a, b, rel, scans, gate, scale, sums)
-        out[k] = sums[0] / max(sums[1], 1.0)
+                add_agreement(a, b, rel, _seen_from(axis, moved[2]), scans, gate, scale, out[k])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _seen_from(axis: tuple[float, float], heading: float) -> tuple[float, float]:
+    """A direction in the map in a frame with this heading."""
+    c = np.cos(heading)
+    s = np.sin(heading)
+    return c * axis[0] + s * axis[1], c * axis[1] - s * axis[0]

@@ -12,6 +12,7 @@ from hsloc.errors import MapError
 from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import Pose2, relative_poses, wrap_angles
 from hsloc.slam.calibration import OdometryCalibration
+from hsloc.slam.displaced import mended
 from hsloc.slam.evidence import Recorded, nothing_seen, weigh
 from hsloc.slam.joint_registration import Registration, moved_scans, refine
 from hsloc.slam.loop_closer import TORN, LoopCloser, loop_edges
@@ -76,9 +77,10 @@ def finish(
 
 def solve(gathered: MapSession, parameters: GraphMapperParameters, rng: Generator) -> MapSession:
     """Close the loops of a session and refine it, so that the log can go on from there: its keyscans as solved."""
-    poses, loops, edges = _close_loops(gathered, parameters, rng, _silent)
-    edges = Edges.concatenate([gathered.steps, edges])
     arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
+    gathered = mended(gathered, arrays)
+    poses, loops, edges = _close_loops(gathered, parameters, rng, _silent)
+    edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), edges])
     refined, _ = _refine(poses, arrays, edges, parameters, _silent)
     return replace(gathered, poses=refined.poses, known=tuple(loops))
 
@@ -95,11 +97,12 @@ def finish_session(
 
     Raises MapError if in the end no loop joins the session with the map that it extends.
     """
+    arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
+    gathered = mended(gathered, arrays)
     poses, loops, loop_edges = _close_loops(gathered, parameters, rng, lambda part: report(0.5 * part))
     if extended is not None and not any(loop.accepted and _connects(loop, gathered) for loop in loops):
         raise MapError(unconnected(extended))
-    edges = Edges.concatenate([gathered.steps, loop_edges])
-    arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
+    edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), loop_edges])
     refined, passes = _refine(poses, arrays, edges, parameters, lambda part: report(0.5 + 0.4 * part))
     repaired = _without_slips(refined, gathered, loop_edges, arrays, parameters)
     refined, observed, edges = repaired.refined, repaired.observed, repaired.edges
@@ -155,17 +158,17 @@ def _without_slips(
 
     The rest of the map is compared when none is left that the scans of a stretch show by themselves.
     """
-    steps, passes = gathered.steps, 0
-    slipped, known = np.zeros(len(steps), dtype=np.bool_), np.zeros(0)
+    slipped, passes = gathered.slipped, 0
+    steps, known = without_slips(gathered.steps, slipped), None
     for repairs_left in range(_MOST_REPAIRS if parameters.use_odometry else 0, -1, -1):
         edges = Edges.concatenate([steps, loop_edges])
-        if slipped.any():
+        if known is not None:
             near_the_end = _near_the_end(parameters)
             refined, more = _refine(refined.poses, scans, edges, near_the_end, _silent, refined)
             passes += more
         observed = observed_terms(refined)
-        stretches = compare_with_odometry(refined, steps, scans, observed)
-        if len(known):
+        stretches = compare_with_odometry(refined, gathered.steps if known is None else steps, scans, observed)
+        if known is not None:
             # Odometry without weight contradicts nothing any more.
             stretches = replace(stretches, normalised=np.maximum(stretches.normalised, known))
         held = None

@@ -76,6 +76,15 @@ class MapSession:
     """Pairs of places that are not."""
     ties: tuple[Tie, ...] = ()
     """Where the path has gaps, in the order of the keyscans after them: there the robot was followed on the map."""
+    slips: tuple[int, ...] = ()
+    """Keyscans before steps in which the wheels slipped, as the scans around them show."""
+
+    @property
+    def slipped(self) -> NDArray[np.bool_]:
+        """The same for each step, shape (n - 1,)."""
+        slipped = np.zeros(len(self.steps), dtype=np.bool_)
+        slipped[list(self.slips)] = True
+        return slipped
 
     @property
     def chain(self) -> Edges:
@@ -90,6 +99,13 @@ class MapSession:
         asserted = stated_places(loops.asserted, seconds, self.places, "--assert-loop")
         forbidden = stated_places(loops.forbidden, seconds, self.places, "--forbid-loop")
         return replace(self, asserted=tuple(asserted), forbidden=tuple(forbidden))
+
+    def on_path(self, poses: F64, covariances: F64, slipped: NDArray[np.bool_]) -> MapSession:
+        """The same keyscans on another path: poses (n, 3), with the covariances (n, 3, 3) of its steps."""
+        motions = np.concatenate((self.motions[:1], relative_poses(poses[:-1], poses[1:])))
+        places = self.places.on_path(poses, motions, covariances)
+        slips = tuple(np.flatnonzero(slipped).tolist())
+        return replace(self, poses=poses, motions=motions, covariances=covariances, places=places, slips=slips)
 
     def moved(self, T_map_front: Pose2) -> MapSession:
         """The same in the map's frame."""
@@ -145,6 +161,7 @@ def from_front_end(
         known=(*kept, *(_tie_loop(tie, poses, places) for tie in ties)),
         first_place=first_place,
         ties=ties,
+        slips=solved.slips if solved is not None else (),
     )
 
 
@@ -196,6 +213,7 @@ def concatenate(old: MapSession, new: MapSession) -> MapSession:
         known=(*old.known, *(replace(loop, first=loop.first + m, second=loop.second + m) for loop in new.known)),
         first=n,
         first_place=m,
+        slips=(*old.slips, *(n + step for step in new.slips)),
     )
 
 

@@ -108,7 +108,7 @@ def compare_with_odometry(refined: Registration, steps: Edges, scans: ScanArrays
     `observed` are the terms of `marginals.observed_terms`.
     """
     covariances: F64 = np.asarray(np.linalg.inv(steps.information), dtype=np.float64)
-    ends = _ends(steps, covariances[:, 0, 0] > _LEFT_OUT)
+    ends = stretch_ends(steps, covariances)
     seen, driven = np.empty((2, len(ends), 3))
     seen_covariance, driven_covariance, known_covariance = np.empty((3, len(ends), 3, 3))
     of_a_point = information_of_a_point(refined)
@@ -130,8 +130,9 @@ def compare_with_odometry(refined: Registration, steps: Edges, scans: ScanArrays
     return Stretches(ends, difference, normalised, sigma, margin, axis)
 
 
-def _ends(steps: Edges, joints: NDArray[np.bool_]) -> I64:
-    """First and last keyscans (m, 2) of stretches, none of which leads over one of the `joints` (n - 1,)."""
+def stretch_ends(steps: Edges, covariances: F64) -> I64:
+    """First and last keyscans (m, 2) of stretches, none of which leads from one log to another."""
+    joints = covariances[:, 0, 0] > _LEFT_OUT
     way = np.concatenate(([0.0], np.cumsum(np.hypot(steps.measured[:, 0], steps.measured[:, 1]))))
     last = np.minimum(np.searchsorted(way, way + _LONGEST_M), np.arange(len(way)) + _STEPS)
     before = np.concatenate(([0], np.cumsum(joints)))
@@ -152,8 +153,10 @@ def _margin(refined: Registration, scans: ScanArrays, ends: I64, axis: F64) -> f
     before = np.arange(max(first - reach + every, 0), first + 1, every)
     after = np.arange(last, min(last + reach - every + 1, len(refined.poses)), every)
     tried = np.concatenate((_HERE, _DISPLACEMENTS))[:, None] * axis
-    agreement = np.empty(len(tried))
-    displaced_agreement(refined.poses, (before, after), tried, scans, refined.gate, refined.scale, agreement)
+    sums = np.empty((len(tried), 2))
+    every_wall = (0.0, 0.0)
+    displaced_agreement(refined.poses, (before, after), tried, every_wall, scans, refined.gate, refined.scale, sums)
+    agreement = sums[:, 0] / np.maximum(sums[:, 1], 1.0)
     return float(agreement[: len(_HERE)].max() - agreement[len(_HERE) :].max())
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -74,20 +74,18 @@ class Submaps:
         start = np.concatenate((np.flatnonzero(np.diff(index, prepend=-1)), [len(poses)])).astype(np.int64)
         reference = (start[:-1] + start[1:]) // 2
         steps = relative_poses(poses[reference[:-1]], poses[reference[1:]])
-        chained = np.zeros((max(len(reference) - 1, 0), 3, 3))
-        for k in range(len(chained)):
-            pose, covariance = IDENTITY, np.zeros((3, 3))
-            for scan in range(reference[k] + 1, reference[k + 1] + 1):
-                motion = Pose2.from_array(motions[scan])
-                covariance = predict_covariance(covariance, pose, motion, covariances[scan])
-                pose = pose @ motion
-            chained[k] = covariance
         count = np.cumsum(refused)
         uncertain = np.diff(count[reference]) > 0
         piece = np.cumsum(gaps)[reference].astype(np.int64)
+        chained = _chained(reference, motions, covariances)
         return Submaps(
             start, reference, poses, steps, chained, uncertain, (way + refused_path_length * count)[reference], piece
         )
+
+    def on_path(self, poses: F64, motions: F64, covariances: F64) -> Submaps:
+        """The same places on another path; arguments as in `split_by_path_length`."""
+        steps = relative_poses(poses[self.reference[:-1]], poses[self.reference[1:]])
+        return replace(self, poses=poses, steps=steps, covariances=_chained(self.reference, motions, covariances))
 
     @staticmethod
     def concatenate(first: Submaps, second: Submaps) -> Submaps:
@@ -142,3 +140,16 @@ class Submaps:
         relative = relative_poses(self.poses[self.reference[owner]], self.poses)
         poses: F64 = compose_poses(places[owner], relative)
         return poses
+
+
+def _chained(reference: I64, motions: F64, covariances: F64) -> F64:
+    """Covariance (m - 1, 3, 3) of the motion from each of the keyscans `reference` (m,) to the next."""
+    chained = np.zeros((max(len(reference) - 1, 0), 3, 3))
+    for k in range(len(chained)):
+        pose, covariance = IDENTITY, np.zeros((3, 3))
+        for scan in range(reference[k] + 1, reference[k + 1] + 1):
+            motion = Pose2.from_array(motions[scan])
+            covariance = predict_covariance(covariance, pose, motion, covariances[scan])
+            pose = pose @ motion
+        chained[k] = covariance
+    return chained

@@ -160,8 +160,16 @@ def test_a_displaced_scan_agrees_less_unless_the_corridor_is_bare(
     scans, true = corridor(0.0) if is_bare else two
     first = Pose2(2.0, 1.5, 0.1 if is_bare else 0.3)
     poses = np.array((first.to_array(), (first @ Pose2.from_array(true)).to_array()))
-    agreement = np.empty(2)
-    groups = (np.array([0]), np.array([1]))
-    displaced_agreement(poses, groups, np.array(((0.0, 0.0), (0.5, 0.0))), scans.arrays(10_000), 0.15, 0.05, agreement)
+    sums, across = np.empty((2, 2, 2))
+    groups, tried = (np.array([0]), np.array([1])), np.array(((0.0, 0.0), (0.5, 0.0)))
+    displaced_agreement(poses, groups, tried, (0.0, 0.0), scans.arrays(10_000), 0.15, 0.05, sums)
+    agreement = sums[:, 0] / sums[:, 1]
     assert agreement[0] > 0.95
+    displaced_agreement(poses, groups, tried, (1.0, 0.0), scans.arrays(10_000), 0.15, 0.05, across)
+    if is_bare:
+        assert (across[:, 1] == 0.0).all()
+    else:
+        assert 0.0 < across[0, 1] < sums[0, 1]
+        assert across[0, 0] > 0.95 * across[0, 1]
+        assert across[1, 0] < 0.1 * across[1, 1]
     assert agreement[0] - agreement[1] < 0.02 if is_bare else agreement[0] - agreement[1] > 0.3

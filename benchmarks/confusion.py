@@ -346,7 +346,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--shapes", nargs="+", default=list(SHAPES), choices=SHAPES)
     parser.add_argument("--rows", type=Path, help="a file to which a line of JSON is added for each run")
-    parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {'; '.join(KINDS)}")
+    parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {'; '.join(KINDS)}".replace("%", "%%"))
     arguments = parser.parse_args()
     print("kind, runs; wrong and localised: mean, largest; right, not localised: mean, largest; NEES: mean, largest,")
     print("coverage; all but NEES in %")

@@ -223,7 +223,7 @@ def measure(name: str, seed: int, is_known: bool) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"of {'; '.join(CASES)}")
+    parser.add_argument("cases", nargs="*", metavar="CASE", help=f"of {'; '.join(CASES)}".replace("%", "%%"))
     arguments = parser.parse_args()
     print("case, start: wrong and localised, right and not localised, rmse of the right ones, NEES, coverage")
     for name in arguments.cases or CASES:

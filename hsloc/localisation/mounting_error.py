@@ -35,8 +35,9 @@ _LEAST_OTHER_SIDE = 0.1
 """Part of the rotation that goes to the other side, at least: to one side alone, slip looks like another place."""
 _LONGEST_M = 1.0
 """Steps that are longer hold refused scans (m)."""
-_MIN_SIGMAS = 4.0
-"""Minimum ratio of an error to its standard deviation: once in 16,000 runs under Gaussian errors."""
+_MIN_SIGMAS = 7.0
+"""Minimum ratio of an error to its standard deviation: once in 16,000 runs, as it is Student's of 9 degrees of freedom:
+4 would be once in 320. True errors of 10 cm and 3 deg have ratios of 10 to 13 after a minute."""
 _LEAST_M, _LEAST_RAD = 0.05, radians(2.0)
 """Smaller errors are not reported: a ruler and an eye do no better."""
 

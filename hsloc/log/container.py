@@ -66,6 +66,8 @@ STEP_NS = 1_000_000_000
 distributions), others it slows down or speeds up; stamps of Intel's log run backwards by up to 0.9 s without one."""
 AGREEING = 10
 """Messages in a row that must show a step, where single ones may be wrong."""
+_SHARED = 0.5
+"""Least part of these messages whose channel goes on."""
 _MARGIN_S = 0.1
 """Distance (s) of a cut from times that are there twice: they are stated to a tenth."""
 
@@ -73,8 +75,8 @@ _MARGIN_S = 0.1
 class RecorderClock:
     """Whether the recorder's own clock was set back: log times, in the order of writing, that step back.
 
-    `AGREEING` messages on either side must show it, and a channel must have some on both: files are also put together
-    topic by topic.
+    `AGREEING` messages on either side must show it, most of channels that have some on both: files are also put
+    together topic by topic.
     """
 
     def __init__(self) -> None:
@@ -92,8 +94,8 @@ class RecorderClock:
             before, after = slice(k + 1 - AGREEING, k + 1), slice(k + 1, k + 1 + AGREEING)
             if k + 1 < AGREEING or k + 1 + AGREEING > len(times):
                 continue
-            shared = np.isin(channels[before], channels[after]).any()
-            if shared and times[after].max() < times[before].min():
+            shared = min(np.isin(channels[a], channels[b]).mean() for a, b in ((before, after), (after, before)))
+            if shared >= _SHARED and times[after].max() < times[before].min():
                 self._steps.append((int(times[k]), int(times[k + 1])))
         left = 2 * AGREEING - 1
         self._channels, self._times = channels[-left:], times[-left:]

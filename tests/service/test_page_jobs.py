@@ -146,7 +146,7 @@ def test_a_page_goes_on_when_the_server_was_restarted(make_live: Callable[..., L
     context = browser.new_context()
     page = context.new_page()  # refused connections are in the console, as they should be
     page.goto(live.url)
-    page.wait_for_selector("#jobs")
+    page.wait_for_selector("#jobs", state="attached")
     with live.client() as client:
         job = submit(client, b"slow 6")
     page.evaluate(f"location.hash = 'job={job}'")

@@ -55,7 +55,7 @@ LIMITS: dict[str, Any] = {
 def test_ends_with_a_reason(
     make_client: Callable[..., TestClient], word: bytes, state: str, reason: str, attempts: int
 ) -> None:
-    client = make_client(**LIMITS | ({"job_wall_s": 60.0} if word == b"spin" else {}))
+    client = make_client(**LIMITS | ({"job_wall_s": 60.0} if word in (b"spin", b"allocate") else {}))
     job = submit(client, word)
     missed: list[float] = []
     stop = threading.Event()

@@ -53,3 +53,8 @@ def spans_of(rows: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """First and last row of each run of True: what a reason names the places and times of."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], rows, [False]))))
     return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]
+
+
+def counted(n: int, word: str) -> str:
+    """`1 stretch`, `2 stretches`: a number of things in a reason."""
+    return f"{n} {word}" if n == 1 else f"{n} {word}{'es' if word.endswith('ch') else 's'}"

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from hsloc.model.pose2 import relative_poses, wrap_angles
-from hsloc.model.verdict import spans_of
-from hsloc.slam.slips import STRETCHES_DEEP
+from hsloc.model.verdict import counted, spans_of
+from hsloc.slam.jumps import jumps
+from hsloc.slam.slips import STRETCHES_DEEP, joined
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -182,6 +183,7 @@ def weigh(recorded: Recorded) -> Evidence:
         _slips(recorded),
         _unobserved(recorded),
         _torn_loops(recorded),
+        _jumps(recorded),
         _blind(recorded),
         _no_returns(recorded),
     ]
@@ -203,7 +205,7 @@ def _open_joints(r: Recorded, bridged: Bools) -> Reason | None:
             wrong.append((first, last))
     if not wrong:
         return None
-    text = f"odometry alone holds {_count(len(wrong), 'joint')}: the scans refused it, fewer than two loops span it"
+    text = f"odometry alone holds {counted(len(wrong), 'joint')}: the scans refused it, fewer than two loops span it"
     return _reason(r, "open-joint", text, wrong, failed=False)
 
 
@@ -242,7 +244,9 @@ def _second_visits(r: Recorded) -> Reason | None:
     if not wrong:
         return None
     share = sum(last - first + 1 for first, last in wrong) / int(known.sum())
-    text = f"{100.0 * share:.0f} % of second visits look through walls of the first, in {_count(len(wrong), 'stretch')}"
+    text = (
+        f"{100.0 * share:.0f} % of second visits look through walls of the first, in {counted(len(wrong), 'stretch')}"
+    )
     return _reason(r, "second-visit", text, wrong, failed=share > _FAILED_SHARE)
 
 
@@ -271,7 +275,7 @@ def _against_odometry(r: Recorded, bridged: Bools) -> Reason | None:
     wrong = [(first, last) for first, last in ends if not bridged[first + 1 : last + 1].all()]
     if not wrong:
         return None
-    text = f"map and odometry contradict each other over {_count(len(wrong), 'stretch')} that no loop spans"
+    text = f"map and odometry contradict each other over {counted(len(wrong), 'stretch')} that no loop spans"
     return _reason(r, "odometry", text, wrong, failed=False)
 
 
@@ -283,7 +287,7 @@ def _slips(r: Recorded) -> Reason | None:
     if _number(harmful) < _LIKELY:
         return None
     runs, sigma = _most_likely(r, slipped, harmful)
-    text = f"the wheels slipped in {_count(len(runs), 'stretch')} where the scans fix the motion to {sigma:.2f} m only"
+    text = f"the wheels slipped in {counted(len(runs), 'stretch')} where the scans fix the motion to {sigma:.2f} m only"
     return _reason(r, "slip", text, runs, failed=False)
 
 
@@ -291,7 +295,7 @@ def _unobserved(r: Recorded) -> Reason | None:
     """Stretches in which a slip would not be noticed: plain corridors, long halls that nothing else measures."""
     slipped = r.stretches.contradicted
     # How often wheels slip in this log is known where it shows (Laplace's rule of succession).
-    slips = len(_joined(r.stretches.ends[slipped]))
+    slips = len(joined(r.stretches.ends[slipped]))
     seen = _number((~slipped & ~r.stretches.hidden).astype(np.float64))
     prior = (slips + 1.0) / (seen + slips + 2.0)
     quiet = ~slipped[r.held.stretches]
@@ -307,7 +311,7 @@ def _unobserved(r: Recorded) -> Reason | None:
         return None
     runs, sigma = _most_likely(r, quiet, harmful)
     text = (
-        f"in {_count(len(runs), 'stretch')} the scans and the rest of the map fix the motion to {sigma:.2f} m only: "
+        f"in {counted(len(runs), 'stretch')} the scans and the rest of the map fix the motion to {sigma:.2f} m only: "
         "the position along them rests on the odometry, and a slip would not be noticed"
     )
     return _reason(r, "unobserved", text, runs, failed=False)
@@ -329,15 +333,7 @@ def _most_likely(r: Recorded, of_held: Bools, harmful: F64) -> tuple[list[tuple[
     before = np.cumsum(harmful[order]) - harmful[order]
     chosen = np.sort(order[before < _MOST_OF_IT * harmful.sum()])
     numbers = np.flatnonzero(of_held)[chosen]
-    return _joined(r.stretches.ends[r.held.stretches[numbers]]), float(r.held.sigma[numbers].max())
-
-
-def _joined(ends: I64) -> list[tuple[int, int]]:
-    """Stretches (m, 2) in ascending order as runs: those that overlap are one."""
-    runs: list[tuple[int, int]] = []
-    for first, last in ends.tolist():
-        runs[-1:] = [(runs[-1][0], last)] if runs and first <= runs[-1][1] else [*runs[-1:], (first, last)]
-    return runs
+    return joined(r.stretches.ends[r.held.stretches[numbers]]), float(r.held.sigma[numbers].max())
 
 
 def _driven(poses: F64) -> tuple[F64, F64]:
@@ -355,6 +351,12 @@ def _torn_loops(r: Recorded) -> Reason | None:
     text = f"{len(r.torn)} of {len(r.loops) + len(r.torn)} loops contradict the others: one side is wrong"
     ends = [(int(pair.max()), int(pair.max())) for pair in r.torn]
     return _reason(r, "torn-loop", text, ends, failed=False)
+
+
+def _jumps(r: Recorded) -> Reason | None:
+    wrong = jumps(r.stamps_ns, r.poses, r.odometry)
+    text = f"the map moves the robot faster than it drives in {counted(len(wrong), 'stretch')}: loops join places that "
+    return _reason(r, "jump", text + "only look alike, or it was carried", wrong, failed=True) if wrong else None
 
 
 def _blind(r: Recorded) -> Reason | None:
@@ -375,10 +377,6 @@ def _no_returns(r: Recorded) -> Reason | None:
         return None
     text = f"{100.0 * r.no_return_share:.0f} % of the beams met nothing: where that is a fault they erase walls"
     return Reason("no-returns", text, "check")
-
-
-def _count(n: int, word: str) -> str:
-    return f"{n} {word}" if n == 1 else f"{n} {word}{'es' if word.endswith('ch') else 's'}"
 
 
 def _reason(r: Recorded, code: str, text: str, runs: list[tuple[int, int]], *, failed: bool) -> Reason:

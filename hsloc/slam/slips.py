@@ -144,6 +144,14 @@ def stretch_ends(steps: Edges, covariances: F64) -> I64:
     return np.array(ends, dtype=np.int64).reshape(-1, 2)
 
 
+def joined(ends: I64) -> list[tuple[int, int]]:
+    """Stretches (m, 2) in ascending order as runs: those that overlap are one."""
+    runs: list[tuple[int, int]] = []
+    for first, last in ends.tolist():
+        runs[-1:] = [(runs[-1][0], last)] if runs and first <= runs[-1][1] else [*runs[-1:], (first, last)]
+    return runs
+
+
 def _margin(refined: Registration, scans: ScanArrays, ends: I64, axis: F64) -> float:
     """Agreement across a stretch as found, less the best agreement displaced along `axis` (2,) in the map."""
     first, last = ends.tolist()

@@ -212,6 +212,21 @@ def test_odometry_that_contradicts_is_reported_where_no_loop_spans(lap: Recorded
     assert codes(replace(lap, odometry=None)) == ("good", [])
 
 
+@pytest.mark.parametrize("steps", [1, 4])
+def test_a_path_that_loops_tore_is_a_failed_map(lap: Recorded, steps: int) -> None:
+    torn = lap.poses.copy()
+    torn[50:, 0] += 7.0 * np.minimum(np.arange(N - 50) + 1, steps)[:, None].squeeze() / steps
+    found = weigh(replace(lap, poses=torn))
+    (reason,) = [each for each in found.reasons if each.code == "jump"]
+    assert (found.verdict, reason.verdict) == ("failed", "failed")
+    assert reason.times_s[0][0] <= 49.0
+    assert reason.times_s[0][1] >= 50.0
+    # Odometry that jumps where the scans do not is no fault of the map; one that drove as far agrees with it.
+    assert "jump" not in codes(replace(lap, odometry=torn))[1]
+    assert "jump" not in codes(replace(lap, poses=torn, odometry=torn))[1]
+    assert "jump" in codes(replace(lap, poses=torn, odometry=None))[1]
+
+
 def test_loops_that_contradict_each_other_are_reported(lap: Recorded) -> None:
     assert codes(replace(lap, torn=np.array([(20, 120), (30, 140)]))) == ("check", ["torn-loop"])
 

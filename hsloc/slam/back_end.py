@@ -15,13 +15,14 @@ from hsloc.slam.calibration import OdometryCalibration
 from hsloc.slam.displaced import mended
 from hsloc.slam.evidence import Recorded, nothing_seen, weigh
 from hsloc.slam.joint_registration import Registration, moved_scans, refine
-from hsloc.slam.loop_closer import TORN, LoopCloser, loop_edges
+from hsloc.slam.loop_closer import TORN, loop_edges
+from hsloc.slam.loop_rounds import close_loops
 from hsloc.slam.map_extension import connect, unconnected
 from hsloc.slam.map_session import LEFT_THE_MAP
 from hsloc.slam.map_state import MapState, fingerprint
 from hsloc.slam.marginals import all_edges, marginal_covariances, observed_terms
 from hsloc.slam.occupancy_mapper import build_grid
-from hsloc.slam.pose_graph import Edges, PoseGraph, edge_errors, solve_edges
+from hsloc.slam.pose_graph import Edges, PoseGraph, compose_steps, edge_errors
 from hsloc.slam.result import MappingQuality, MappingResult
 from hsloc.slam.slips import compare_with_odometry, held_by_the_rest, without_slips
 
@@ -79,7 +80,7 @@ def solve(gathered: MapSession, parameters: GraphMapperParameters, rng: Generato
     """Close the loops of a session and refine it, so that the log can go on from there: its keyscans as solved."""
     arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
     gathered = mended(gathered, arrays)
-    poses, loops, edges = _close_loops(gathered, parameters, rng, _silent)
+    poses, loops, edges = close_loops(gathered, parameters, rng, _silent)
     edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), edges])
     refined, _ = _refine(poses, arrays, edges, parameters, _silent)
     return replace(gathered, poses=refined.poses, known=tuple(loops))
@@ -99,7 +100,7 @@ def finish_session(
     """
     arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
     gathered = mended(gathered, arrays)
-    poses, loops, loop_edges = _close_loops(gathered, parameters, rng, lambda part: report(0.5 * part))
+    poses, loops, loop_edges = close_loops(gathered, parameters, rng, lambda part: report(0.5 * part))
     if extended is not None and not any(loop.accepted and _connects(loop, gathered) for loop in loops):
         raise MapError(unconnected(extended))
     edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), loop_edges])
@@ -213,7 +214,7 @@ def _recorded(
         motions=motions,
         covariances=gathered.covariances,
         refused=gathered.refused,
-        odometry=_composed(steps) if use_odometry else None,
+        odometry=compose_steps(steps) if use_odometry else None,
         pairs=refined.pairs,
         counts=refined.counts,
         loops=accepted,
@@ -240,15 +241,6 @@ def verified_stretches(loops: I64, ties: tuple[Tie, ...]) -> I64:
     return np.array(cut, dtype=np.int64).reshape(-1, 2)
 
 
-def _composed(steps: F64) -> F64:
-    """Poses (n, 3) from the steps (n - 1, 3) between them; the first is the origin."""
-    theta = np.concatenate(([0.0], np.cumsum(steps[:, 2])))
-    c, s = np.cos(theta[:-1]), np.sin(theta[:-1])
-    x = np.concatenate(([0.0], np.cumsum(c * steps[:, 0] - s * steps[:, 1])))
-    y = np.concatenate(([0.0], np.cumsum(s * steps[:, 0] + c * steps[:, 1])))
-    return np.column_stack((x, y, theta))
-
-
 def _connects(loop: Loop, gathered: MapSession) -> bool:
     return loop.first < gathered.first_place <= loop.second
 
@@ -267,19 +259,6 @@ def _state(
         grid=grid,
         fingerprint=fingerprint(parameters),
     )
-
-
-def _close_loops(
-    gathered: MapSession, parameters: GraphMapperParameters, rng: Generator, progress: Callable[[float], None]
-) -> tuple[F64, list[Loop], Edges]:
-    """Poses of the keyscans with all loops closed, the loops, and those accepted as edges between keyscans."""
-    p, places = parameters.loops, gathered.places
-    closer = LoopCloser(
-        places, gathered.scans, p, rng, gathered.known, gathered.first_place, gathered.asserted, gathered.forbidden
-    )
-    closer.close(progress)
-    edges = loop_edges(closer.accepted, places.reference, p.robust)
-    return solve_edges(places.expand(closer.poses), Edges.concatenate([gathered.chain, edges])), closer.loops, edges
 
 
 def _refine(

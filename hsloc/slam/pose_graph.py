@@ -204,3 +204,12 @@ def _numbers(fields: list[str], count: int) -> list[float]:
     if len(numbers) != count or not all(np.isfinite(number) for number in numbers):
         raise ValueError(f"{count} finite numbers are wanted, {len(numbers)} stand there")
     return numbers
+
+
+def compose_steps(steps: F64) -> F64:
+    """Poses (n, 3) from the steps (n - 1, 3) between them; the first is the origin."""
+    theta = np.concatenate(([0.0], np.cumsum(steps[:, 2])))
+    c, s = np.cos(theta[:-1]), np.sin(theta[:-1])
+    x = np.concatenate(([0.0], np.cumsum(c * steps[:, 0] - s * steps[:, 1])))
+    y = np.concatenate(([0.0], np.cumsum(s * steps[:, 0] + c * steps[:, 1])))
+    return np.column_stack((x, y, theta))

@@ -60,6 +60,5 @@ def test_loops_that_tear_the_path_by_more_than_the_robot_drives_are_closed_witho
     wide = replace(mapper, loops=replace(mapper.loops, min_path_length=4.0, drift=0.5))
     poses, loops, edges = close_loops(log, wide, np.random.default_rng(0), lambda part: None)
     far = np.abs(poses[:, 0] - true[:, 0]).max()
-    assert (far > 5.0) == torn
-    assert any(loop.accepted for loop in loops) == torn
-    assert (len(edges) > 0) == torn
+    assert far > 5.0 if torn else far < 0.05
+    assert len(edges) == sum(loop.accepted for loop in loops) > 0

@@ -64,7 +64,7 @@ def test_upload_watch_look_download(
     page.wait_for_selector("#job-state .running")
     picture(page, "2-running")
     page.wait_for_selector("#job-state .succeeded", timeout=120_000)
-    page.wait_for_selector("#result:not([hidden])")
+    page.wait_for_selector("#result:not([hidden])", timeout=120_000)
     page.wait_for_function("() => document.querySelector('.rv-now')?.textContent")
     assert page.text_content("#job-title") == NASTY
     assert page.locator("#job img, #jobs img:not([src^='blob:'])").count() == 0  # none of the log's name
@@ -96,9 +96,9 @@ def test_upload_watch_look_download(
     press(page, "#job-buttons button >> text=Run again")
     page.wait_for_function("(first) => location.href !== first", arg=first)
     page.wait_for_selector("#job-state .succeeded", timeout=120_000)
-    page.wait_for_selector("#result:not([hidden])")
+    page.wait_for_selector("#result:not([hidden])", timeout=120_000)
     page.go_back()  # to the first result
-    page.wait_for_selector("#result:not([hidden])")
+    page.wait_for_selector("#result:not([hidden])", timeout=120_000)
     assert page.url == first
     time = first.partition("&t=")[2]  # a link holds the time that was looked at
     page.wait_for_function("(t) => document.querySelector('.rv-now')?.textContent.startsWith(`${t} s`)", arg=time)

@@ -1,8 +1,10 @@
-"""Ctrl-C that waits: for calls that must not end in the middle."""
+"""Ctrl-C that waits, for calls that must not end in the middle, and Ctrl-C that is not lost."""
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -39,3 +41,16 @@ def interrupts_held_back() -> Iterator[None]:
             signal.signal(signal.SIGINT, handler)
         if held:
             signal.raise_signal(signal.SIGINT)
+
+
+def interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
+    """A `sys.unraisablehook` for programs: Ctrl-C that came in a callback, where Python ignores it, comes once more.
+
+    While modules are imported there are many callbacks: a command went on for minutes as if nothing had been.
+    """
+    if ignored.exc_type is not KeyboardInterrupt:
+        sys.__unraisablehook__(ignored)
+        return
+    later = threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGINT))
+    later.daemon = True
+    later.start()

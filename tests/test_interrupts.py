@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
+import weakref
 
 import pytest
 
-from hsloc.interrupts import interrupts_held_back
+from hsloc.interrupts import interrupt_again, interrupts_held_back
 
 
 def test_an_interrupt_that_another_thread_takes_waits_too() -> None:
@@ -36,3 +38,31 @@ def test_an_interrupt_that_another_thread_takes_waits_too() -> None:
         signal.signal(signal.SIGINT, before)
         end.set()
         other.join()
+
+
+def test_an_interrupt_in_a_callback_comes_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Held:
+        pass
+
+    def called(_: object) -> None:
+        signal.raise_signal(signal.SIGINT)  # as if it came from the terminal just now
+
+    monkeypatch.setattr(sys, "unraisablehook", interrupt_again)
+    held = Held()
+    reference = weakref.ref(held, called)
+    with pytest.raises(KeyboardInterrupt):  # noqa: PT012
+        del held
+        time.sleep(5.0)
+    assert reference() is None
+
+
+def test_other_exceptions_of_callbacks_are_printed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Bad:
+        def __del__(self) -> None:
+            raise ValueError("of the destructor")
+
+    monkeypatch.setattr(sys, "unraisablehook", interrupt_again)
+    Bad()
+    assert "of the destructor" in capsys.readouterr().err

@@ -21,6 +21,7 @@ from io import TextIOWrapper
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from hsloc.errors import HslocError
+from hsloc.interrupts import interrupt_again
 from hsloc.version import __version__
 
 if TYPE_CHECKING:
@@ -185,6 +186,7 @@ def program() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
     # Without a writable home matplotlib keeps its fonts among the temporary files, and says so in two long lines.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    sys.unraisablehook = interrupt_again
     warnings.formatwarning = lambda message, *_, **__: f"hsloc: warning: {message}\n"
     status = main()
     signal.signal(signal.SIGINT, signal.SIG_IGN)

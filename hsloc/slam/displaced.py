@@ -2,7 +2,7 @@
 
 In a corridor nearly all points lie on its side walls, and agree wherever along it a scan is put: a step that slipped
 passes for one with few points in conflict, and in the refinement those are outliers. Only walls across the corridor
-tell: door frames, pillars, its end. So the scans before and after each stretch are held against each other by these
+show it: door frames, pillars, its end. So the scans before and after each stretch are held against each other by these
 alone. Where they disagree as found, and agree in one displaced place and no other, the stretch is measured again there.
 """
 

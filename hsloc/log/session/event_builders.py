@@ -242,7 +242,7 @@ class OdometryFeed:
             return ()
         pose = message.pose
         has_heading = isfinite(pose.theta) and states_rotation(getattr(message, "quaternion", _NO_ROTATION))
-        if not (has_heading or self.is_truth or isfinite(pose.theta)):
+        if not (self.is_truth or isfinite(pose.theta)):
             pose = Pose2(pose.x, pose.y, 0.0)
         if not is_usable(pose):
             self._losses.invalid_messages[self.topic] += 1

@@ -96,6 +96,11 @@ OPTIONS: tuple[Option, ...] = (
         "localise the robot is localised on it.",
     ),
     Option(
+        name="align_to", flag="--align-to", kind="path", metavar="PLAN", doors=frozenset({"replay", "map"}),
+        help="Floor plan, or another map, whose frame a built map is brought into: a YAML of nav2 with its image, or "
+        "what --map takes. Its place is searched for on the whole plan.",
+    ),
+    Option(
         name="assert_loop", flag="--assert-loop", kind="topics", metavar="T1,T2", doors=ONE_RUN,
         help="When mapping: the robot was at one place at these two times [s after the beginning of the log] "
         "(repeatable).",

@@ -30,8 +30,9 @@ class RunRequest:
     """What to run. The same request on the same files gives the same result, bit for bit.
 
     With `resume`, the results of an earlier mapping run, that run's map is extended: the new map and trajectory are in
-    its frame. `mode` is "localise", "slam" or "auto": localise if there is a map, `map_path` or the log's own, else
-    build one. With `no_odometry` the log's odometry is not read: motion is estimated from the scans. The start is
+    its frame. With `align_to`, a floor plan or another map, a map is built in the frame of that. `mode` is "localise",
+    "slam" or "auto": localise if there is a map, `map_path` or the log's own, else build one. With `no_odometry` the
+    log's odometry is not read: motion is estimated from the scans. The start is
     `initial_pose`, else the one that the log states for the time of the first event, else unknown; with `unknown_start`
     it is unknown whatever the log states. `reference` names poses to compare with, see `hsloc.replay.references`;
     otherwise they are those in the log. `alignment` and `relations` are for the evaluation. `own_matcher` is used
@@ -44,6 +45,7 @@ class RunRequest:
     logs: tuple[Path, ...]
     map_path: Path | None = None
     resume: Path | None = None
+    align_to: Path | None = None
     config: Config = field(default_factory=Config)
     read: ReadOptions = field(default_factory=ReadOptions)
     initial_pose: Pose2 | None = None
@@ -70,7 +72,7 @@ class RunRequest:
         if isinstance(self.logs, str | os.PathLike):
             object.__setattr__(self, "logs", (self.logs,))
         object.__setattr__(self, "logs", tuple(Path(log) for log in self.logs))
-        for name in ("map_path", "resume", "relations", "calibration"):
+        for name in ("map_path", "resume", "align_to", "relations", "calibration"):
             if isinstance(getattr(self, name), str):
                 object.__setattr__(self, name, Path(getattr(self, name)))
         if self.own_matcher is not None and not callable(getattr(self.own_matcher, "match", None)):
@@ -90,6 +92,13 @@ class RunRequest:
         if self.resume is not None and self.config.mapper != "graph":
             raise ConfigError(
                 f"a map is extended by the graph mapper; leave out --resume or --mapper {self.config.mapper}"
+            )
+        if self.align_to is not None and (
+            self.resume is not None or self.mode == "localise" or self.config.mapper != "graph"
+        ):
+            raise ConfigError(
+                "a map that the graph mapper builds is aligned to a plan; leave out --align-to, or --resume, "
+                "--mode localise and --mapper"
             )
         is_stated = StatedLoops.parsed(self.assert_loop, self.forbid_loop) != StatedLoops()
         if is_stated and (self.resume is not None or self.mode == "localise" or self.config.mapper != "graph"):

@@ -195,6 +195,27 @@ class ResidualMetrics(LaserResiduals):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class PlanMetrics:
+    """Where a built map lies on the floor plan that was given, and how well it fits there."""
+
+    name: str
+    """Name of the plan's file."""
+    certain: bool
+    """Whether it fits at one place only, by proof; then the map and the trajectory are in the plan's frame."""
+    pose: tuple[float, float, float] | None
+    """Pose on the plan of the frame that the map has without it, the robot's first pose: x, y [m], yaw [rad]; null
+    where it fits nowhere."""
+    fitness: float
+    """Mean score of the map's walls there, from 0 to 1."""
+    elsewhere: float
+    """Fitness that no other place of the plan exceeds, from 0 to 1."""
+    walls_near: float | None
+    """Fraction of the map's walls within 0.15 m of a wall of the plan, from 0 to 1; null where it is not certain."""
+    mean_distance: float | None
+    """Mean distance from the map's walls to the nearest wall of the plan [m]; null where it is not certain."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MapMetrics:
     """How well map and scans agree, and how good a map is that this run built."""
 
@@ -206,6 +227,8 @@ class MapMetrics:
     """Consistency of the map and its loops; only of a map built by the graph mapper."""
     comparison: MapComparison | None = None
     """Comparison with the map in the log; only of a map that this run built, where the log has a map and truth."""
+    plan: PlanMetrics | None = None
+    """Its place on a floor plan; left out where none was given."""
     comparison_error: str | None = None
     """Why the map was not compared with the one in the log."""
 

@@ -129,6 +129,8 @@ class WarningCode(StrEnum):
     """The map is larger or smaller than what the lidar measures: the resolution in its YAML may be wrong."""
     MAP_MIRRORED = "map_mirrored"
     """The mirrored scans fit the map better than the scans: its image is mirrored, or the angles of the laser are."""
+    PLAN_NOT_FOUND = "plan_not_found"
+    """The walls of a built map fit at no place of the floor plan, or at several; the map is in its own frame."""
     LASER_MISFIT = "laser_misfit"
     """The scans of one laser fit the map far worse than those of another."""
     EXTRINSICS_WRONG = "extrinsics_wrong"

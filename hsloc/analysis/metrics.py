@@ -24,6 +24,7 @@ from hsloc.run_metrics import (
     LogMetrics,
     LossMetrics,
     MapMetrics,
+    PlanMetrics,
     ResidualMetrics,
     RunIdentity,
     RunTimings,
@@ -155,6 +156,24 @@ def map_metrics(result: Result, residuals: ResidualMetrics, comparison: Comparis
         mapping=None if result.mapping is None else result.mapping.quality,
         comparison=compared,
         comparison_error=error_text,
+        plan=_plan_metrics(result),
+    )
+
+
+def _plan_metrics(result: Result) -> PlanMetrics | None:
+    path, mapping = result.request.align_to, result.mapping
+    if path is None or mapping is None or mapping.plan is None:
+        return None
+    fit = mapping.plan
+    pose, compared = fit.T_plan_map, fit.comparison
+    return PlanMetrics(
+        name=path.name,
+        certain=fit.is_certain,
+        pose=None if pose is None else (pose.x, pose.y, pose.theta),
+        fitness=fit.fitness,
+        elsewhere=fit.elsewhere,
+        walls_near=None if compared is None else compared.precision,
+        mean_distance=None if compared is None else compared.mean_distance_to_truth,
     )
 
 

@@ -37,6 +37,7 @@ _VERDICTS = {
     WarningCode.ODOMETRY_JUMPS: Verdict.CHECK,
     WarningCode.CLOCK_OFFSET_LARGE: Verdict.CHECK,
     WarningCode.MAP_SCALE: Verdict.CHECK,
+    WarningCode.PLAN_NOT_FOUND: Verdict.CHECK,
     WarningCode.MAP_MIRRORED: Verdict.FAILED,
 }
 """Warnings that concern the whole result, with the verdict that each alone gives."""
@@ -56,7 +57,7 @@ def quality_warnings(result: Result) -> list[RunWarning]:
     A pose found once may then be a chance fit. Mapping: single scans that are beside their place.
     """
     if result.mapping is not None:
-        return _stray_warnings(result.mapping, result)
+        return [*_stray_warnings(result.mapping, result), *_plan_warnings(result.mapping, result)]
     if result.mode != "localise":
         return []
     of_sensor = [*_mirror_warnings(result), *_scale_warnings(result), *_mounting_warnings(result)]
@@ -86,6 +87,26 @@ def _stray_warnings(mapping: MappingResult, result: Result) -> list[RunWarning]:
             WarningCode.STRAY_SCAN,
             f"rejected scans do not fit the scans around them, and are drawn beside their place: at {times}",
             "look for doubled walls there; cut that part off (--start, --end) if they matter",
+        )
+    ]
+
+
+def _plan_warnings(mapping: MappingResult, result: Result) -> list[RunWarning]:
+    fit, path = mapping.plan, result.request.align_to
+    if fit is None or path is None or fit.is_certain:
+        return []
+    remedy = "check that it is the plan of this building, with doors and walls dark, and resolution in its YAML"
+    if fit.T_plan_map is None:
+        why = f"no place on it has a fitness of {fit.elsewhere:.2f}"
+    elif len(fit.places) > 1:
+        named = ", ".join(f"({pose.x:.1f}, {pose.y:.1f}, {degrees(pose.theta):.0f} deg)" for pose in fit.places)
+        why = f"{len(fit.places)} places fit about as well, with the frame of the map at {named}"
+        remedy = f"cut the plan to the part that was driven; if none is right, {remedy}"
+    else:
+        why = f"it fits with {fit.fitness:.2f}, and that no other place fits better was not proven in the boxes allowed"
+    return [
+        RunWarning(
+            WarningCode.PLAN_NOT_FOUND, f"the map was not found on {path.name} and is in its own frame: {why}", remedy
         )
     ]
 

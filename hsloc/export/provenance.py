@@ -29,8 +29,9 @@ def provenance(result: Result) -> Provenance:
     versions = {"hsloc": __version__, "Python": platform.python_version()}
     versions |= {name: metadata.version(name) for name in _PACKAGES}
     hashes = {" ".join(result.request.names()): result.input_sha256}
-    if result.request.map_path is not None:
-        hashes |= {path.name: _sha256(path) for path in map_files(result.request.map_path)}
+    for given in (result.request.map_path, result.request.align_to):
+        if given is not None:
+            hashes |= {path.name: _sha256(path) for path in map_files(given)}
     if result.request.calibration is not None:
         hashes[result.request.calibration.name] = _sha256(result.request.calibration)
     return Provenance(command(result.request), dump(result.request.config), versions, hashes, _options(result))
@@ -45,6 +46,8 @@ def _options(result: Result) -> dict[str, Any]:
     if request.map_path is not None:
         cells = sha256(grid.cells.tobytes()).hexdigest()
         found["map"] = (cells, grid.resolution, grid.origin, grid.occupied_threshold)
+    if request.align_to is not None:
+        found["align_to"] = [_sha256(path) for path in map_files(request.align_to)]
     if request.resume is not None:
         found["resume"] = _sha256(state_file(request.resume))
     if request.calibration is not None:

@@ -9,25 +9,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hsloc.config import preset
 from hsloc.errors import ConfigError, LogError
-from hsloc.interrupts import interrupts_held_back
 from hsloc.kernels.cache import compilation_reported
-from hsloc.matching.window import Window
 from hsloc.model.events import Heading, Odometry, Scan
-from hsloc.model.pose2 import IDENTITY
 from hsloc.preprocessing.odometry import ContinuousOdometry, OdometryWatch, UnusableOdometry
 from hsloc.preprocessing.scans import ScanWatch
 from hsloc.replay.clock_offset import ClockEvidence, LateScans, clock_offsets, offsets_of_mapping, open_as_meant
 from hsloc.replay.engine import rarely_collected, replay
-from hsloc.replay.map_and_start import find_map, find_start, first_odometry, load_state, require_map, resumed
+from hsloc.replay.estimators import make_localiser, make_mapper
+from hsloc.replay.map_and_start import find_map, find_start, first_odometry, load_state, require_map
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory, pose_covariances
 from hsloc.request import RunRequest
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.point_mapper import PointMapper
-from hsloc.slam.stated_loops import StatedLoops
 from hsloc.slam.time_offset import clock_warnings
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -36,20 +32,16 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hsloc.localisation.localiser import Localiser
     from hsloc.localisation.map_scale import MapScale
     from hsloc.localisation.mounting_error import MountingError
     from hsloc.localisation.states import StateRows
     from hsloc.log import Log, LogSummary, Losses, ReadOptions
     from hsloc.matching.likelihood_field import LikelihoodField
-    from hsloc.matching.match import Matcher
     from hsloc.model.estimate import Ambiguity, ScanDiagnostics
     from hsloc.model.events import Event
     from hsloc.model.occupancy_grid import OccupancyGrid
-    from hsloc.model.pose2 import Pose2
     from hsloc.model.trajectory import Trajectory
     from hsloc.replay.engine import Estimator
-    from hsloc.slam.map_state import MapState
     from hsloc.slam.result import MappingResult
     from hsloc.slam.time_offset import Offset
 
@@ -228,7 +220,12 @@ def _run_with(
     state, of_state = load_state(request)
     warnings = (*warnings, *of_map, *of_state, *of_reference)
     # Without odometry the map of a log is used where the user asks for it.
-    builds = request.mode == "slam" or state is not None or (request.no_odometry and request.map_path is None)
+    builds = (
+        request.mode == "slam"
+        or state is not None
+        or request.align_to is not None
+        or (request.no_odometry and request.map_path is None)
+    )
     localise = request.mode == "localise" or (grid is not None and not builds)
     opened = time.perf_counter()
     if progress is not None:
@@ -239,11 +236,10 @@ def _run_with(
         start, of_start = find_start(request, log, require_map(grid))
         warnings = (*warnings, *of_start)
         likelihood = request.config.make_field(require_map(grid))
-        localiser = _localiser(request, require_map(grid), likelihood, start)
+        localiser = make_localiser(request, require_map(grid), likelihood, start)
         estimator: Estimator = localiser
     else:
-        require_matcher(request)
-        localiser, likelihood, estimator = None, None, _mapper(request, state, lidar_only)
+        localiser, likelihood, estimator = None, None, make_mapper(request, state, lidar_only)
     first = None if lidar_only else first_odometry(log.events())
     prepared = time.perf_counter()
     history = RunHistory(request.config.localiser.smoothing_model() if localise else None)
@@ -340,49 +336,6 @@ def _share(progress: Callable[[Progress], None] | None, total: float, scans: int
     if progress is None:
         return None
     return lambda share: progress(Progress("refine", share * total, total, scans))
-
-
-def require_matcher(request: RunRequest) -> None:
-    """Raise ConfigError for a matcher that was asked for and that the graph mapper would not use."""
-    if request.config.mapper == "graph" and request.matcher_name != preset(request.preset).matcher:
-        raise ConfigError(
-            f"the graph mapper has a matcher of its own and would not use {request.matcher_name}; leave out --matcher, "
-            "or use --mapper point"
-        )
-
-
-def _mapper(request: RunRequest, state: MapState | None, lidar_only: bool) -> Mapper | PointMapper:
-    if request.config.mapper == "point":
-        if lidar_only:
-            raise ConfigError("the point mapper predicts with odometry; leave out --no-odom, or use --mapper graph")
-        start = IDENTITY if request.initial_pose is None else request.initial_pose
-        return PointMapper(request.matcher, request.config.point_mapper, np.random.default_rng(request.seed), start)
-    resume = None
-    if state is not None:
-        begin = None if request.unknown_start else request.initial_pose
-        resume = resumed(state, request.config, request.matcher, begin)
-    return Mapper(
-        replace(request.config.graph_mapper, use_odometry=not lidar_only),
-        np.random.default_rng(request.seed),
-        resume,
-        StatedLoops.parsed(request.assert_loop, request.forbid_loop),
-    )
-
-
-def _localiser(request: RunRequest, grid: OccupancyGrid, likelihood: LikelihoodField, start: Pose2 | None) -> Localiser:
-    from hsloc.localisation.localiser import Localiser
-
-    rng = np.random.default_rng(request.seed)
-    _warm_up(request.matcher, likelihood)
-    return Localiser.from_parameters(grid, likelihood, request.matcher, request.config.localiser, rng, start)
-
-
-def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:
-    """Have the kernels compiled (once after an installation, up to a minute) before the clock of the replay starts."""
-    points = np.zeros((1, 2))
-    window = Window(likelihood.T_map_field, 0.1, 0.1, 0.1)
-    with interrupts_held_back():  # A compiler that is interrupted may take the process with it.
-        matcher.match(points, likelihood, window, np.random.default_rng(0))
 
 
 def _reported(

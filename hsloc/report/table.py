@@ -286,6 +286,11 @@ def _map_rows(found: MapMetrics) -> list[Row]:
     if found.crispness is not None and isfinite(found.crispness.wall_thickness_median):
         values = format_length(found.crispness.wall_thickness_median)
         rows.append(Row("wall thickness", (values,), _THICKNESS, ("map/crispness/wall_thickness_median",)))
+    plan = found.plan
+    if plan is not None and plan.walls_near is not None:
+        values = f"{format_share(plan.walls_near)}, {format_length(plan.mean_distance)}"
+        sources = ("map/plan/walls_near", "map/plan/mean_distance")
+        rows.append(Row("walls within 15 cm of the plan, mean distance", (values,), _PLAN, sources))
     compared = found.comparison
     if compared is not None and isfinite(compared.precision):
         values = f"{format_share(compared.precision)}, {format_share(compared.recall)}"
@@ -294,6 +299,10 @@ def _map_rows(found: MapMetrics) -> list[Row]:
     return rows
 
 
+_PLAN = (
+    "Part of the map's walls within 15 cm of a wall of the floor plan, and their mean distance. Furniture, and what "
+    "was built since the plan was drawn, lower the one and raise the other."
+)
 _NEAR_WALL = (
     "Part of the scan points that lie within 15 cm of a wall of the map. Above 95 % is usual for a map that fits; "
     "people and furniture that are not in the map lower it."

@@ -22,6 +22,7 @@ from hsloc.slam.map_session import LEFT_THE_MAP
 from hsloc.slam.map_state import MapState, fingerprint
 from hsloc.slam.marginals import all_edges, marginal_covariances, observed_terms
 from hsloc.slam.occupancy_mapper import build_grid
+from hsloc.slam.plan_alignment import find_on_plan
 from hsloc.slam.pose_graph import Edges, PoseGraph, compose_steps, edge_errors
 from hsloc.slam.result import MappingQuality, MappingResult
 from hsloc.slam.slips import compare_with_odometry, held_by_the_rest, without_slips
@@ -61,9 +62,11 @@ def finish(
     rng: Generator,
     progress: Callable[[float], None] | None = None,
     resume: Resume | None = None,
+    plan: OccupancyGrid | None = None,
 ) -> MappingResult:
     """Close loops, refine, build the map; with `resume`, in and with a saved map. None: the log had no keyscan.
 
+    With a floor `plan` the map is in its frame, if it fits one place of it only.
     Raises MapError if the log cannot be connected with the saved map.
     """
     report = progress if progress is not None else _silent
@@ -73,7 +76,8 @@ def finish(
         return _empty(track)
     if resume is not None:
         gathered = connect(resume, gathered, parameters, rng)
-    return finish_session(gathered, track, parameters, rng, report, resume.state if resume is not None else None)
+    extended = resume.state if resume is not None else None
+    return finish_session(gathered, track, parameters, rng, report, extended, plan)
 
 
 def solve(gathered: MapSession, parameters: GraphMapperParameters, rng: Generator) -> MapSession:
@@ -93,6 +97,7 @@ def finish_session(
     rng: Generator,
     report: Callable[[float], None],
     extended: MapState | None,
+    plan: OccupancyGrid | None = None,
 ) -> MappingResult:
     """Close the loops of a session, refine, build the map; `track` has the events of the log that was read.
 
@@ -105,6 +110,12 @@ def finish_session(
         raise MapError(unconnected(extended))
     edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), loop_edges])
     refined, passes = _refine(poses, arrays, edges, parameters, lambda part: report(0.5 + 0.4 * part))
+    fit = None
+    if plan is not None:
+        fit = find_on_plan(plan, build_grid(refined.poses, gathered.scans, parameters.occupancy), refined.poses)
+        if fit.is_certain:
+            refined, more = _refine(fit.moved(refined.poses), arrays, edges, _near_the_end(parameters), _silent)
+            passes += more
     repaired = _without_slips(refined, gathered, loop_edges, arrays, parameters)
     refined, observed, edges = repaired.refined, repaired.observed, repaired.edges
     gathered, passes = replace(gathered, steps=repaired.steps), passes + repaired.passes
@@ -132,6 +143,7 @@ def finish_session(
         calibration=calibration,
         state=_state(gathered, refined.poses, loop_edges, grid, parameters),
         evidence=weigh(_recorded(gathered, refined, loops, repaired, parameters.use_odometry)),
+        plan=None if plan is None or fit is None else fit.compared(grid, plan),
     )
 
 

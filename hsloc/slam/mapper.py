@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
 
     from hsloc.model.events import Scan
+    from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.slam.front_end import LocalMatch
     from hsloc.slam.keyscans import KeyScan
     from hsloc.slam.known_map import Anchor
@@ -47,10 +48,12 @@ class Mapper:
         rng: Generator,
         resume: Resume | None = None,
         stated_loops: StatedLoops | None = None,
+        plan: OccupancyGrid | None = None,
     ) -> None:
         self._parameters = parameters
         self._rng = rng
         self._resume = resume
+        self._plan = plan
         self._stated_loops = StatedLoops() if stated_loops is None else stated_loops
         self._first_ns: int | None = None
         self._matcher = FrontEnd(parameters.front_end, rng, parameters.use_odometry)
@@ -183,6 +186,8 @@ class Mapper:
     def finish(self, progress: Callable[[float], None] | None = None) -> MappingResult:
         """Close loops, refine, build the map, once at the end; `progress` is called with parts from 0 to 1.
 
+        With a floor plan, the map is in its frame if it fits one place of it only.
+
         Raises MapError if no connection with the saved map is found.
         """
-        return finish(self._session(), self._track, self._parameters, self._rng, progress, self._resume)
+        return finish(self._session(), self._track, self._parameters, self._rng, progress, self._resume, self._plan)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from hsloc.slam.evidence import Evidence
     from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_state import MapState
+    from hsloc.slam.plan_alignment import PlanFit
     from hsloc.slam.pose_graph import PoseGraph
 
     F64 = NDArray[np.float64]
@@ -96,6 +97,8 @@ class MappingResult:
     """What is saved to go on from; None if no scan had a return."""
     evidence: Evidence
     """Whether the map is right, as far as what was recorded shows."""
+    plan: PlanFit | None = None
+    """Where the map lies on the floor plan that was given."""
 
     def loop_ends(self) -> NDArray[np.int64]:
         """Rows of `keyscan_poses` (k, 2) that the k loops join, accepted or not: the frames of their submaps."""

@@ -1,0 +1,79 @@
+"""The localiser or the mapper of a run, made as the request asks for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hsloc.config import preset
+from hsloc.errors import ConfigError
+from hsloc.interrupts import interrupts_held_back
+from hsloc.matching.window import Window
+from hsloc.model.pose2 import IDENTITY
+from hsloc.replay.map_and_start import load_grid, resumed
+from hsloc.slam.mapper import Mapper
+from hsloc.slam.point_mapper import PointMapper
+from hsloc.slam.stated_loops import StatedLoops
+
+if TYPE_CHECKING:
+    from hsloc.localisation.localiser import Localiser
+    from hsloc.matching.likelihood_field import LikelihoodField
+    from hsloc.matching.match import Matcher
+    from hsloc.model.occupancy_grid import OccupancyGrid
+    from hsloc.model.pose2 import Pose2
+    from hsloc.request import RunRequest
+    from hsloc.slam.map_state import MapState
+
+
+def make_mapper(request: RunRequest, state: MapState | None, lidar_only: bool) -> Mapper | PointMapper:
+    """The mapper that the run asks for; `state` is the saved map that it extends.
+
+    Raises ConfigError for options that it would not use, and MapError for a plan that cannot be read.
+    """
+    _require_matcher(request)
+    if request.config.mapper == "point":
+        if lidar_only:
+            raise ConfigError("the point mapper predicts with odometry; leave out --no-odom, or use --mapper graph")
+        start = IDENTITY if request.initial_pose is None else request.initial_pose
+        return PointMapper(request.matcher, request.config.point_mapper, np.random.default_rng(request.seed), start)
+    resume = None
+    if state is not None:
+        begin = None if request.unknown_start else request.initial_pose
+        resume = resumed(state, request.config, request.matcher, begin)
+    return Mapper(
+        replace(request.config.graph_mapper, use_odometry=not lidar_only),
+        np.random.default_rng(request.seed),
+        resume,
+        StatedLoops.parsed(request.assert_loop, request.forbid_loop),
+        None if request.align_to is None else load_grid(request.align_to)[0],
+    )
+
+
+def make_localiser(
+    request: RunRequest, grid: OccupancyGrid, likelihood: LikelihoodField, start: Pose2 | None
+) -> Localiser:
+    """The localiser on a map, with its kernels compiled; `start` is T_map_base at the first event, if it is known."""
+    from hsloc.localisation.localiser import Localiser
+
+    rng = np.random.default_rng(request.seed)
+    _warm_up(request.matcher, likelihood)
+    return Localiser.from_parameters(grid, likelihood, request.matcher, request.config.localiser, rng, start)
+
+
+def _require_matcher(request: RunRequest) -> None:
+    """Raise ConfigError for a matcher that was asked for and that the graph mapper would not use."""
+    if request.config.mapper == "graph" and request.matcher_name != preset(request.preset).matcher:
+        raise ConfigError(
+            f"the graph mapper has a matcher of its own and would not use {request.matcher_name}; leave out --matcher, "
+            "or use --mapper point"
+        )
+
+
+def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:
+    """Have the kernels compiled (once after an installation, up to a minute) before the clock of the replay starts."""
+    points = np.zeros((1, 2))
+    window = Window(likelihood.T_map_field, 0.1, 0.1, 0.1)
+    with interrupts_held_back():  # A compiler that is interrupted may take the process with it.
+        matcher.match(points, likelihood, window, np.random.default_rng(0))

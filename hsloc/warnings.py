@@ -93,6 +93,8 @@ class WarningCode(StrEnum):
     """The scans turn the other way than the odometry: the lidar is upside down, or the sign of its angles is wrong."""
     CALIBRATION_UNUSED = "calibration_unused"
     """A calibration names a lidar whose scans are not read."""
+    TIME_OFFSET_UNUSED = "time_offset_unused"
+    """`--time-offset` names a topic of the log that is not read."""
     CLOCKS_APART = "clocks_apart"
     """The stamps of scans and odometry differ by more than their log times: they may come from two clocks."""
     PARTS_GAP = "parts_gap"

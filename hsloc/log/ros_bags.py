@@ -51,6 +51,34 @@ _WRITTEN = [("channel", "i8"), ("time", "i8")]
 """Channel and log time (ns) of a message."""
 
 
+_WAL_HEAD, _FRAME_HEAD = 32, 24
+"""Bytes before the frames of a write-ahead log, and before the page in each (sqlite.org/fileformat2.html)."""
+_HOT_JOURNAL = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
+"""How a rollback journal begins that SQLite rolls back; of a finished transaction it is zeros or empty."""
+
+
+def _frames_of(log: Path) -> int:
+    """Frames of a write-ahead log that were written since it was last begun anew, with the one that is cut at its end.
+
+    Frames before that have other salts; they are in the database already.
+    """
+    size = log.stat().st_size
+    with log.open("rb") as stream:
+        head = stream.read(_WAL_HEAD)
+        if len(head) < _WAL_HEAD:
+            return 1
+        page, salts = int.from_bytes(head[8:12], "big"), head[16:24]
+        if not 512 <= page <= 65536:
+            return 1
+        count = 0
+        for at in range(_WAL_HEAD, size, _FRAME_HEAD + page):
+            stream.seek(at)
+            if not salts.startswith(stream.read(_FRAME_HEAD)[8:16]):
+                break
+            count += 1
+    return count
+
+
 class _Bag(ABC):
     """What both kinds have in common; `shown` is the name for messages to people, where the file is a copy."""
 
@@ -214,10 +242,12 @@ class Db3Container(_Bag):
         self._scratch = Scratch()
         self._file = self._with_its_log(path)
         self._is_copy = self._file != path
+        self._is_rolled_back = self._is_copy and self._has_hot_journal()
         self._in_order_of_time = True
         self._lowest, self._highest = -(1 << 63), (1 << 63) - 1
         with self._guarded(), self._connected() as connection:
             self._read_topics(connection)
+            self._note_uncommitted(connection)
             self._count(connection)
 
     def messages(self, wanted: Collection[int], losses: Losses) -> Iterator[RawMessage]:
@@ -258,6 +288,34 @@ class Db3Container(_Bag):
                 "set TMPDIR to a folder with space"
             ) from error
         return path
+
+    def _has_hot_journal(self) -> bool:
+        journal = self._file.with_name(f"{self._file.name}-journal")
+        if not journal.is_file():
+            return False
+        with journal.open("rb") as stream:
+            return stream.read(len(_HOT_JOURNAL)) == _HOT_JOURNAL
+
+    def _note_uncommitted(self, connection: sqlite3.Connection) -> None:
+        """A loss where the log beside the database holds a transaction that was never committed, or is cut."""
+        if not self._is_copy:
+            return
+        unread = 0
+        log = self._file.with_name(self._file.name + "-wal")
+        if log.is_file():
+            # The checkpoint, which changes the copy alone, says how many frames SQLite takes: those up to a commit.
+            (_, taken, _) = connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+            unread = _frames_of(log) - max(taken, 0)
+            what = f"its write-ahead log (-wal) ends within a transaction: {unread} of its pages were never committed"
+        elif self._is_rolled_back:
+            unread = 1
+            what = "its recorder ended within a transaction, which is rolled back by the journal (-journal)"
+        if unread > 0:
+            self.losses_at_opening.truncated_files += 1
+            self.losses_at_opening.note(
+                f"{self.path}: {what}, and the messages in it are lost; if the recorder's disk has them still, copy "
+                "database and log again after it has ended"
+            )
 
     @contextmanager
     def _connected(self) -> Iterator[sqlite3.Connection]:

@@ -217,6 +217,22 @@ def test_the_write_ahead_log_of_a_database_is_read_and_nothing_beside_it_changes
     assert events_of(copied / "live.db3") == expected
     assert events_of(copied) == expected
     assert {path.name: path.read_bytes() for path in copied.iterdir()} == before
+    # Cut within its last frame, within the head of a frame, and to less than its own head.
+    whole = (copied / "live.db3-wal").read_bytes()
+    page = int.from_bytes(whole[8:12], "big")
+    for cut in (whole[:-1], whole[: 32 + 3 * (24 + page)], whole[: 32 + 3 * (24 + page) + 7], whole[:20]):
+        (copied / "live.db3-wal").write_bytes(cut)
+        log = open_log(copied / "live.db3")
+        assert 0 < len(list(log.events())) < len(expected)
+        assert log.losses.truncated_files == 1
+        assert "ends within a transaction" in log.losses.reasons[0]
+    # Frames of before the log was begun anew are in the database, and no loss.
+    stale = bytes(each ^ 0xFF for each in whole[16:24])
+    for keep in (2, len(whole) // (24 + page)):
+        at = 32 + keep * (24 + page)
+        old = whole[at : at + 8] + stale + whole[at + 16 :] if at < len(whole) else b""
+        (copied / "live.db3-wal").write_bytes(whole[:at] + old)
+        assert open_log(copied / "live.db3").losses.data_lost == (keep == 2)
 
 
 def test_a_transaction_that_was_cut_off_is_rolled_back(tmp_path: Path, db3: Path, expected: list[Any]) -> None:
@@ -230,7 +246,9 @@ def test_a_transaction_that_was_cut_off_is_rolled_back(tmp_path: Path, db3: Path
     shutil.copy(f"{live}-journal", f"{copied}-journal")
     connection.close()
     assert copied.read_bytes() != db3.read_bytes()
-    assert events_of(copied) == expected
+    log = open_log(copied)
+    assert [describe(event) for event in log.events()] == expected
+    assert "rolled back by the journal" in log.losses.reasons[0]
 
 
 # Times and encodings.

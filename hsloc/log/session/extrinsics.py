@@ -16,7 +16,7 @@ from dataclasses import replace
 from math import degrees, radians
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from hsloc.errors import ConfigError
+from hsloc.errors import ConfigError, TopicError
 from hsloc.log.session.transform_topics import BASE_FRAMES, last_name, read_links
 from hsloc.log.transforms import FrameTree, Mounting, Transform3, differ, laser_mounting
 from hsloc.model import IDENTITY, Pose2, wrap_angle
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from hsloc.log.summary import ReadOptions
 
 TILT_WARNING = radians(3.0)
+_LISTED = 12
 
 _ODOMETRY = {"scale": (0.5, 2.0), "rotation_scale": (0.5, 2.0), "turn_per_metre": (-1.0, 1.0)}
 """Keys and limits: what lies beyond is a mistake of units or of the file."""
@@ -116,6 +117,18 @@ class Extrinsics:
         """The T_base_laser that differ in the plane, where the log states several and none was chosen."""
         self.found(laser)
         return tuple(self._alternatives.get(laser, ()))
+
+    def require(self, base: str, known: Sequence[str | None]) -> None:
+        """Raise TopicError where the log has transforms but not a base, whose prefix may be that of `known` frames."""
+        if base in known or any(self._static.resolve(base, frame or "") for frame in known):
+            return
+        tree = self._whole_tree()
+        frames = tree.frames()
+        if frames and not any(tree.resolve(base, frame or "") for frame in known):
+            there = ", ".join(frames[:_LISTED]) + (f" and {len(frames) - _LISTED} more" if frames[_LISTED:] else "")
+            raise TopicError(
+                f"{self._containers[0].path}: no frame {base}, or several of that name; --base-frame may be {there}"
+            )
 
     def between(self, target: str, source: str) -> Transform3 | None:
         """T_target_source from all that the log knows, or None."""

@@ -14,6 +14,7 @@ from hsloc.log.session.scan_geometry import ScanFixes, ScanSurvey, survey
 from hsloc.log.session.split_recordings import check_parts
 from hsloc.log.session.topic_selection import (
     TF,
+    check_offsets,
     choose_maps,
     choose_scans,
     choose_topics,
@@ -97,6 +98,9 @@ class LogSession:
         self.choice = choose_topics(where, self.active, options, self.transforms)
         self._warnings += self.choice.warnings
         odom = self.choice.odom
+        transforms = self.transforms.dynamic if TF in (odom, self.choice.truth) else ()
+        named = (*scans, *(each for each in (odom, self.choice.truth) if each), *transforms)
+        self._warnings += check_offsets(where, self.active, tuple(dict.fromkeys(named)), options)
         self._parts, of_parts = check_parts(
             containers,
             self.choice.scans,
@@ -203,8 +207,9 @@ class LogSession:
 
     def _child_to_base(self) -> Pose2 | None:
         """From the frame that the odometry speaks of to the base that the user named, where they differ."""
-        child = self.odometry_child
-        base = self.options.base_frame
+        child, base = self.odometry_child, self.options.base_frame
+        if base is not None:
+            self.mountings.require(base, [child, *(f.message.frame_id for f in self.scans.values() if f)])
         if not child or base is None or child == base:
             return None
         transform = self.mountings.between(child, base)

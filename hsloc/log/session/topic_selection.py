@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import hypot
 from typing import TYPE_CHECKING
 
@@ -341,6 +341,25 @@ def _truth(where: str, channels: Sequence[Channel], options: ReadOptions) -> str
         return found[0]
     remedy = ", ".join([*candidates, "tf"][:_LISTED])
     raise TopicError(f"{where}: no topic {named} to take as truth; --truth-topic may be {remedy}")
+
+
+def check_offsets(where: str, channels: Sequence[Channel], read: Sequence[str], options: ReadOptions) -> list[RunWarning]:
+    """A warning for each topic of `--time-offset` that is not among the ones that are read.
+
+    Raises TopicError for one that the log does not have.
+    """
+    found = []
+    for name in replace(options, calibration=None).offsets_s():
+        if any(topic.lstrip("/") == name for topic in read):
+            continue
+        given = f"--time-offset {options.time_offset}"
+        there = ", ".join(read)
+        if not any(has_name(channel, name) for channel in channels):
+            raise TopicError(f"{where}: no topic {name} that {given} could move; of this log {there} are read")
+        text = f"{given}: /{name} is not read, so that its offset has no effect; {there} are read"
+        remedy = "name one of these, or have the topic read by --scan-topic or --odom-topic"
+        found.append(RunWarning(WarningCode.TIME_OFFSET_UNUSED, text, remedy))
+    return found
 
 
 def _unread_encoding(channel: Channel) -> str:

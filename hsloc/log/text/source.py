@@ -278,7 +278,7 @@ class TextSource:
             odom_topic=" + ".join(kinds["odometry"]) or None,
             truth_topic=" + ".join(kinds["truth"]) or None,
             odom_frame="odom",
-            base_frame=self._options.base_frame or "base_link",
+            base_frame="base_link",
             laser_frame=scan.frame_id if scan else None,
             T_base_laser=mounting,
             extrinsics=extrinsics,
@@ -287,9 +287,18 @@ class TextSource:
         )
 
     def _check(self, has_scans: bool, has_odometry: bool) -> None:
-        for flag, name in (("scan", self._options.scan_topic), ("odom", self._options.odom_topic)):
-            if name is not None:
-                raise TopicError(f"{self._shown}: a text log has no topics; leave out --{flag}-topic {name}")
+        options = self._options
+        named = (
+            ("topics", "scan-topic", options.scan_topic),
+            ("topics", "odom-topic", options.odom_topic),
+            ("topics", "truth-topic", options.truth_topic),
+            ("frames", "base-frame", options.base_frame),
+            ("fields to override", "scan-fix", options.scan_fix),
+            ("joint states", "wheels", options.wheels),
+        )
+        for what, flag, value in named:
+            if value is not None:
+                raise TopicError(f"{self._shown}: a text log has no {what}; leave out --{flag} {value}")
         if self._options.require_scan and not has_scans:
             raise TopicError(f"{self._shown}: no laser lines in this {self._format.name} log")
         if self._options.require_odometry and not has_odometry:

@@ -72,14 +72,26 @@ _MARGIN_S = 0.1
 """Distance (s) of a cut from times that are there twice: they are stated to a tenth."""
 
 
+def out_of_line(times: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which log times (n,) of one channel in the order of writing (ns) are wrong alone: those around them agree.
+
+    They are earlier, or later, than both of these by more than a clock's step. The first and the last never are.
+    """
+    found = np.zeros(len(times), dtype=np.bool_)
+    before, after = times[1:-1] - times[:-2], times[1:-1] - times[2:]
+    found[1:-1] = (np.maximum(before, after) < -STEP_NS) | (np.minimum(before, after) > STEP_NS)
+    return found
+
+
 class RecorderClock:
     """Whether the recorder's own clock was set back: log times, in the order of writing, that step back.
 
     `AGREEING` messages on either side must show it, most of channels that have some on both: files are also put
-    together topic by topic.
+    together topic by topic. `has_single_errors` says that log times of single messages are wrong.
     """
 
     def __init__(self) -> None:
+        self.has_single_errors = False
         self._steps: list[tuple[int, int]] = []
         self._first_ns: int | None = None
         self._channels = np.zeros(0, dtype=np.int64)
@@ -89,6 +101,8 @@ class RecorderClock:
         """The next messages: their channels (n,) and log times (n,) in ns."""
         if self._first_ns is None and len(times):
             self._first_ns = int(times[0])
+        if (np.diff(times) < -STEP_NS).any():
+            self.has_single_errors |= any(out_of_line(times[channels == each]).any() for each in np.unique(channels))
         channels, times = np.concatenate((self._channels, channels)), np.concatenate((self._times, times))
         for k in np.flatnonzero(np.diff(times) < -STEP_NS).tolist():
             before, after = slice(k + 1 - AGREEING, k + 1), slice(k + 1, k + 1 + AGREEING)

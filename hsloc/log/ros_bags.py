@@ -21,10 +21,20 @@ import numpy as np
 
 from hsloc.errors import LogError, LogFormatError
 from hsloc.log.bag_index import reindex
-from hsloc.log.container import Channel, RawMessage, RecorderClock, guarded, in_runs, plausible_times
+from hsloc.log.container import (
+    STEP_NS,
+    Channel,
+    RawMessage,
+    RecorderClock,
+    guarded,
+    in_runs,
+    out_of_line,
+    plausible_times,
+)
 from hsloc.log.files import Scratch
 from hsloc.log.messages.definitions import long_name
 from hsloc.log.summary import Losses, TopicStatistics
+from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -32,8 +42,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
-
-    from hsloc.warnings import RunWarning
 
     class _Reader(Protocol):
         connections: list[Any]
@@ -105,11 +113,15 @@ class _Bag(ABC):
             pass
         return losses
 
-    def _note_steps(self, written: NDArray[np.void]) -> None:
-        """A warning where messages (n,) in the order of writing, of `_WRITTEN`, show that the clock was set back."""
+    def _note_steps(self, written: NDArray[np.void]) -> bool:
+        """A warning where messages (n,) in the order of writing, of `_WRITTEN`, show that the clock was set back.
+
+        Returns whether log times of single messages are wrong.
+        """
         clock = RecorderClock()
         clock.take(written["channel"], written["time"])
         self.warnings = clock.warnings(self.path, self.statistics.values())
+        return clock.has_single_errors
 
     def _require_some(self, damage: Losses) -> None:
         """Raise LogFormatError where counting met damage before the first message.
@@ -216,7 +228,10 @@ class BagContainer(_Bag):
         self._require_some(damage)
         entries = ((each.chunk_pos, each.offset, k, each.time) for k, index in reader.indexes.items() for each in index)
         written = np.sort(np.fromiter(entries, dtype=[("chunk", "i8"), ("offset", "i8"), *_WRITTEN]))
-        self._note_steps(written)
+        if self._note_steps(written):
+            text = f"{self.path}: log times of single messages are out of line with those around them in the file"
+            remedy = "rewrite the bag with the stamps of its headers (wiki.ros.org/rosbag/Cookbook)"
+            self.warnings.append(RunWarning(WarningCode.CLOCK_SET, text, remedy))
         counted, promised = sum(item.count for item in self.statistics.values()), reader.message_count
         if not damage.reasons and counted < promised:
             self.losses_at_opening.truncated_files += 1
@@ -244,6 +259,7 @@ class Db3Container(_Bag):
         self._is_copy = self._file != path
         self._is_rolled_back = self._is_copy and self._has_hot_journal()
         self._in_order_of_time = True
+        self._wrong: set[int] = set()
         self._lowest, self._highest = -(1 << 63), (1 << 63) - 1
         with self._guarded(), self._connected() as connection:
             self._read_topics(connection)
@@ -264,7 +280,7 @@ class Db3Container(_Bag):
                 if type(data) is not bytes or type(log_time) is not int:
                     continue
                 if not self._in_order_of_time:  # Some times are not to be trusted: the order of writing is.
-                    if not self._lowest <= log_time <= self._highest:
+                    if number in self._wrong or not self._lowest <= log_time <= self._highest:
                         losses.log_times_repaired += 1
                         log_time = last
                     log_time = max(log_time, last)
@@ -362,9 +378,21 @@ class Db3Container(_Bag):
                     log_time = last.get(number, low)
                 last[number] = log_time
                 statistics.add(max(log_time, 0), max(log_time, 0), 1, 0)
-            rows = connection.execute("SELECT topic_id, timestamp FROM messages ORDER BY id")
-            self._note_steps(np.fromiter(rows, dtype=_WRITTEN))
+            rows = connection.execute("SELECT topic_id, timestamp, id FROM messages ORDER BY id")
+            written = np.fromiter(rows, dtype=[*_WRITTEN, ("id", "i8")])
+            if self._note_steps(written):
+                self._distrust(written)
         self._require_some(damage)
+
+    def _distrust(self, written: NDArray[np.void]) -> None:
+        """Read in the order of writing where that is the order of all log times but some; note which are wrong."""
+        wrong = (written["time"] < self._lowest) | (written["time"] > self._highest)
+        for channel in np.unique(written["channel"]):
+            rows = np.flatnonzero((written["channel"] == channel) & ~wrong)
+            wrong[rows] = out_of_line(written["time"][rows])
+        if np.diff(written["time"][~wrong]).min(initial=0) > -STEP_NS:
+            self._in_order_of_time = False
+            self._wrong = set(written["id"][wrong].tolist())
 
     def _guarded(self, losses: Losses | None = None) -> AbstractContextManager[None]:
         return guarded(

@@ -98,6 +98,11 @@ def test_stamps_that_are_late(run: Run, delay: float, expected: dict[str, Any]) 
     assert found(run.write()) == expected
 
 
+def test_scans_that_were_written_in_batches_are_not_late(run: Run) -> None:
+    run.scan_delays = {k: -(k % 25) * TENTH for k in range(100)}
+    assert found(run.write()) == {"log_time_repeated": ("warning", "/scan", 1, None)}
+
+
 def test_stamps_of_another_clock_are_no_trouble(run: Run) -> None:
     for k in range(100):
         run.change(k, stamp_ns=36 * SECOND + k * TENTH)

@@ -164,6 +164,10 @@ def test_no_odometry_is_an_error_unless_it_is_allowed(tmp_path: Path) -> None:
         (ReadOptions(scan_topic="/odom"), r"/odom is nav_msgs/msg/Odometry \(cdr\), not sensor_msgs/msg/LaserScan"),
         (ReadOptions(odom_topic="/nope"), r"no topic /nope; --odom-topic may be /odom"),
         (ReadOptions(truth_topic="/nope"), r"no topic /nope to take as truth; --truth-topic may be .*/odom, tf"),
+        (
+            ReadOptions(time_offset="/nope=1,/scan=2"),
+            r"no topic nope that --time-offset .* of this log /scan, /odom are",
+        ),
     ],
 )
 def test_a_topic_that_is_not_there_is_named_with_those_that_are(

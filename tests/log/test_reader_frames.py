@@ -111,6 +111,8 @@ def test_another_base_frame_moves_odometry_and_laser(tmp_path: Path) -> None:
         )
         log.odometry(START, Pose2(1.0, 0.0, 0.0))
         log.scan(make_scan(START))
+    with pytest.raises(TopicError, match=r"no frame axle, .*; --base-frame may be base_link, laser, rear_axle"):
+        open_log(path, ReadOptions(base_frame="axle"))
     odometry, scan = open_log(path, ReadOptions(base_frame="rear_axle")).events()
     assert isinstance(odometry, Odometry)
     assert isinstance(scan, Scan)

@@ -127,6 +127,8 @@ def test_odometry_with_an_offset_takes_its_place_among_the_scans(tmp_path: Path)
     path = write(tmp_path / "log.clf", [odom("1"), odom("2"), flaser("2.1", [1.0] * 181), odom("3")])
     events = list(open_log(path, ReadOptions(time_offset="ODOM=0.25")).events())
     assert [event.stamp_ns / SECOND for event in events] == [1.25, 2.1, 2.25, 3.25]
+    with pytest.raises(TopicError, match="a text log has no fields to override; leave out --scan-fix range_max=12"):
+        open_log(path, ReadOptions(scan_fix="range_max=12"))
     with pytest.raises(TopicError, match="no lines odom that --time-offset could move; it has FLASER, ODOM"):
         open_log(path, ReadOptions(time_offset="/odom=0.25"))
 

@@ -70,6 +70,17 @@ def check_log(log: Log, progress: Callable[[int], None] | None = None) -> CheckR
         check.finish()
         if check.steps:
             losses.clock_steps[check.topic] = check.steps
+    if any(warning.code == WarningCode.CLOCK_SET for warning in log.summary.warnings):
+        # Of the recorder: the order of the log is not that of writing, and its times are no measure of stamps.
+        findings.drop(_BY_LOG_TIME)
+        losses.clock_steps.clear()
+    if losses.log_times_repaired:
+        findings.add(
+            Severity.WARNING, "log_time", "",
+            "log times are impossible, or out of line with those around them: each was replaced by the one before",
+            "none is needed: stamps are what counts; look at the recorder, whose clock these are of",
+            losses.log_times_repaired,
+        )  # fmt: skip
     for warning in losses.step_warnings(log.summary):
         findings.add(Severity.ERROR, warning.code, "", warning.text, warning.remedy)
     scans = [check for check in topics.values() if isinstance(check, ScanCheck)]
@@ -88,6 +99,8 @@ def check_log(log: Log, progress: Callable[[int], None] | None = None) -> CheckR
     return CheckReport(tuple(findings.sorted()), intervals, count, losses, frames, transforms.parents)
 
 
+_BY_LOG_TIME = ("latency", "latency_high", "other_clock", "stamp_backwards", "gap")
+"""Findings that compare with the log's times, or go by their order."""
 _SCAN_OR_ODOMETRY: dict[type, type[TopicCheck]] = {ScanMessage: ScanCheck, OdometryMessage: OdometryCheck}
 
 

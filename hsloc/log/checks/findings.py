@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
 
 NANOSECONDS = 1_000_000_000
 EDGES_MS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000)
@@ -56,6 +59,14 @@ class Findings:
             known = self.found[code, topic] = Finding(code, severity, topic, text, remedy)
             known.first = None if isinstance(place, str) else place
         known.count += count
+
+    def drop(self, codes: Collection[str], topic: str | None = None) -> None:
+        """Forget findings of some codes, of one topic or of all."""
+        self.found = {
+            (code, of): finding
+            for (code, of), finding in self.found.items()
+            if code not in codes or topic not in (None, of)
+        }
 
     def sorted(self) -> list[Finding]:
         """The worst first; of one severity, in the order in which they were met."""

@@ -45,6 +45,8 @@ class TopicCheck:
         self.last_ns: int | None = None
         self._findings = findings
         self._count = 0
+        self._last_log_ns = 0
+        self._same_log_time = 0
         self._steps = StepDetector()
         self.steps: list[tuple[int, int]] = []
 
@@ -60,6 +62,8 @@ class TopicCheck:
             return
         if (step := self._steps.take(message.stamp_ns, log_time_ns)) is not None:
             self.steps.append(step)
+        self._same_log_time += log_time_ns == self._last_log_ns and place.stamp_ns != self.last_ns
+        self._last_log_ns = log_time_ns
         self._check_latency(place)
         self._check_order(place)
         self.last_ns = place.stamp_ns
@@ -69,6 +73,15 @@ class TopicCheck:
         """At the end of the log: short topics have waited for what is usual."""
         for interval, place in self.intervals.settle():
             self._check_gap(interval, place)
+        if self._same_log_time > self._count // 2:
+            # Whatever their latency is, the log does not say.
+            self._findings.drop(("latency", "latency_high"), self.topic)
+            self._findings.add(
+                Severity.WARNING, "log_time_repeated", self.topic,
+                f"most log times of the {self.what} are that of the message before: they were written in batches, and "
+                "the log does not say when each was received",
+                "none is needed: stamps are what counts; --stamps log cannot be used",
+            )  # fmt: skip
 
     def _check_latency(self, place: Place) -> None:
         late = abs(place.log_time_ns - place.stamp_ns)

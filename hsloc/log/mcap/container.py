@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from hsloc.errors import LogError, LogFormatError
-from hsloc.log.container import Channel, RawMessage
+from hsloc.log.container import Channel, RawMessage, out_of_line
 from hsloc.log.mcap import records
 from hsloc.log.mcap.index_scan import IndexScan, Segment
 from hsloc.log.mcap.records import ChunkHead, Damage, Opcode, UnknownCompression
@@ -179,6 +179,8 @@ class McapContainer:
         low, high = self._directory.plausible_ns
         if found and not (low <= min(found)[0] and max(found)[0] <= high):
             found = _with_plausible_times(found, low, high, segment.start_ns, losses)
+        if found and self._directory.clock.has_single_errors:
+            found = _with_times_in_line(found, losses)
         if at < end:
             losses.damaged_chunks += 1
             losses.bytes_lost += end - at
@@ -235,3 +237,17 @@ def _with_plausible_times(
             message = (last, *message[1:])
         repaired.append(message)
     return repaired
+
+
+def _with_times_in_line(found: list[RawMessage], losses: Losses) -> list[RawMessage]:
+    """Messages in the order of the file; log times that those of their channel contradict give way to ones before."""
+    channels = np.array([message[2] for message in found])
+    times = np.array([message[0] for message in found], dtype=np.uint64).astype(np.int64)
+    wrong = np.zeros(len(found), dtype=np.bool_)
+    for channel in np.unique(channels):
+        rows = np.flatnonzero(channels == channel)
+        wrong[rows] = out_of_line(times[rows])
+    for row in np.flatnonzero(wrong).tolist():  # never the first one
+        losses.log_times_repaired += 1
+        found[row] = (found[row - 1][0], *found[row][1:])
+    return found

@@ -343,7 +343,9 @@ def _truth(where: str, channels: Sequence[Channel], options: ReadOptions) -> str
     raise TopicError(f"{where}: no topic {named} to take as truth; --truth-topic may be {remedy}")
 
 
-def check_offsets(where: str, channels: Sequence[Channel], read: Sequence[str], options: ReadOptions) -> list[RunWarning]:
+def check_offsets(
+    where: str, channels: Sequence[Channel], read: Sequence[str], options: ReadOptions
+) -> list[RunWarning]:
     """A warning for each topic of `--time-offset` that is not among the ones that are read.
 
     Raises TopicError for one that the log does not have.

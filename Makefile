@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Processes that run the tests; a file's tests stay in one of them, so that its fixtures are made once.
 JOBS ?= auto
+# Where it is set, as in many containers, hundreds of processes compile all modules again, which takes each half a second.
+unexport PYTHONDONTWRITEBYTECODE
 PYTEST := $(BIN)/pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test lint docs clean

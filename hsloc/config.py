@@ -7,6 +7,7 @@ import difflib
 import json
 import typing
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -354,6 +355,12 @@ def _get(values: Any, path: tuple[str, ...]) -> Any:
 
 def dump(config: Config) -> str:
     """A configuration as YAML, which `load` reads back."""
+    return _as_yaml(json.dumps(to_dict(config)))
+
+
+@lru_cache(maxsize=16)
+def _as_yaml(values: str) -> str:
+    """JSON as YAML: three files of a run hold its configuration, and ruamel takes 20 ms for each."""
     from io import StringIO
 
     from ruamel.yaml import YAML
@@ -362,5 +369,5 @@ def dump(config: Config) -> str:
     yaml.default_flow_style = False
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
     stream = StringIO()
-    yaml.dump(to_dict(config), stream)
+    yaml.dump(json.loads(values), stream)
     return stream.getvalue()

@@ -212,7 +212,8 @@ def draw_panel(axes: Axes, chart: Chart, data: ReportData, *, with_time: bool) -
     for begin, until in data.lost:
         axes.axvspan(begin / factor, until / factor, facecolor=style.PURPLE, alpha=0.22, linewidth=0, zorder=0)
     title = f"{chart.title} [{chart.unit}]" if chart.unit else chart.title
-    axes.set_title(title, loc="left", fontsize=style.TEXT, color=style.INK, pad=4)
+    # With y given, matplotlib does not look for its place among the ticks, which takes a tenth of the drawing.
+    axes.set_title(title, loc="left", fontsize=style.TEXT, color=style.INK, pad=4, y=1.0)
     axes.set_xlim(0.0, end if end > 0.0 else 1.0)
     axes.grid(axis="y", color=style.RULE, linewidth=0.7)
     axes.set_axisbelow(True)

@@ -13,15 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import httpx2 as httpx
 import pytest
-from live_service import free_port, submit
+from live_service import Live, free_port, submit
 
 from hsloc.client import Client
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
-
-    from live_service import Live
 
 pytestmark = pytest.mark.unmeasured
 
@@ -54,28 +52,27 @@ def wait_for_port(port: int) -> None:
     raise AssertionError("the proxy did not start")
 
 
-@pytest.fixture(params=["nginx", "caddy"])
-def proxied(
-    request: pytest.FixtureRequest, make_live: Callable[..., Live], tmp_path: Path
-) -> Iterator[tuple[Live, str]]:
+@pytest.fixture(params=["nginx", "caddy"], scope="module")
+def proxied(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Live, str]]:
     """A server, and the URL of a proxy before it."""
     program = NGINX if request.param == "nginx" else CADDY
     if program is None:
         pytest.skip(f"{request.param.upper()} IS NOT TESTED: apt-get install {request.param}")
-    live, port = make_live(), free_port()
+    folder = tmp_path_factory.mktemp(request.param)
+    live, port = Live(folder).start(), free_port()
     if request.param == "nginx":
-        config = tmp_path / "nginx.conf"
+        config = folder / "nginx.conf"
         user = "user root;" if os.getuid() == 0 else ""
-        config.write_text(NGINX_CONFIG.format(folder=tmp_path, port=port, upstream=live.url, user=user))
-        command = [program, "-c", str(config), "-p", str(tmp_path), "-e", str(tmp_path / "error.log")]
+        config.write_text(NGINX_CONFIG.format(folder=folder, port=port, upstream=live.url, user=user))
+        command = [program, "-c", str(config), "-p", str(folder), "-e", str(folder / "error.log")]
     else:
-        config = tmp_path / "Caddyfile"
+        config = folder / "Caddyfile"
         config.write_text(
             f"{{\n admin off\n auto_https off\n}}\nhttp://127.0.0.1:{port} {{\n reverse_proxy {live.url[7:]}\n}}\n"
         )
         command = [program, "run", "--config", str(config), "--adapter", "caddyfile"]
-    environment = {**os.environ, "HOME": str(tmp_path), "XDG_DATA_HOME": str(tmp_path)}
-    with (tmp_path / "proxy.log").open("wb") as log:
+    environment = {**os.environ, "HOME": str(folder), "XDG_DATA_HOME": str(folder)}
+    with (folder / "proxy.log").open("wb") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
     try:
         wait_for_port(port)
@@ -83,16 +80,17 @@ def proxied(
     finally:
         process.terminate()
         process.wait(10.0)
+        live.end()
 
 
 def test_a_large_upload_passes(proxied: tuple[Live, str], tmp_path: Path) -> None:
     log = tmp_path / "run.mcap"
     log.write_bytes(b"ok " + os.urandom(5_000_000))
     client = Client(proxied[1])
-    job = client.submit(client.upload(log))
-    assert client.wait(job["id"])["state"] == "succeeded"
+    ident = client.upload(log)
+    assert client.wait(client.submit(ident)["id"])["state"] == "succeeded"
     with proxied[0].client() as direct:
-        (file,) = direct.get("/v1/files").json()["files"]
+        file = direct.get(f"/v1/files/{ident}").json()
     assert file["sha256"] == hashlib.sha256(log.read_bytes()).hexdigest()
 
 

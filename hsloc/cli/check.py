@@ -82,15 +82,18 @@ def _with_choices(
     from hsloc.errors import HslocError
     from hsloc.log import Finding, Severity
     from hsloc.slam.front_end import FrontEndParameters
-    from hsloc.slam.mounting_choice import with_chosen_mountings
+    from hsloc.slam.mounting_choice import direction_warnings, with_chosen_mountings
     from hsloc.warnings import WarningCode
 
+    paths, parameters = log.summary.paths, FrontEndParameters()
     try:
-        options, warnings = with_chosen_mountings(log, log.summary.paths, options, FrontEndParameters())
+        options, chosen = with_chosen_mountings(log, paths, options, parameters)
+        turned = direction_warnings(log, paths, options, parameters, stated=True)
     except HslocError:  # The reason is among the findings.
         return options, findings
-    kept = [f for f in findings if not warnings or f.code != WarningCode.EXTRINSICS_RESTATED]
-    return options, (*kept, *(Finding(w.code, Severity.WARNING, "", w.text, w.remedy, 1) for w in warnings))
+    kept = [f for f in findings if not chosen or f.code != WarningCode.EXTRINSICS_RESTATED]
+    more = (Finding(w.code, Severity.WARNING, "", w.text, w.remedy, 1) for w in (*chosen, *turned))
+    return options, (*kept, *more)
 
 
 def _of_odometry(log: Log) -> list[Finding]:

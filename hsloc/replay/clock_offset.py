@@ -16,7 +16,7 @@ import numpy as np
 from hsloc.log import LONGEST_OFFSET_S, open_log
 from hsloc.options import AUTO
 from hsloc.replay.matched_scans import are_matched, is_lost
-from hsloc.slam.mounting_choice import with_chosen_mountings
+from hsloc.slam.mounting_choice import direction_warnings, with_chosen_mountings
 from hsloc.slam.time_offset import (
     HINT_S,
     Headings,
@@ -98,7 +98,8 @@ def open_as_meant(
         plain = replace(plain, stamps="log")
         log = open_log(request.logs, plain)
     reading, of_mountings = with_chosen_mountings(log, request.logs, plain, front_end)
-    warnings = (*of_epochs, *of_mountings)
+    of_directions = () if lidar_only else direction_warnings(log, request.logs, reading, front_end, stated=False)
+    warnings = (*of_epochs, *of_mountings, *of_directions)
     looks = time_offset is None and not lidar_only
     automatic = looks and request.read.time_offset == AUTO
     apart = looks and abs(log.summary.clocks_apart_s) > HINT_S and request.read.time_offset is None

@@ -3,13 +3,13 @@
 Scans are matched one to the next without odometry. What the base did then follows from the mounting: a laser that
 stands elsewhere moves otherwise in each turn, one that looks elsewhere drives in another direction. Steps of the scans
 are compared with those of the odometry under each mounting, step by step, so that what the odometry itself gets wrong
-counts for all of them alike.
+counts for all of them alike. The same steps show a laser that looks elsewhere than it is assumed to, as backwards.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import sqrt
+from math import degrees, inf, pi, radians, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,11 +17,11 @@ import numpy as np
 from hsloc.errors import HslocError
 from hsloc.log import laser_mounting, open_log
 from hsloc.model.events import Odometry, Scan
-from hsloc.model.pose2 import relative_poses, wrap_angles
+from hsloc.model.pose2 import Pose2, relative_poses, wrap_angle, wrap_angles
 from hsloc.options import AUTO
 from hsloc.preprocessing.odometry import ContinuousOdometry
 from hsloc.slam.laser_odometry import with_laser_odometry
-from hsloc.slam.time_offset import Headings, find_offset, half_sweep_ns
+from hsloc.slam.time_offset import LEAST_AGREEMENT, Headings, find_offset, half_sweep_ns
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -56,6 +56,22 @@ _LEAST_T = 3.0
 """Minimum t of the difference of two mountings: were both equally wrong, one would be chosen in one of 200 logs."""
 
 
+_SCANS_OF_DIRECTION = 600
+"""Scans that are matched to see where a laser looks: a minute, in which a robot drives 20 m."""
+_LEAST_RAD = radians(10.0)
+"""Smallest error of a yaw that is looked for here. Smaller ones leave the matches on a map right, and show in them."""
+_PARTS, _MIN_SIGMAS = 10, 7.0
+"""Parts of the log, and minimum ratio to the standard deviation: as for errors of a mounting by matches on a map."""
+_FEWEST_OF_DIRECTION = 20
+"""Minimum number of steps: 4 m, two in each part."""
+_SCALES_OF_DIRECTION = (0.5, 2.0)
+"""Ratio of the steps of scans and odometry outside of which one of the two says nothing."""
+_PLACE_M = 0.02
+"""Standard deviation (m) up to which the place of such a laser is stated, too: what a ruler finds."""
+_LEAST_TURNED = 0.5
+"""Rotation (rad) by the odometry from which the scans must turn the same way."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Motion:
     """Steps (n, 3) of the base by the scans and by the odometry, and its path by the odometry at the scans (m, 3)."""
@@ -80,6 +96,91 @@ def with_chosen_mountings(
             chosen.append((laser.frame, laser.alternatives[best]))
             warnings.append(warning)
     return (replace(options, mountings=tuple(chosen)) if warnings else options), tuple(warnings)
+
+
+def direction_warnings(
+    log: Log, paths: Sequence[Path], options: ReadOptions, parameters: FrontEndParameters, *, stated: bool
+) -> list[RunWarning]:
+    """A warning for each laser that looks elsewhere than assumed, or where `stated`, than the log states it.
+
+    `log` is the opened log of these `paths` and `options`. Raises LogError as `open_log` does.
+    """
+    summary = log.summary
+    if summary.odom_topic is None or summary.scan_topic is None:
+        return []
+    # A text log has no topics to choose from.
+    lasers = [(laser.topic, laser.T_base_laser, laser.extrinsics) for laser in summary.lasers]
+    lasers = lasers or [("", summary.T_base_laser, summary.extrinsics)]
+    found = []
+    for topic, mounting, extrinsics in lasers:
+        if not stated and extrinsics != "identity":
+            continue
+        reading = replace(
+            options, scan_topic=topic or None, deskew=False, start_s=None, end_s=None,
+            time_offset=None if options.time_offset == AUTO else options.time_offset,
+        )  # fmt: skip
+        motion = _motion(open_log(paths, reading).events(), parameters, _SCANS_OF_DIRECTION)
+        error, place_sigma, sigma = _direction(motion)
+        yaw = error.theta
+        if abs(yaw) <= max(_LEAST_RAD, _MIN_SIGMAS * sigma):
+            continue
+        looks = f"turned by {degrees(yaw):.0f} deg" if abs(yaw) < pi - _LEAST_RAD else "backwards"
+        where = "is assumed to" if extrinsics == "identity" else f"is stated to ({extrinsics})"
+        is_placed = place_sigma < _PLACE_M
+        pose = error @ mounting if is_placed else Pose2(mounting.x, mounting.y, wrap_angle(mounting.theta + yaw))
+        text = (
+            f"the laser{f' of {topic}' if topic else ''} looks {looks} from where it {where}, by its scans and the "
+            f"odometry (+- {degrees(sigma):.1f} deg)"
+        )
+        place = "the place exactly" if is_placed else "the place, which is not known yet"
+        remedy = f"--laser-pose={pose.x:.3f},{pose.y:.3f},{pose.theta:.3f}; hsloc calibrate finds {place}"
+        found.append(RunWarning(WarningCode.EXTRINSICS_WRONG, text, remedy))
+    return found
+
+
+def _direction(motion: _Motion) -> tuple[Pose2, float, float]:
+    """The laser is at this pose `@` its mounting; standard deviations of place (m) and yaw (rad), infinite: not known.
+
+    A laser that is mounted elsewhere by a place p and a yaw sees a step S of the base as
+    `R(-yaw) (S + (R(turn) - 1) p)`. In complex numbers that is linear in two of them, which are found by robust least
+    squares.
+    """
+    nothing = Pose2(), inf, inf
+    if len(motion.by_scans) < _FEWEST_OF_DIRECTION:
+        return nothing
+    turned, driven_turn = motion.by_scans[:, 2], motion.by_odometry[:, 2]
+    seen, driven = (each[:, 0] + 1j * each[:, 1] for each in (motion.by_scans, motion.by_odometry))
+    length = sqrt(float(np.sum(turned**2) * np.sum(driven_turn**2)))
+    if np.abs(driven_turn).sum() > _LEAST_TURNED and np.sum(turned * driven_turn) < LEAST_AGREEMENT * length:
+        return nothing  # The scans are mirrored, or one of the two is wrong.
+    rows = np.stack((driven, np.exp(1j * turned) - 1.0), axis=1)
+    values = np.zeros(2, dtype=np.complex128)
+    for _ in range(10):
+        misfit = np.abs(seen - rows @ values)
+        scale = max(1.4826 * float(np.median(misfit)), _LEAST_M)
+        weight = 1.0 / (1.0 + (misfit / scale) ** 2)
+        information = np.einsum("np,n,nq->npq", rows.conj(), weight, rows)
+        vectors = rows.conj() * (weight * seen)[:, None]
+        prior = 1e-6 * np.eye(2)
+        values = np.linalg.solve(information.sum(axis=0) + prior, vectors.sum(axis=0))
+    part = np.arange(len(seen)) * _PARTS // len(seen)
+    without = np.array(
+        [
+            np.linalg.solve(information[part != k].sum(axis=0) + prior, vectors[part != k].sum(axis=0))
+            for k in range(_PARTS)
+        ]
+    )
+    low, high = _SCALES_OF_DIRECTION
+    if not all(low < abs(each) < high for each in (values[0], *without[:, 0])):
+        return nothing
+    every = np.vstack((values, without))
+    turns = every[:, 0].conj() / np.abs(every[:, 0])  # e^(i yaw)
+    places = every[:, 1] * turns
+    spread = (_PARTS - 1) / _PARTS
+    yaw_sigma = sqrt(spread * float(np.sum(np.angle(turns[1:] / turns[0]) ** 2)))
+    place_sigma = sqrt(spread * float(np.sum(np.abs(places[1:] - places[0]) ** 2)))
+    error = Pose2(float(places[0].real), float(places[0].imag), float(np.angle(turns[0])))
+    return error, place_sigma, yaw_sigma
 
 
 def _choice(
@@ -141,7 +242,7 @@ def _misfits(options: ReadOptions, paths: Sequence[Path], parameters: FrontEndPa
     return np.asarray(np.sqrt(np.sum(apart**2, axis=1) + turned**2))
 
 
-def _motion(events: Iterable[Event], parameters: FrontEndParameters) -> _Motion:
+def _motion(events: Iterable[Event], parameters: FrontEndParameters, most: int = _MOST_SCANS) -> _Motion:
     """The motion of the base by scans and odometry, their clocks put together."""
     odometry: list[tuple[int, float, float, float]] = []
     middles: dict[int, int] = {}
@@ -150,9 +251,9 @@ def _motion(events: Iterable[Event], parameters: FrontEndParameters) -> _Motion:
         for event in ContinuousOdometry(events):
             if isinstance(event, Odometry):
                 odometry.append((event.stamp_ns, *event.T_odom_base.to_array().tolist()))
-                if len(middles) >= _MOST_SCANS:
+                if len(middles) >= most:
                     return
-            elif isinstance(event, Scan) and len(middles) < _MOST_SCANS:
+            elif isinstance(event, Scan) and len(middles) < most:
                 middles[event.stamp_ns] = event.stamp_ns + half_sweep_ns(event)
                 yield event
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import pi
 from typing import TYPE_CHECKING
 
 import pytest
@@ -13,7 +14,7 @@ from hsloc.simulation.sensors import Lidar
 from hsloc.simulation.simulator import events
 from hsloc.simulation.world_files import load_world
 from hsloc.slam.front_end import FrontEndParameters
-from hsloc.slam.mounting_choice import with_chosen_mountings
+from hsloc.slam.mounting_choice import direction_warnings, with_chosen_mountings
 from hsloc.warnings import WarningCode
 
 if TYPE_CHECKING:
@@ -80,3 +81,31 @@ def test_a_mounting_that_the_user_gives_is_not_chosen_again(tmp_path: Path, reco
     path = write(tmp_path / "a.mcap", recorded[:20], [UPSIDE_DOWN, Transform3.from_pose2(RIGHT)])
     given = ReadOptions(laser_pose=Pose2(0.1, 0.0, 0.0))
     assert with_chosen_mountings(open_log(path, given), [path], given, FrontEndParameters()) == (given, ())
+
+
+@pytest.mark.parametrize(
+    ("mounting", "text"),
+    [
+        (None, "looks turned by 23 deg from where it is assumed to"),
+        (RIGHT @ Pose2(0.0, 0.0, pi), "looks backwards from where it is stated to"),
+        (RIGHT, ""),
+        (UPSIDE_DOWN, ""),
+    ],
+    ids=["not stated", "backwards", "right", "upside down"],
+)
+def test_a_laser_that_looks_elsewhere_than_it_is_said_to_is_reported(
+    tmp_path: Path, recorded: list[Event], mounting: Pose2 | Transform3 | None, text: str
+) -> None:
+    mounting = Transform3.from_pose2(mounting) if isinstance(mounting, Pose2) else mounting
+    path = write(tmp_path / "a.mcap", recorded, [] if mounting is None else [mounting])
+    log, options = open_log(path), ReadOptions()
+    found = direction_warnings(log, [path], options, FrontEndParameters(), stated=True)
+    assert [warning.code for warning in found] == [WarningCode.EXTRINSICS_WRONG] * bool(text)
+    for warning in found:
+        assert text in warning.text
+        pose = warning.remedy.removeprefix("--laser-pose=").partition(";")[0]
+        x, y, yaw = (float(value) for value in pose.split(","))
+        assert yaw == pytest.approx(RIGHT.theta, abs=0.01)
+        assert (x, y) == pytest.approx((RIGHT.x, RIGHT.y), abs=0.03)
+    if mounting is not None:  # A run asks only where the log states nothing.
+        assert direction_warnings(log, [path], options, FrontEndParameters(), stated=False) == []

@@ -140,33 +140,40 @@ def _steps_at_border(tables: U8, offsets: I32, weights: I64, rest: I64, n: int, 
 
 
 @njit(cache=True, nogil=True)
-def _add(totals: I32, row: U8, weight: int) -> None:
+def _add(totals: I32, row: U8, stride: int, weight: int) -> None:
+    if stride == 1:  # by itself, so that a processor adds many at once
+        for x in range(len(totals)):
+            totals[x] += np.int32(weight) * np.int32(row[x])
+        return
     for x in range(len(totals)):
-        totals[x] += np.int32(weight) * np.int32(row[x])
+        totals[x] += np.int32(weight) * np.int32(row[x * stride])
 
 
 @njit(cache=True, nogil=True)
 def _bound_row(by_phase: U8, offsets: I32, weights: I64, n: int, y: int, side: int, totals: I32) -> None:
     """255 times the bounds of a whole row of boxes of places of `side` entries.
 
-    `by_phase[k, p, q, j, i]` is entry (j side + p, i side + q) of table k: boxes side by side look up neighbours in
-    memory, and a processor adds many at once.
+    `by_phase[k, p, q, j, i]` is entry (j step + p, i step + q) of table k, and `side` is a multiple of the step: boxes
+    side by side look up neighbours in memory, or those `stride` apart.
     """
+    step = by_phase.shape[1]
     rows = by_phase.shape[3]
     columns = by_phase.shape[4]
+    stride = side // step
     for i in range(n):
         v = offsets[i, 1] + y * side
         u = offsets[i, 2]
-        row = v // side
-        column = u // side
+        row = v // step
+        column = u // step
         if row < 0 or row >= rows:
             continue
-        begin = max(0, -column)
-        end = min(len(totals), columns - column)
+        begin = max(0, -(column // stride))
+        end = min(len(totals), -((column - columns) // stride))
         if begin < end:
             _add(
                 totals[begin:end],
-                by_phase[offsets[i, 0], v - row * side, u - column * side, row, column + begin : column + end],
+                by_phase[offsets[i, 0], v - row * step, u - column * step, row, column + begin * stride :],
+                stride,
                 weights[i],
             )
 
@@ -299,17 +306,17 @@ def fit_boxes(
 
 
 @njit(cache=True, nogil=True)
-def expected_loss(pyramid: Pyramid, rows: F64, places: I64, level: int, half_theta: float) -> F64:
-    """For each cluster by how much it lowers the bound of a box on the average.
+def sampled_bounds(pyramid: Pyramid, rows: F64, places: I64, level: int, half_theta: float) -> tuple[F64, I64]:
+    """For each cluster by how much it lowers the bound of a box on the average, and 255 times the bounds.
 
-    The average is over boxes that hold the entries `places` (k, 2; v, u), with all headings.
-
-    Those that lower it most are looked up first, so that most boxes are ruled out after a few look-ups.
+    The boxes are k that hold the entries `places` (k, 2; v, u), with all headings. Clusters that lower the bound most
+    are looked up first, so that most boxes are ruled out after a few look-ups.
     """
     step = 1 << pyramid.shift
     extent = float(step << level)
     n = len(rows)
     loss = np.zeros(n, dtype=np.float64)
+    bounds = np.zeros(len(places), dtype=np.int64)
     entries = np.empty(n, dtype=np.int64)
     weights = np.empty(n, dtype=np.int64)
     rest = np.empty(n + 1, dtype=np.int64)
@@ -321,7 +328,9 @@ def expected_loss(pyramid: Pyramid, rows: F64, places: I64, level: int, half_the
         x = places[k, 1] >> level << level
         for i in range(n):
             kept, _, _, _, _ = _turned(rows[i : i + 1], theta, half_theta, extent, pyramid, look_ups)
+            bound = rest[0]
             if kept == 1:
-                top = _steps_at_border(pyramid.tables, offsets, weights, rest, 1, y, x, -1)
-                loss[i] += 255 * weights[0] - top
-    return loss
+                bound = _steps_at_border(pyramid.tables, offsets, weights, rest, 1, y, x, -1)
+                loss[i] += rest[0] - bound
+            bounds[k] += bound
+    return loss, bounds

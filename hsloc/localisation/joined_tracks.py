@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.track_consistency import LEAST, MappedGround, Track, Way, right_tracks
+from hsloc.localisation.odometry_errors import Way
+from hsloc.localisation.track_consistency import LEAST, MappedGround, Track, right_tracks
 from hsloc.localisation.track_evidence import CONFIDENCE, PRIOR, States, TrackRow, entry_likelihoods, smooth
 from hsloc.model.estimate import Status
 

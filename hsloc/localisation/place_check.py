@@ -13,7 +13,7 @@ better than the scans: at the robot's own place, seen in the mirror.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -63,13 +63,15 @@ class Explanation:
     """What the map explains of a scan at a pose.
 
     `fitness` is the mean score over the beams that neither end at an object in free space nor where nothing is mapped;
-    `short`, `through` and `unmapped` are the shares of all beams that end before a wall, behind one, or there.
+    `short`, `through` and `unmapped` are the shares of all beams that end before a wall, behind one, or there. `ends`
+    (n, 2) is where in the map those end that end before a wall.
     """
 
     fitness: float
     short: float
     through: float
     unmapped: float
+    ends: F64 = field(default_factory=lambda: np.empty((0, 2)), compare=False)
 
 
 _FITS = 0.3
@@ -87,6 +89,9 @@ _MOST_HIDDEN = 0.6
 """Share of beams that something may hide: with fewer left, they fit somewhere by chance. Assumed."""
 _MOST_ASTRAY = 0.05
 """Share of beams that may end behind walls and where nothing is mapped: a door that is open, a window."""
+_BESIDE, _THERE_M, _FEWEST_ENDS = 0.02, 0.15, 5
+"""A beam that points at something within the first (rad) ends there if it does so within the second (m), and something
+that stood there is gone if the beam ends behind twice that; fewer such beams than the third say nothing."""
 _OWN_HALF, _OWN_HALF_ANGLE = 0.2, 0.1
 """The scans of the own place are moved as a whole within these half-widths (m, rad), as those of another one are."""
 
@@ -139,7 +144,26 @@ class PlaceCheck:
         counts = np.bincount(beam, minlength=4)
         judged = (beam != SHORT) & (beam != UNMAPPED)
         fitness = float(score[judged].sum()) / int(judged.sum()) if judged.any() else 0.0
-        return Explanation(fitness, int(counts[SHORT]) / n, int(counts[THROUGH]) / n, int(counts[UNMAPPED]) / n)
+        ends = T_map_base @ paired.scan.points_base()[beam == SHORT] if counts[SHORT] else np.empty((0, 2))
+        return Explanation(fitness, int(counts[SHORT]) / n, int(counts[THROUGH]) / n, int(counts[UNMAPPED]) / n, ends)
+
+    def still_stands(self, paired: PairedScan, pose: Pose2, ends: F64) -> float:
+        """The share of what beams ended at before, `ends` (n, 2) in the map, that a scan with the base at `pose` sees.
+
+        What stands behind something else does not count; NaN where too little is left.
+        """
+        scan = paired.scan
+        seen = _polar(scan.T_base_laser.inverse() @ scan.points_base())
+        seen = seen[np.argsort(seen[:, 1])]
+        expected = _polar((pose @ scan.T_base_laser).inverse() @ ends)
+        if len(seen) < 2:
+            return float("nan")
+        after = np.clip(np.searchsorted(seen[:, 1], expected[:, 1]), 1, len(seen) - 1)
+        gaps = np.abs(seen[[after - 1, after], 1] - expected[:, 1])
+        beyond = seen[after - (gaps[0] < gaps[1]), 0] - expected[:, 0]
+        beyond = beyond[gaps.min(axis=0) < _BESIDE]
+        stands, gone = int((np.abs(beyond) < _THERE_M).sum()), int((beyond > 2.0 * _THERE_M).sum())
+        return stands / (stands + gone) if stands + gone >= _FEWEST_ENDS else float("nan")
 
     def _classify(self, paired: PairedScan, T_map_base: Pose2) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
         points = paired.scan.points_base()
@@ -198,3 +222,8 @@ class PlaceCheck:
         mirrored = cloud * np.array((1.0, -1.0))
         place, fitness = fittest_other(self.search, self._field, mirrored, anywhere, self.parameters.max_boxes)
         return fitness / own if place is not None or fitness < own else float("nan")
+
+
+def _polar(points: F64) -> F64:
+    """Distances and bearings of points (n, 2) in the frame of the laser (n, 2)."""
+    return np.column_stack((np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])))

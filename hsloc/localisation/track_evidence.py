@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     F64 = NDArray[np.float64]
-    from hsloc.localisation.place_check import PlaceCheck
+    from hsloc.localisation.place_check import Explanation, PlaceCheck
     from hsloc.model.events import PairedScan
     from hsloc.model.pose2 import Pose2
 
@@ -99,6 +99,9 @@ _FEWEST_JOINED = 4
 _RAREST = 4
 """Intervals that pass between two comparisons where the last ones said the same, at most: over 32 m a look-alike has a
 probability of 3 %, and a jump into one is noticed in the scans, after which comparisons are frequent again."""
+_LATER_M = 1.0
+"""Path length (m) after which it is checked whether something that beams ended at still stands. Assumed: long enough
+for people around the robot to be elsewhere, short enough for most of it to be in sight."""
 _FIRST_COMPARISON_M = 3.0
 """A new track is compared with the whole map after this path length (m), or after the usual one if that is shorter."""
 
@@ -296,6 +299,7 @@ class TrackMonitor:
         self._check = check
         self._filter = TrackFilter()
         self._trail: deque[tuple[float, Pose2, F64]] = deque()
+        self._ends: deque[tuple[float, F64]] = deque()
         self._path_length = 0.0
         self._compared_at = 0.0
         self._unchanged = 1
@@ -312,6 +316,7 @@ class TrackMonitor:
         self._filter.start()
         self._unchanged = 1
         self._trail.clear()
+        self._ends.clear()
         self._compared_at = self._path_length - max(self._check.parameters.interval - _FIRST_COMPARISON_M, 0.0)
 
     def move(self, distance: float) -> None:
@@ -346,10 +351,22 @@ class TrackMonitor:
             chosen = np.unique(np.linspace(0, len(self._trail) - 1, p.scans).astype(np.int64))
             compared = self._check.compare([self._trail[k][1:] for k in chosen], pose)
         found = self._check.explain(paired, pose)
-        evidence = Evidence(distance, found.fitness, found.short, found.through, found.unmapped, *compared)
+        lasting = self._lasting(paired, pose, found)
+        evidence = Evidence(distance, found.fitness, found.short, found.through, found.unmapped, *compared, lasting)
         self._weigh_change(evidence)
         self._filter.add(TrackRow(Status.MATCHED, evidence))
         return evidence
+
+    def _lasting(self, paired: PairedScan, pose: Pose2, found: Explanation) -> float:
+        """See `Evidence.lasting`; by what beams ended at the last time that it was far enough back."""
+        before = self._path_length - _LATER_M
+        while len(self._ends) > 1 and self._ends[1][0] <= before:
+            self._ends.popleft()
+        share = float("nan")
+        if self._ends and self._ends[0][0] <= before and found.short > 0.0:
+            share = self._check.still_stands(paired, pose, self._ends[0][1])
+        self._ends.append((self._path_length, found.ends))
+        return found.short * share if found.short > 0.0 else 0.0
 
     def _weigh_change(self, evidence: Evidence) -> None:
         """Comparisons that say the same again become rarer; where a scan fits worse than usual they do not."""

@@ -59,7 +59,8 @@ class Evidence:
     in free space cut short, `short`, `through` and `unmapped` are the shares of all beams that end before a wall,
     behind one, or where the map has nothing. `rival` is the fitness of the fittest other place on the map divided by
     that of this one, NaN where the places were not compared; `other` is that place, where one was found. `mirrored` is
-    that of the fittest place for the mirrored scans, NaN where it is not known.
+    that of the fittest place for the mirrored scans, NaN where it is not known. `lasting` is the part of `short` that
+    ends at what still stands there after the robot has moved on, which people do not; NaN where it is not known.
     """
 
     distance: float
@@ -70,6 +71,7 @@ class Evidence:
     rival: float = float("nan")
     other: Pose2 | None = None
     mirrored: float = float("nan")
+    lasting: float = float("nan")
 
 
 class LikelyPlace(NamedTuple):

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rooms import L_SHAPE, beside, grid, seen
+from rooms import L_SHAPE, beside, grid, seen, walls
 
 from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
 from hsloc.matching import LikelihoodField
@@ -78,6 +78,18 @@ def test_a_crowd_hides_walls_but_does_not_contradict_them() -> None:
     assert check.is_hidden(hidden, place, clear.fitness)
     assert not check.is_hidden(crowded(hidden, 1.0), place, clear.fitness)
     assert not check.is_hidden(hidden, place @ Pose2(0.3, 0.2), clear.fitness)
+
+
+def test_what_stands_still_is_seen_again_and_people_are_not() -> None:
+    check = check_of(grid(L_SHAPE, ONE))
+    crate = np.vstack((L_SHAPE, walls((0.5, 1.0), (1.5, 1.0), (1.5, 1.8), (0.5, 1.8))))
+    before, after = PLACES[1], PLACES[2]
+    ends = check.explain(seen(crate, before, Pose2(), 0.0), before).ends
+    assert len(ends) > 8
+    assert np.abs(ends[:, 1] - 1.8).max() < 0.1
+    assert check.still_stands(seen(crate, after, Pose2(), 0.0), after, ends) > 0.9
+    assert check.still_stands(seen(L_SHAPE, after, Pose2(), 0.0), after, ends) == 0.0
+    assert np.isnan(check.still_stands(seen(crate, after, Pose2(), 0.0), after, ends[:3]))
 
 
 def test_at_a_wrong_place_beams_end_behind_walls() -> None:

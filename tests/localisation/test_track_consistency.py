@@ -12,8 +12,9 @@ import pytest
 from hsloc.localisation import track_consistency
 from hsloc.localisation.kalman_filter import predict_covariance
 from hsloc.localisation.motion_models import OdometryNoise
+from hsloc.localisation.odometry_errors import Errors, Way
 from hsloc.localisation.states import StateLog
-from hsloc.localisation.track_consistency import Errors, MappedGround, Track, Way, right_tracks
+from hsloc.localisation.track_consistency import MappedGround, Track, right_tracks
 from hsloc.localisation.track_evidence import PRIOR
 from hsloc.model import Estimate, Evidence, OccupancyGrid, Pose2, State, Status
 
@@ -120,9 +121,23 @@ def test_beams_behind_walls_and_places_that_fit_as_well_are_those_of_look_alikes
     weights = [replace(a_track(0, 9), said=each).look_alike() for each in (said(), said(0.3), said(0.3, 0.02))]
     assert weights[0] < 0.01 < 0.1 < weights[1] < weights[2]
     assert replace(a_track(0, 9), said=said(0.5, 0.5)).look_alike() == pytest.approx(3.0)
-    assert replace(a_track(0, 9), said=said()).on_another_map() == pytest.approx(weights[0])
-    rivalled = replace(a_track(0, 9), said=said(rival=1.0) * 2)
-    assert rivalled.on_another_map() == pytest.approx(9.0 * weights[0])
+    people = tuple(replace(each, lasting=0.0) for each in said(0.3))
+    assert replace(a_track(0, 9), said=people).look_alike() == pytest.approx(weights[0])
+
+
+def test_on_another_map_other_places_fit_and_tracks_end() -> None:
+    way, track = Way.of(along(), OdometryNoise()), a_track(0, 9, said=said())
+    lasted = exp(-9 * STEP / 20.0)
+    assert track.on_another_map(way, 0.0) == pytest.approx(lasted * track.look_alike())
+    for rival, ratio in ((1.0, 9.0), (0.85, 0.04), (0.92, 1.0)):
+        compared = replace(track, said=said(rival=rival) * 2)
+        assert compared.on_another_map(way, 0.0) == pytest.approx(ratio * track.on_another_map(way, 0.0))
+    assert track.on_another_map(way, 4.0) == pytest.approx(10.0 * track.on_another_map(way, 2.0))
+    gone_astray = replace(a_track(0, 29), leaves=9, exit=track.exit)
+    for over in (gone_astray, replace(track, lost=np.arange(10, 30))):
+        for known, metres in ((1.0, 20 * STEP), (0.3, 6 * STEP)):
+            pairs = track_consistency._Pairs.of([track, over], way, MappedGround(hall(known)))
+            np.testing.assert_allclose(pairs.went_on, (0.0, metres), atol=1e-9)
 
 
 def test_evidence_that_is_overwhelming_stays_a_number() -> None:
@@ -147,7 +162,10 @@ def test_all_subsets_are_summed() -> None:
     pairs = track_consistency._Pairs.of(tracks, way, ground)
     own = np.array([each.wrong(PRIOR) for each in tracks])
     look_alike = np.array([each.look_alike() if each.is_found else 0.0 for each in tracks])
-    total, right = exp(log(3e-2) + sum(log(each.on_another_map()) for each in tracks)), np.zeros(4)
+    total, right = (
+        exp(log(3e-2) + sum(log(k.on_another_map(way, m)) for k, m in zip(tracks, pairs.went_on, strict=True))),
+        np.zeros(4),
+    )
     for chosen in product((False, True), repeat=4):
         stops = [-1, *np.flatnonzero(chosen).tolist(), 4]
         weight = PRIOR[0] ** sum(chosen)

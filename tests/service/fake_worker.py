@@ -153,6 +153,10 @@ def attack(folder: Path, rest: list[str]) -> dict[str, str]:
             line.connect(address)
             line.send(b"x")
 
+    def connect_to_a_file() -> None:
+        with socket.socket(socket.AF_UNIX) as line:
+            line.connect(str(data.parent / "line"))
+
     def write_database() -> None:
         with sqlite3.connect(f"file:{data / 'hsloc.db'}?mode=rw", uri=True) as database:
             database.execute("INSERT INTO secret VALUES ('planted', 'x')")
@@ -160,6 +164,8 @@ def attack(folder: Path, rest: list[str]) -> dict[str, str]:
     attempt("read database", (data / "hsloc.db").read_bytes)
     attempt("write database", write_database)
     attempt("link database", lambda: os.link(data / "hsloc.db", folder / "output" / "stolen.db"))
+    attempt("change permissions", lambda: (data / "hsloc.db").chmod(0o600))
+    attempt("change times", lambda: os.utime(data / "hsloc.db"))
     attempt("list uploads", lambda: len(os.listdir(data / "uploads")) > 1 or os.listdir(data / "none"))
     attempt("write elsewhere", lambda: (data / "results" / "planted").write_text("x"))
     attempt("write input", lambda: next((folder / "input").iterdir()).write_bytes(b"changed"))
@@ -167,6 +173,7 @@ def attack(folder: Path, rest: list[str]) -> dict[str, str]:
     attempt("read password file", Path("/etc/passwd").read_bytes)
     attempt("environment of the server", lambda: b"PATH" in Path(f"/proc/{server}/environ").read_bytes() or 1 / 0)
     attempt("signal to the server", lambda: os.kill(int(server), 0))
+    attempt("socket of another program", connect_to_a_file)
     attempt("tcp", lambda: connect(socket.SOCK_STREAM, ("127.0.0.1", port)))
     with contextlib.suppress(OSError):  # in a network of its own it arrives nowhere
         connect(socket.SOCK_DGRAM, ("127.0.0.1", int(rest[2])))

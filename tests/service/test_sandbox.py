@@ -37,6 +37,14 @@ def need(kind: str) -> None:
         pytest.skip("LANDLOCK IS NOT TESTED: the kernel has none")
 
 
+def other_program(live: Live) -> socket.socket:
+    """A socket in a folder, as databases have them."""
+    found = socket.socket(socket.AF_UNIX)
+    found.bind(str(live.data.parent / "line"))
+    found.listen()
+    return found
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_hostile_job_reaches_nothing(make_live: Callable[..., Live], kind: str) -> None:
     need(kind)
@@ -45,6 +53,7 @@ def test_a_hostile_job_reaches_nothing(make_live: Callable[..., Live], kind: str
     listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     listener.bind(("127.0.0.1", 0))
     listener.setblocking(False)
+    other = other_program(live)
     with live.client() as client:
         for _ in range(3):
             upload(client, b"of somebody else")
@@ -53,7 +62,8 @@ def test_a_hostile_job_reaches_nothing(make_live: Callable[..., Live], kind: str
         assert ended["state"] == "succeeded", ended
         report = client.get(f"/v1/jobs/{job}/results/report.json").json()
         names = {asset["name"] for asset in client.get(f"/v1/jobs/{job}/results").json()["assets"]}
-    assert len(report) == 11
+    other.close()
+    assert len(report) == 14
     with pytest.raises(BlockingIOError):
         listener.recv(1)
     listener.close()
@@ -69,13 +79,16 @@ def test_without_a_sandbox_the_same_job_does_reach_things(make_live: Callable[..
     """That the attacks above are real; and the second name of the database is not published even so."""
     live = make_live(HSLOC_SANDBOX="none")
     assert live.process is not None
-    with live.client() as client:
+    with live.client() as client, other_program(live):
         upload(client, b"of somebody else")
         job = submit(client, f"attack {live.port} {live.process.pid} 9".encode())
         wait(client, job)
         report = client.get(f"/v1/jobs/{job}/results/report.json").json()
         names = {asset["name"] for asset in client.get(f"/v1/jobs/{job}/results").json()["assets"]}
-    for name in ("read database", "link database", "list uploads", "environment of the server", "tcp"):
+    for name in (
+        *("read database", "link database", "change permissions", "change times", "list uploads"),
+        *("environment of the server", "socket of another program", "tcp"),
+    ):
         assert report[name].startswith("done"), report
     assert "stolen.db" not in names
 

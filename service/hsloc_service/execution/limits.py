@@ -2,7 +2,8 @@
 
 Of memory, time and files by `setrlimit`; of what it can see by Landlock and seccomp (Linux), for machines without
 bubblewrap. After `restrict` the process, and all that it starts, can read and write only below the folders that it
-named, open no socket but local ones, and signal only its own children. It cannot be undone.
+named, open no socket but pairs of its own, change no permission, owner or time of a file, and signal only its own
+children. It cannot be undone.
 """
 
 from __future__ import annotations
@@ -34,10 +35,15 @@ DEVICES = ("/dev/null", "/dev/zero", "/dev/urandom", "/dev/random")
 MIN_LANDLOCK_ABI = 3
 """Linux 6.2: before, a file could be truncated without a right to."""
 PR_SET_NO_NEW_PRIVS, PR_SET_SECCOMP, SECCOMP_MODE_FILTER = 38, 22, 2
-_SOCKET = {"x86_64": (0xC000003E, 41), "aarch64": (0xC00000B7, 198)}
-"""Audit architecture and number of the system call `socket`."""
-AF_UNIX = 1
-IO_URING_SETUP = 425
+_REFUSED = {
+    "x86_64": (0xC000003E, (41, 90, 91, 92, 93, 94, 132, 188, 189, 190, 197, 198, 199, 235, 260, 261, 268, 280)),
+    "aarch64": (0xC00000B7, (198, 5, 6, 7, 14, 15, 16, 52, 53, 54, 55, 88)),
+}
+"""Audit architecture, and system calls that Landlock lets pass: `socket`, as it knows TCP alone, and a socket in a
+folder may be that of a database; of any file, changes of its permissions, owner, times and extended attributes."""
+_REFUSED_EVERYWHERE = (425, 452, 463, 466, 469)
+"""io_uring_setup, which would open sockets, too, fchmodat2, setxattrat, removexattrat and file_setattr, the same on
+every architecture."""
 
 
 def apply(limits: Mapping[str, Any], parent: int) -> None:
@@ -74,7 +80,9 @@ def _limit(which: int, soft: int, hard: int | None = None) -> None:
 
 
 def landlock_abi() -> int:
-    """Version of Landlock that the kernel has; 0 if it has none."""
+    """Version of Landlock that the kernel has; 0 if it has none, or if `_REFUSED` lacks the architecture."""
+    if platform.machine() not in _REFUSED:
+        return 0
     return max(int(_libc().syscall(CREATE_RULESET, None, 0, 1)), 0)
 
 
@@ -98,7 +106,7 @@ def restrict(readable: Iterable[str], writable: Iterable[str]) -> None:
         _allow(libc, ruleset, path, access & handled)
     _checked(libc.syscall(RESTRICT_SELF, ruleset, 0))
     os.close(ruleset)
-    _refuse_sockets(libc)
+    _refuse_calls(libc)
 
 
 def _allow(libc: ctypes.CDLL, ruleset: int, path: str, access: int) -> None:
@@ -114,12 +122,10 @@ def _allow(libc: ctypes.CDLL, ruleset: int, path: str, access: int) -> None:
         os.close(descriptor)
 
 
-def _refuse_sockets(libc: ctypes.CDLL) -> None:
-    """Let `socket` fail with EACCES for all families but AF_UNIX: Landlock knows TCP alone."""
-    known = _SOCKET.get(platform.machine())
-    if known is None:
-        return
-    architecture, number = known
+def _refuse_calls(libc: ctypes.CDLL) -> None:
+    """Let the system calls fail with EACCES that Landlock lets pass."""
+    architecture, own = _REFUSED[platform.machine()]
+    numbers = (*own, *_REFUSED_EVERYWHERE)
     load, equal, at_least, result = 0x20, 0x15, 0x35, 0x06
     allow, refuse = 0x7FFF0000, 0x00050000 | errno.EACCES
     program = [
@@ -127,11 +133,8 @@ def _refuse_sockets(libc: ctypes.CDLL) -> None:
         (equal, 1, 0, architecture),
         (result, 0, 0, refuse),  # of a foreign one, whose numbers differ
         (load, 0, 0, 0),  # the number of the call
-        (at_least, 5, 0, 0x40000000),  # the same calls once more, of x32
-        (equal, 4, 0, IO_URING_SETUP),  # would open sockets, too
-        (equal, 0, 2, number),
-        (load, 0, 0, 16),  # its first argument
-        (equal, 0, 1, AF_UNIX),
+        (at_least, len(numbers) + 1, 0, 0x40000000),  # the same calls once more, of x32
+        *((equal, len(numbers) - index, 0, number) for index, number in enumerate(numbers)),
         (result, 0, 0, allow),
         (result, 0, 0, refuse),
     ]

@@ -36,7 +36,7 @@ TOKEN = "a-token-of-the-operator-0123456789"
 FEW = {
     "Config": ("matcher", "hide"),
     "RunRequest": ("mode", "seed"),
-    "RerunRequest": ("mode", "seed", "config"),
+    "RerunRequest": ("mode", "seed", "config", "read", "map"),
     "SweepOptions": ("matcher", "priority"),
 }
 """Of the parameters, which one table checks, some will do; a rerun takes what `/v1/jobs` does, which is all tried."""

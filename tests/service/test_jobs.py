@@ -76,6 +76,18 @@ def test_run_again_keeps_the_seed_and_takes_changes(client: TestClient) -> None:
     changed = client.post(f"/v1/jobs/{job}/rerun", json={"seed": 6, "matcher": "icp"}).json()
     assert (changed["request"]["seed"], changed["request"]["matcher"]) == (6, "icp")
     assert wait(client, changed["id"])["state"] == "succeeded"
+    chart = {"yaml": upload(client), "image": upload(client)}
+    more = {"map": chart, "read": {"start_s": 1.0, "end_s": 9.0}, "webhook": "https://example.com/a", "tag": "big"}
+    second = client.post(f"/v1/jobs/{job}/rerun", json=more).json()["request"]
+    assert {key: second[key] for key in ("map", "webhook", "tag")} == {
+        key: more[key] for key in ("map", "webhook", "tag")
+    }
+    kept = client.post(f"/v1/jobs/{changed['id']}/rerun", json={"read": {"end_s": 9.0}}).json()
+    third = client.post(f"/v1/jobs/{kept['id']}/rerun", json={"read": {"start_s": 2.0}, "priority": 3}).json()
+    assert (third["request"]["read"]["start_s"], third["request"]["read"]["end_s"]) == (2.0, 9.0)
+    assert (third["request"]["priority"], third["request"]["matcher"]) == (3, "icp")
+    other = {"map": {"yaml": str(uuid.uuid4()), "image": chart["image"]}}
+    assert client.post(f"/v1/jobs/{job}/rerun", json=other).status_code == 404
 
 
 def test_the_queue_has_an_end(make_client: Callable[..., TestClient]) -> None:

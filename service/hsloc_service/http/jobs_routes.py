@@ -145,6 +145,8 @@ def rerun(
         if option.default is not None and changed.get(option.name, ...) is None:
             del changed[option.name]
     old = ctx.jobs.get(who, job_id)
+    if changed.get("read") is not None:
+        changed["read"] = {**(old.request.get("read") or {}), **changed["read"]}
     job = ctx.jobs.rerun(who, job_id, plain(checked(JobRequest, {**old.request, **changed}).model_dump()))
     ctx.dispatcher.enqueue(job.id)
     response.headers["Location"] = f"/v1/jobs/{job.id}"

@@ -124,8 +124,8 @@ _Run = Model(
 )
 
 
-class RunRequest(_Run):  # type: ignore[misc, valid-type]
-    """How to run: the options of `hsloc replay`."""
+class _Common(Strict):
+    """What is no option of `hsloc replay`, of a job and of one that is run again."""
 
     read: ReadRequest | None = None  # type: ignore[valid-type]
     webhook: Annotated[str, Field(max_length=2000, pattern=r"^https?://[^\s]+$")] | None = Field(
@@ -139,6 +139,10 @@ class RunRequest(_Run):  # type: ignore[misc, valid-type]
     priority: Annotated[int, Field(ge=-100, le=100), BeforeValidator(whole)] | None = Field(
         default=None, description="of your waiting jobs those with a higher one are begun first; 0 by default"
     )
+
+
+class RunRequest(_Run, _Common):  # type: ignore[misc, valid-type]
+    """How to run: the options of `hsloc replay`."""
 
 
 _Job = Model("JobOptions", __base__=RunRequest, **_fields(option for option in _HTTP if option.is_upload))
@@ -194,17 +198,15 @@ class JobRequest(_Job):  # type: ignore[misc, valid-type]
         return self
 
 
-_CHANGES = ("resume", "reference")
-"""What a job that is run again keeps."""
 _Rerun = Model(
-    "RerunOptions",
-    __base__=Strict,
-    **_fields((each for each in _HTTP if each.place != "read" and each.name not in _CHANGES), optional=True),
+    "RerunOptions", __base__=Strict, **_fields((each for each in _HTTP if each.place != "read"), optional=True)
 )
 
 
-class RerunRequest(_Rerun):  # type: ignore[misc, valid-type]
-    """What to change in a job that is run again; the rest, and the seed, stay."""
+class RerunRequest(_Rerun, _Common):  # type: ignore[misc, valid-type]
+    """What to change in a job that is run again; its logs, and all that is left out, stay, in `read` as well."""
+
+    map: MapFiles | None = Field(default=None, description="map; null for the one in the log")
 
 
 Verdict = Literal["good", "check", "failed"]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 from live_service import free_port
@@ -82,9 +82,17 @@ def test_refusals_are_reported_at_once(make_live: Callable[..., Live], log: Path
         Client(live.url).upload(log.parent / "not there")
 
 
-def submit(live: Live, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "hsloc.cli.main", "submit", "--url", live.url, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+class Done(NamedTuple):
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def submit(live: Live, *arguments: str) -> Done:
+    """`hsloc submit`."""
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
+        code = main(["submit", "--url", live.url, *arguments])
+    return Done(code, out.getvalue(), err.getvalue())
 
 
 def test_the_command(make_live: Callable[..., Live], log: Path, tmp_path: Path) -> None:

@@ -301,6 +301,9 @@ def _remedy_of_none(kind: str, channels: Sequence[Channel], options: ReadOptions
     poses = [t for t in of_type(channels, *POSE_TYPES[1:]) if t.rpartition("/")[2] not in _NO_ODOMETRY]
     if poses:
         remedy += f"; or it is the poses of --odom-topic {poses[0]}"
+    velocities = of_type(channels, definitions.TWIST, definitions.TWIST_STAMPED)
+    if velocities:
+        remedy += f"; or velocities, if they are measured and not commanded: --odom-topic {velocities[0]}"
     for other in ODOMETRY_KINDS:
         if other.missing(options) and (topics := of_type(channels, other.typename)):
             remedy += f"; or it is made of {topics[0]} with {other.missing(options)}"

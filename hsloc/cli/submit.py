@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
+from zipfile import ZipFile
 
 from hsloc.cli.arguments import add_no_progress, add_options, add_service, service_client, values
 from hsloc.cli.output import print_job
 from hsloc.cli.progress import ProgressLine
+from hsloc.errors import LogError
 from hsloc.options import BY_NAME, MATCHER_ALIASES, merged
 
 if TYPE_CHECKING:
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
 HELP = "send a log to a running service"
 EXAMPLES = """
   hsloc submit run.mcap --wait
+  hsloc submit rosbag2_folder --wait
   hsloc submit run.mcap --map floor.yaml --initial-pose -1,2,0 --out results/run
   hsloc submit second.mcap --resume 3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f --mode slam
 
@@ -28,7 +32,9 @@ The token, if the service asks for one, is read from $HSLOC_TOKEN.
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Where to, what, and whether to wait."""
-    parser.add_argument("log", nargs="+", type=Path, help="Logs, each one file; several are one run.")
+    parser.add_argument(
+        "log", nargs="+", type=Path, help="Logs: files, or folders, which are packed; several are one run."
+    )
     add_service(parser)
     parser.add_argument("--wait", action="store_true", help="Wait until the job has ended; 1 unless it succeeded.")
     parser.add_argument("--out", type=Path, metavar="DIR", help="Wait, and fetch the results into this folder.")
@@ -56,7 +62,9 @@ def run(arguments: argparse.Namespace) -> int:
             request["priority"] = arguments.priority
         if arguments.tag is not None:
             request["tag"] = arguments.tag
-        job = client.submit([client.upload(path, uploaded) for path in arguments.log], **request)
+        with TemporaryDirectory(prefix="hsloc-") as folder:
+            logs = [client.upload(packed(path, Path(folder)), uploaded) for path in arguments.log]
+        job = client.submit(logs, **request)
         if arguments.wait or arguments.out is not None:
             job = client.wait(job["id"], lambda now: _show(line, now))
             if job["state"] == "succeeded" and arguments.out is not None:
@@ -73,6 +81,30 @@ def run(arguments: argparse.Namespace) -> int:
     if job["summary"].get("limits"):
         return EXIT_BELOW_LIMIT
     return EXIT_DATA_LOST if job["summary"]["data_lost"] else EXIT_OK
+
+
+def packed(path: Path, folder: Path) -> Path:
+    """A file as it is; a log of several files, a folder or a database with its write-ahead log, as a zip in `folder`.
+
+    Raises LogError where that cannot be written.
+    """
+    base = path if path.is_dir() else path.parent
+    if path.is_dir():
+        members = sorted(each for each in path.rglob("*") if each.is_file())
+    else:
+        beside = (path.with_name(path.name + ending) for ending in ("-wal", "-journal"))
+        members = [path, *(each for each in beside if each.is_file() and each.stat().st_size)]
+        if len(members) == 1:
+            return path
+    target = folder / f"{path.resolve().name}.zip"
+    try:
+        with ZipFile(target, "w", strict_timestamps=False) as archive:  # stored: bags hardly shrink
+            for member in members:
+                archive.write(member, member.relative_to(base))
+    except OSError as error:
+        remedy = "set TMPDIR to a folder with space"
+        raise LogError(f"{path}: cannot be packed for the upload ({error.strerror or error}); {remedy}") from error
+    return target
 
 
 def request_of(given: Mapping[str, Any], upload: Callable[[Path], str]) -> dict[str, Any]:

@@ -6,12 +6,14 @@ import json
 import subprocess
 import sys
 from typing import TYPE_CHECKING
+from zipfile import ZipFile
 
 import pytest
 from paths import RECORDINGS
 
 from hsloc.cli.main import COMMANDS, build_parser, main
-from hsloc.cli.submit import request_of
+from hsloc.cli.submit import packed, request_of
+from hsloc.errors import LogError
 from hsloc.options import BY_NAME, OPTIONS, offered
 
 if TYPE_CHECKING:
@@ -67,6 +69,23 @@ def test_submit_sends_the_options(tmp_path: Path) -> None:
     }
     given = {"start_s": 2.0, "reference": "/vicon"}
     assert request_of(given, str) == {"read": {"start_s": 2.0, "truth_topic": "/vicon"}}
+
+
+def test_submit_packs_logs_of_several_files(tmp_path: Path) -> None:
+    recording, target = tmp_path / "recording", tmp_path / "archives"
+    recording.mkdir()
+    target.mkdir()
+    for name in ("run_0.db3", "run_0.db3-wal", "metadata.yaml"):
+        (recording / name).write_bytes(name.encode())
+    assert packed(recording / "metadata.yaml", target) == recording / "metadata.yaml"
+    for log, names in (
+        (recording, ["metadata.yaml", "run_0.db3", "run_0.db3-wal"]),
+        (recording / "run_0.db3", ["run_0.db3", "run_0.db3-wal"]),
+    ):
+        with ZipFile(packed(log, target)) as archive:
+            assert archive.namelist() == names
+    with pytest.raises(LogError, match=r"cannot be packed .*TMPDIR"):
+        packed(recording, tmp_path / "missing")
 
 
 def test_submit_has_no_bar_with_no_progress() -> None:

@@ -17,10 +17,10 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
-from log_builders import START, describe, scan_payloads, write_raw, write_run
+from log_builders import describe, scan_payloads, write_raw, write_run
 
 from hsloc.errors import LogError, LogFormatError, TopicError
-from hsloc.log import ReadOptions, check_log, open_log
+from hsloc.log import ReadOptions, open_log
 from hsloc.log.messages import definitions
 
 if TYPE_CHECKING:
@@ -251,52 +251,7 @@ def test_a_transaction_that_was_cut_off_is_rolled_back(tmp_path: Path, db3: Path
     assert "rolled back by the journal" in log.losses.reasons[0]
 
 
-# Times and encodings.
-
-
-@pytest.mark.parametrize("wrong", [2**64 - 5, 2**63 + 7, 0, START + 10**9 * SECOND])
-def test_a_few_impossible_log_times_leave_the_order_alone(tmp_path: Path, plain: Path, wrong: int) -> None:
-    items = list(log_formats.messages(plain))
-    for number in (30, 71, 110):
-        schema, channel, _, data = items[number]
-        items[number] = (schema, channel, wrong, data)
-    log = open_log(log_formats.write(tmp_path / "times.mcap", items))
-    assert [describe(event) for event in log.events()] == events_of(plain)
-    everything = log.verify().log_times_repaired
-    assert everything == 3 >= log.losses.log_times_repaired > 0
-    assert log.losses.stamps_backwards == {}
-    assert log.summary.duration_s == pytest.approx(open_log(plain).summary.duration_s, abs=0.2)
-
-
-@pytest.mark.parametrize("shift_s", [-2, 2, 100])
-def test_log_times_that_those_around_them_contradict_leave_the_order_alone(
-    tmp_path: Path, plain: Path, db3: Path, expected: list[Any], shift_s: int
-) -> None:
-    items = list(log_formats.messages(plain))
-    for number in (30, 71, 100):
-        schema, channel, log_time, data = items[number]
-        items[number] = (schema, channel, log_time + shift_s * SECOND, data)
-    shutil.copy(db3, tmp_path / "times.db3")
-    with sqlite3.connect(tmp_path / "times.db3") as bag:
-        bag.execute("UPDATE messages SET timestamp = timestamp + ? WHERE id IN (31, 72, 101)", (shift_s * SECOND,))
-    for path in (log_formats.write(tmp_path / "times.mcap", items), tmp_path / "times.db3"):
-        report = check_log(open_log(path))
-        assert [(found.code, found.count) for found in report.findings] == [("log_time", 3)]
-        log = open_log(path)
-        assert [describe(event) for event in log.events()] == expected
-        assert log.losses.stamps_backwards == {}
-
-
-def test_log_times_of_a_database_that_overflowed_leave_the_order_alone(
-    tmp_path: Path, db3: Path, expected: list[Any]
-) -> None:
-    path = tmp_path / "times.db3"
-    shutil.copy(db3, path)
-    with sqlite3.connect(path) as bag:
-        bag.execute("UPDATE messages SET timestamp = -17 WHERE id IN (40, 80)")
-    log = open_log(path)
-    assert [describe(event) for event in log.events()] == expected
-    assert log.losses.log_times_repaired == 2
+# Encodings.
 
 
 @pytest.mark.parametrize(

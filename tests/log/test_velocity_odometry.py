@@ -132,7 +132,7 @@ def test_measured_velocities_are_used_where_there_is_no_odometry_and_named(tmp_p
     log = write_log(tmp_path / "run.mcap", "/wheel_twist", definitions.TWIST_STAMPED)
     assert_circle(log, ReadOptions())
     assert "odometry_from_velocities" in [warning.code for warning in open_log(log).summary.warnings]
-    with pytest.raises(TopicError, match="--no-odom; or velocities, .* not commanded: --odom-topic /cmd_vel"):
+    with pytest.raises(TopicError, match=r"--no-odom; or velocities, .* not commanded: --odom-topic /cmd_vel"):
         open_log(write_log(tmp_path / "cmd.mcap", "/cmd_vel", definitions.TWIST_STAMPED))
 
 

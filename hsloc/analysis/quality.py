@@ -120,7 +120,7 @@ def _scale_warnings(result: Result) -> list[RunWarning]:
         RunWarning(
             WarningCode.MAP_SCALE,
             f"the map is {100 * abs(scale.value - 1.0):.1f} % {size} than the lidar measures: scale {scale.value:.4f} "
-            f"+- {scale.sigma:.4f}, so poses are off by {abs(scale.value - 1.0):.3f} m per metre from the map's corner",
+            f"± {scale.sigma:.4f}, so poses are off by {abs(scale.value - 1.0):.3f} m per metre from the map's corner",
             f"if the ranges are right, set resolution: {cell / scale.value:.5g} in the map's YAML (it is {cell:g})",
         )
     ]
@@ -134,7 +134,7 @@ def _mirror_warnings(result: Result) -> list[RunWarning]:
             WarningCode.MAP_MIRRORED,
             f"the scans fit the map better when they are mirrored, at every place; with a probability of "
             f"{100.0 * result.states.mirrored:.0f} % the image of the map or the laser is mirrored",
-            "flip the map's image; or, if the laser hangs upside down, state it (--laser-pose, /tf_static)",
+            "flip the map's image; or, if the laser is mounted upside down, state it (--laser-pose, /tf_static)",
         )
     ]
 
@@ -146,12 +146,12 @@ def _mounting_warnings(result: Result) -> list[RunWarning]:
     (laser,) = result.summary.lasers
     error, (x, y, yaw) = found.error, found.sigma
     right = error @ laser.T_base_laser
-    place = f"{hypot(error.x, error.y):.3f} +- {hypot(x, y):.3f} m and " if isfinite(x) else ""
+    place = f"{hypot(error.x, error.y):.3f} ± {hypot(x, y):.3f} m and " if isfinite(x) else ""
     return [
         RunWarning(
             WarningCode.EXTRINSICS_WRONG,
             f"scans and odometry agree if the laser is {place}"
-            f"{degrees(error.theta):.1f} +- {degrees(yaw):.1f} deg from where it is stated, and so are the poses",
+            f"{degrees(error.theta):.1f} ± {degrees(yaw):.1f} deg from where it is stated, and so are the poses",
             f"measure it, or hsloc calibrate; --laser-pose {right.x:.3f},{right.y:.3f},{right.theta:.4f}",
         )
     ]

@@ -218,7 +218,7 @@ def _matches(bench: Bench) -> list[str]:
     return [
         "## One match",
         "",
-        f"Window +-(0.3 m, 0.3 m, 10 deg), {bench.matches[0].timing.repeats} seeds.",
+        f"Window ±(0.3 m, 0.3 m, 10 deg), {bench.matches[0].timing.repeats} seeds.",
         "",
         *table(head, rows),
     ]
@@ -311,8 +311,8 @@ def _cases(bench: Bench) -> list[str]:
         "",
         (
             f"{bench.cases[0].cases} cases a level, each matched once; ms: median / 95th percentile. Success: within "
-            f"{SUCCESS[0]:.2f} m and {SUCCESS[1]:g} deg. The window of a level (track +-0.1 m, 5 deg; small +-0.5 m, "
-            "20 deg; large +-2 m, 45 deg) is given to all but small_gicp, which starts from its centre; the "
+            f"{SUCCESS[0]:.2f} m and {SUCCESS[1]:g} deg. The window of a level (track ±0.1 m, 5 deg; small ±0.5 m, "
+            "20 deg; large ±2 m, 45 deg) is given to all but small_gicp, which starts from its centre; the "
             "preparation of the map is not counted."
         ),
         "",

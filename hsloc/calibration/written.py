@@ -67,7 +67,7 @@ def as_yaml(found: LogCalibration) -> str:
     def add(k: int, indent: str, keep: bool) -> None:
         line = f"{NAMES[k]}: {values[k]:.6f}"
         if estimate.determined[k]:
-            lines.append(f"{indent}{line}  # +- {half[k]:.6f} {UNITS[k]}".rstrip())
+            lines.append(f"{indent}{line}  # ± {half[k]:.6f} {UNITS[k]}".rstrip())
         else:
             lines.append(f"{indent}{'' if keep else '# '}{line}  # not determined: {estimate.reasons[NAMES[k]]}")
 
@@ -121,19 +121,19 @@ def as_lines(found: LogCalibration) -> list[str]:
         f"{found.topic} against {odom}: {estimate.driven_m:.1f} m, {degrees(estimate.turned_rad):.0f} deg of rotation",
         f"{estimate.steps} steps were compared, {estimate.outliers} of them outliers",
         f"left over of a step, median: {1000.0 * estimate.residual_m:.1f} mm, {degrees(estimate.residual_rad):.3f} deg",
-        f"{'':<16}{'value':>12}{'95 %':>14}",
+        f"{'':<16}{'value':>12}{'95 %':>13}",
     ]
     logged = (None, None, None, found.nominal.x, found.nominal.y, found.nominal.theta, None)
     for k, name in enumerate(NAMES):
         if not estimate.determined[k]:
             continue
         beside = "" if logged[k] is None else f"  (the log: {logged[k]:.4f})"
-        lines.append(f"{name:<16}{values[k]:>12.5f}  +- {half[k]:<9.5f} {UNITS[k]}{beside}".rstrip())
+        lines.append(f"{name:<16}{values[k]:>12.5f}  ± {half[k]:<9.5f} {UNITS[k]}{beside}".rstrip())
         if name == "turn_per_metre" and estimate.determined[:2].all():
             track, sigma = estimate.track
-            lines.append(f"{'track':<16}{track:>12.5f}  +- {estimate.quantile * sigma:<9.5f} of the assumed track")
+            lines.append(f"{'track':<16}{track:>12.5f}  ± {estimate.quantile * sigma:<9.5f} of the assumed track")
     for name, (value, sigma) in _wheels(found).items():
-        lines.append(f"{name:<16}{value:>12.5f}  +- {estimate.quantile * sigma:<9.5f} m")
+        lines.append(f"{name:<16}{value:>12.5f}  ± {estimate.quantile * sigma:<9.5f} m")
     reasons: dict[str, list[str]] = {}
     for name, reason in estimate.reasons.items():
         reasons.setdefault(reason, []).append(name)

@@ -100,7 +100,7 @@ def _e1(rows: Sequence[ScanMatch], title: str) -> list[str]:
         "",
         (
             f"{len(rows[0].poses)} seeds; success: within {100 * metres:g} cm and {degrees:g} deg (ours: [P] prints no "
-            "number). Box +-(0.5 m, 0.5 m, 15 deg), the truth 0.40 m and 12 deg off its centre."
+            "number). Box ±(0.5 m, 0.5 m, 15 deg), the truth 0.40 m and 12 deg off its centre."
         ),
         "",
     ]
@@ -265,7 +265,7 @@ def _m1(rows: Sequence[Windows]) -> list[str]:
         "",
         (
             f"{len(rows[0].tally.ms)} scans of the built-in office with 1 cm of range noise, on its map of 5 cm cells, "
-            f"window +-(x, x, 10 deg). Success: within {100 * metres:g} cm (a cell) and {degrees:g} deg of the truth "
+            f"window ±(x, x, 10 deg). Success: within {100 * metres:g} cm (a cell) and {degrees:g} deg of the truth "
             "(ours: [M] does not say in the table what it counts). The means are over all windows, failures too."
         ),
         "",

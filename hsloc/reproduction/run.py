@@ -152,7 +152,7 @@ def _window_verdicts(windows: Sequence[Windows]) -> list[Verdict]:
             continue
         error, angle = float(row.tally.metres.mean()), float(abs(row.tally.degrees).mean())
         text = (
-            f"M1 (+-{100 * row.uncertainty:.0f} cm): HIDE's success >= {published.M1_WANTED} and mean error <= "
+            f"M1 (±{100 * row.uncertainty:.0f} cm): HIDE's success >= {published.M1_WANTED} and mean error <= "
             f"{100 * metres:.2f} cm, {degrees} deg: {row.success:.3f}, {100 * error:.2f} cm, {angle:.3f} deg"
         )
         verdicts.append(Verdict(text, row.success >= published.M1_WANTED and error <= metres and angle <= degrees))

@@ -334,7 +334,7 @@ def offsets_of_log(paths: Sequence[Path], options: ReadOptions, parameters: Fron
 def in_words(offset: Offset) -> str:
     """An offset with its uncertainty, to be followed by what it is counted from."""
     word = "later than" if offset.seconds > 0.0 else "earlier than"
-    return f"{abs(offset.seconds):.3f} +- {offset.sigma:.3f} s {word}"
+    return f"{abs(offset.seconds):.3f} ± {offset.sigma:.3f} s {word}"
 
 
 def clock_warnings(

@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print_lines(table(("", *(run.name for run in runs)), comparison_rows(runs)))
         if (seeds := over_seeds(runs)) is not None:
-            print_lines(("", "over seeds: mean ± standard deviation [95 % interval of the mean, by bootstrap]"))
+            print_lines(("over seeds: mean ± standard deviation [95 % interval of the mean, by bootstrap]", ""))
             print_lines(table(("", *seeds["names"]), seeds["rows"]))
     if out is not None:
         write_comparison(out, runs)

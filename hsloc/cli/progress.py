@@ -5,6 +5,10 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 _EVERY = 0.1
 _TICK = 0.5
@@ -21,7 +25,8 @@ class ProgressLine:
         self._length = 0
         self._lock = threading.Lock()
         self._ended = threading.Event()
-        self._clock: tuple[float, str] | None = None
+        self._moving: Callable[[float], tuple[float, str]] | None = None
+        """Share and note after so many seconds of the phase."""
 
     def __enter__(self) -> ProgressLine:
         if self._on:
@@ -39,7 +44,7 @@ class ProgressLine:
 
     def show(self, phase: str, share: float, note: str = "") -> None:
         """A bar at `share` of 1, at most ten times a second."""
-        self._clock = None
+        self._moving = None
         now = self._enter(phase)
         if self._on and now >= self._next:
             self._next = now + _EVERY
@@ -48,7 +53,12 @@ class ProgressLine:
     def show_clock(self, phase: str, expected_s: float, note: str = "") -> None:
         """A bar that moves by itself, over about `expected_s` seconds: for work that reports nothing."""
         self._enter(phase)
-        self._clock = expected_s, note
+        self._moving = lambda elapsed: (min(elapsed / expected_s, 0.99), f"{elapsed:.0f} s, {note}")
+
+    def show_count(self, phase: str, done: int, total: int, note: str) -> None:
+        """A bar at `done` of `total`, with the seconds of the phase, which go on between the calls."""
+        self._enter(phase)
+        self._moving = lambda elapsed: (done / max(total, 1), f"{done} of {total} {note}, {elapsed:.0f} s")
 
     def _enter(self, phase: str) -> float:
         now = time.monotonic()
@@ -58,10 +68,9 @@ class ProgressLine:
 
     def _tick(self) -> None:
         while not self._ended.wait(_TICK):
-            clock = self._clock
-            if clock is not None:
-                expected_s, note = clock
-                self._draw(min(self.elapsed / expected_s, 0.99), f"{self.elapsed:.0f} s, {note}")
+            moving = self._moving
+            if moving is not None:
+                self._draw(*moving(self.elapsed))
 
     def _draw(self, share: float, note: str) -> None:
         width = 28

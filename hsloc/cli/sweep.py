@@ -83,8 +83,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Sweep; 1 where a run failed, else 4 where one does not keep a limit, else 3 where part of an input was lost."""
     from hsloc.cli.main import EXIT_USAGE
+    from hsloc.cli.output import print_lines
     from hsloc.errors import OutputError
-    from hsloc.report.sweep_page import sweep_page
+    from hsloc.report.sweep_page import sweep_lines, sweep_page
     from hsloc.sweep.parallel import merge, write_shard
     from hsloc.sweep.table import as_csv, as_json, as_markdown, as_parquet, as_text, rows
 
@@ -112,14 +113,18 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             (folder / "sweep.csv").write_text(as_csv(table), encoding="utf-8")
             (folder / "sweep.json").write_text(as_json(table), encoding="utf-8")
-            (folder / "sweep.md").write_text(as_markdown(table), encoding="utf-8")
+            summary = sweep_lines(table)
+            (folder / "sweep.md").write_text("\n".join([as_markdown(table).rstrip(), *summary, ""]), encoding="utf-8")
             (folder / "sweep.html").write_text(sweep_page(table), encoding="utf-8")
             if (content := as_parquet(table)) is not None:
                 (folder / "sweep.parquet").write_bytes(content)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
     form = as_json if arguments.json else as_csv if arguments.csv else as_text
-    sys.stdout.write(form(table))
+    if form is not as_text:
+        sys.stdout.write(form(table))
+    else:
+        print_lines([*as_text(table).splitlines(), *(() if arguments.shard is not None else summary)])
     return _exit_code(table, arguments.quiet)
 
 
@@ -148,8 +153,9 @@ def _sweep(arguments: argparse.Namespace, runs: list[SweepRun]) -> list[Outcome]
         def tell(outcome: Outcome) -> None:
             nonlocal done
             done += 1
-            line.show("sweep", done / len(runs), f"{done} of {len(runs)} runs: {outcome.run.name} {outcome.state}")
+            line.show_count("sweep", done, len(runs), f"runs, last {outcome.run.name}: {outcome.state}")
 
+        line.show_count("sweep", 0, len(runs), "runs")
         if arguments.executor is not None:
             return sweep_on_dask(runs, arguments.out, arguments.executor, tell)
         return sweep_in_processes(runs, arguments.out, max(min(arguments.jobs, len(runs)), 1), tell)
@@ -189,7 +195,7 @@ def _sweep_by_service(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
         def show(now: dict[str, Any]) -> None:
             ended = sum(count for state, count in now["states"].items() if state not in ("queued", "running"))
-            line.show("sweep", ended / now["jobs"], f"{ended} of {now['jobs']} jobs of sweep {now['id']}")
+            line.show_count("sweep", ended, now["jobs"], f"jobs of sweep {now['id']}")
 
         table = client.wait_sweep(sweep["id"], show)
     return [{**row, "state": DONE if row["state"] == "succeeded" else FAILED} for row in table]

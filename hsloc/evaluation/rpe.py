@@ -54,7 +54,8 @@ class Delta:
             raise EvaluationError(f"delta is {self.value:g} frames; it must be whole")
 
     def __str__(self) -> str:
-        return f"{self.value:g} {self.unit}"
+        unit = "frame" if self.unit == "frames" and self.value == 1.0 else self.unit
+        return f"{self.value:g} {unit}"
 
 
 def rpe(pairs: Pairs, delta: Delta) -> PoseErrors:

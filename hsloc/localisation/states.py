@@ -337,7 +337,7 @@ def _named_places(ambiguities: Sequence[Ambiguity]) -> str:
         return ""
     longest = max(ambiguities, key=lambda each: each.end_ns - each.begin_ns)
     places = [f"x {pose.x:.1f} m, y {pose.y:.1f} m ({100.0 * p:.0f} %)" for pose, p in longest.places[:_NAMED]]
-    return f", as {' or '.join(places)} {'' if len(longest.places) <= _NAMED else 'or others '}(hypotheses.csv)"
+    return f", at {' or '.join(places)} {'' if len(longest.places) <= _NAMED else 'or others '}(hypotheses.csv)"
 
 
 def _named_rival(rows: Sequence[TrackRow]) -> str:

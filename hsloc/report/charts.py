@@ -62,7 +62,7 @@ def run_charts(data: ReportData) -> list[Chart]:
     if data.errors is not None:
         in_cm = _scaled(data.errors.translation_m, 100.0)
         charts.append(Chart("error_cm", "Translation error", "cm", in_cm, _ERROR))
-        charts.append(Chart("error_deg", "Rotation error", "deg", data.errors.rotation_deg, _ERROR))
+        charts.append(Chart("error_deg", "Rotation error", "°", data.errors.rotation_deg, _ERROR))
     if data.far is not None:
         charts.append(Chart("far_cm", "Scan to map, 90 % of points", "cm", _scaled(data.far, 100.0), _FAR))
     scans = data.scans
@@ -71,7 +71,7 @@ def run_charts(data: ReportData) -> list[Chart]:
         sigma = Curve(scans.seconds, scans.sigma_m * 100.0)
         charts.append(Chart("sigma_cm", "Standard deviation of the position", "cm", sigma, about))
         sigma = Curve(scans.seconds, scans.sigma_deg)
-        charts.append(Chart("sigma_deg", "Standard deviation of the heading", "deg", sigma, about))
+        charts.append(Chart("sigma_deg", "Standard deviation of the heading", "°", sigma, about))
     if scans is not None and not data.is_built:
         refused = scans.where(Status.REJECTED) & np.isfinite(scans.fitness)
         fitness = Curve(scans.seconds, np.where(refused, np.nan, scans.fitness))

@@ -18,8 +18,8 @@ from hsloc.atomic_write import write_text_atomically
 from hsloc.errors import EvaluationError
 from hsloc.evaluation.metrics import format_json
 from hsloc.report.data import prepare, reason_counts
-from hsloc.report.seeds import seed_groups, seed_rows
-from hsloc.report.summary import ResultSummary
+from hsloc.report.seeds import figure_names, is_number, seed_groups, seed_rows
+from hsloc.report.summary import VERDICT_WORDS, ResultSummary
 from hsloc.report.table import DASH, STATUS_WORDS, error_statistics
 from hsloc.report.view import data_url, view_of
 
@@ -102,7 +102,7 @@ def _head(summary: ResultSummary) -> str:
     return (
         f'<p class="headline"><strong class="verdict {summary.verdict}">{summary.verdict}</strong> '
         f"<span>{escape(summary.headline)}</span></p>"
-        f'<p class="muted">{escape(summary.verdict_text)}</p><ul class="facts">{_items(summary.facts)}</ul>'
+        f'<p class="muted">{escape(VERDICT_WORDS[summary.verdict])}</p><ul class="facts">{_items(summary.facts)}</ul>'
         f'<dl class="key-figures">{key_figures}</dl><section class="warnings">{reasons}{warnings}</section>'
     )
 
@@ -272,7 +272,7 @@ def comparison_rows(runs: Sequence[ComparedRun]) -> list[tuple[str, ...]]:
     """A line for the verdict and for each figure of any run: its name, then each run's values and change."""
     verdicts = tuple(str((run.view["summary"] or {}).get("verdict", "")) for run in runs)
     rows = [("verdict", *verdicts)]
-    for name in dict.fromkeys(name for run in runs for name in run.figures):
+    for name in figure_names([run.figures for run in runs]):
         first = runs[0].figures.get(name)
         cells = [_figure_cell(run.figures.get(name), first if k else None) for k, run in enumerate(runs)]
         rows.append((name, *cells))
@@ -283,17 +283,36 @@ def _figure_cell(figure: dict[str, Any] | None, first: dict[str, Any] | None) ->
     if figure is None:
         return "–"
     text = " / ".join(figure["values"])
-    return text if first is None else text + change(first.get("numbers", ()), figure.get("numbers", ()))
+    changed = "" if first is None else change(first, figure)
+    return f"{text} ({changed})" if changed else text
 
 
-def change(first: Sequence[float | None], numbers: Sequence[float | None]) -> str:
-    """The change of the first number in per cent, in brackets; empty where there is hardly one, or from zero."""
-    if not first or not numbers or first[0] is None or numbers[0] is None or first[0] in (0.0, numbers[0]):
+def change(first: Mapping[str, Any], figure: Mapping[str, Any]) -> str:
+    """How a figure differs from that of the first run, for each of its values; empty where none does by 0.05 %.
+
+    Shares differ by percentage points (pp), other numbers in per cent, from the tenfold on by a factor. Values that are
+    not one number, such as counts of several kinds, have no change. compare.js does the same.
+    """
+    numbers, values = figure.get("numbers", ()), figure["values"]
+    if len(numbers) != len(values) or len(first.get("numbers", ())) != len(values):
         return ""
-    percent = 100.0 * (numbers[0] - first[0]) / abs(first[0])
-    if abs(percent) < 0.05:
+    parts = [_change(*each) for each in zip(first["numbers"], numbers, values, strict=True)]
+    return " / ".join(part or "0 %" for part in parts) if any(parts) else ""
+
+
+def _change(first: float | None, number: float | None, text: str) -> str:
+    if first is None or number is None or first == number or not is_number(text):
         return ""
-    return f" ({percent:+.1f} %)" if abs(percent) < 10.0 else f" ({percent:+.0f} %)"
+    if "%" in text:
+        points = 100.0 * (number - first)
+        return "" if abs(points) < 0.05 else f"{points:+.1f} pp"
+    if first == 0.0:
+        return ""
+    factor = number / first
+    if factor >= 10.0 or 0.0 < factor <= 0.1:
+        return f"× {factor:.0f}" if factor > 1.0 else f"× {factor:.1g}"
+    percent = 100.0 * (factor - 1.0)
+    return "" if abs(percent) < 0.05 else f"{percent:+.{1 if abs(percent) < 10.0 else 0}f} %"
 
 
 def write_comparison(path: Path, runs: Sequence[ComparedRun]) -> None:

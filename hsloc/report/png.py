@@ -6,6 +6,7 @@ The plots show trajectories with the reference, the error on the map, and errors
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,17 +22,19 @@ from hsloc.report import style
 from hsloc.report.charts import Chart, run_charts
 from hsloc.report.data import prepare, since
 from hsloc.report.map_image import Extent, shown_extent
-from hsloc.report.png_panels import draw_map, draw_panel, draw_table
-from hsloc.report.summary import ResultSummary
+from hsloc.report.png_panels import draw_map, draw_panel, draw_places_to_check, draw_table
+from hsloc.report.summary import VERDICT_WORDS, ResultSummary, count
+from hsloc.report.table import reason_text
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from matplotlib.axes import Axes
     from matplotlib.text import Text
     from numpy.typing import NDArray
 
     from hsloc.evaluation import Comparison
+    from hsloc.model.verdict import VerdictReason
     from hsloc.report.data import ReportData, ReportParts
     from hsloc.report.table import Row
 
@@ -43,6 +46,9 @@ LEFT, LEFT_OF_AXES, RIGHT, BOTTOM, TOP = 0.015, 0.05, 0.985, 0.06, 0.88
 
 LINE = 0.031
 """Height of a line of the table, as a part of the picture's."""
+
+LEAST_LINE = 0.024
+"""As low as a line of the table may be, so that the next one does not touch it."""
 
 MOST_PANELS = 3
 """Curves that are shown, the most important first."""
@@ -96,11 +102,15 @@ def report_figure(parts: ReportParts) -> Figure:
     axes = figure.add_axes((left, bottom, width, height))
     shown = extent.widened(width * WIDTH / (height * HEIGHT))
     draw_map(axes, data, parts.grid, parts.points, shown, max(width * WIDTH, height * HEIGHT) * DPI)
-    _draw_head(figure, axes, parts.title, summary)
+    reasons = () if parts.metrics is None else parts.metrics.verdict_reasons
+    draw_places_to_check(axes, [place for reason in reasons for place in reason.places])
+    _draw_head(figure, axes, parts.title, summary, reasons)
     return figure
 
 
-def _draw_head(figure: Figure, axes: Axes, title: str, summary: ResultSummary | None) -> None:
+def _draw_head(
+    figure: Figure, axes: Axes, title: str, summary: ResultSummary | None, reasons: Sequence[VerdictReason]
+) -> None:
     """Title and legend, the verdict with the headline and the facts, and the first reason, as much as there is room."""
     wide = WIDTH * DPI
     handles, labels = axes.get_legend_handles_labels()
@@ -121,14 +131,17 @@ def _draw_head(figure: Figure, axes: Axes, title: str, summary: ResultSummary | 
     )  # fmt: skip
     start = LEFT + 0.02 + badge.get_window_extent().width / wide
     line = figure.text(start, 0.9385, "", fontsize=12.5, color=style.INK, va="top", parse_math=False)
-    texts = [summary.headline, *summary.facts[1:]]
+    texts = [summary.headline, VERDICT_WORDS[summary.verdict], *summary.facts[1:]]
     _fit(line, ["  ·  ".join(texts[:count]) for count in range(len(texts), 0, -1)], RIGHT - start)
     if summary.reasons:
-        more = f" (and {len(summary.reasons) - 1} more)" if len(summary.reasons) > 1 else ""
-        reason = summary.reasons[0]
+        others = len(summary.reasons) - 1
+        more = f" (and {count(others, 'other reason')})" if others else ""
         line = figure.text(LEFT, 0.909, "", fontsize=11, color=style.INK, va="top", parse_math=False)
-        cuts = [reason + more, *(f"{reason[:most]}…{more}" for most in range(len(reason), 0, -1))]
-        _fit(line, cuts, RIGHT - LEFT)
+        # What there is no room for is in report.html: the remedy first, then places, then times.
+        first, text = replace(reasons[0], remedy=""), reasons[0].text
+        whole = [summary.reasons[0], reason_text(first), reason_text(replace(first, places=())), text]
+        cuts = [*whole, *(f"{text[:most]}…" for most in range(len(text), 0, -1))]
+        _fit(line, [f"{each}{more}" for each in cuts], RIGHT - LEFT)
 
 
 def _shortened(text: str, most: int) -> str:
@@ -155,7 +168,7 @@ def _place(figure: Figure, extent: Extent, panels: list[Chart], rows: list[Row],
         return LEFT_OF_AXES, BOTTOM, RIGHT - LEFT_OF_AXES, TOP - BOTTOM
     if extent.aspect > WIDE:
         height = min(max((RIGHT - LEFT_OF_AXES) * WIDTH / extent.aspect / HEIGHT, 0.3), 0.48)
-        below = TOP - height - 0.1
+        below = TOP - height - 0.09
         split = LEFT_OF_AXES + 0.6 * (RIGHT - LEFT_OF_AXES) if panels else LEFT_OF_AXES - 0.055
         _draw_panels(figure, panels, data, (LEFT_OF_AXES, BOTTOM, split - LEFT_OF_AXES, below - BOTTOM))
         _draw_rows(figure, rows, (split + 0.055, BOTTOM, RIGHT - split - 0.055, below - BOTTOM))
@@ -182,7 +195,9 @@ def _draw_panels(figure: Figure, panels: list[Chart], data: ReportData, box: Box
 
 def _draw_rows(figure: Figure, rows: list[Row], box: Box) -> None:
     if rows:
-        draw_table(figure.add_axes(box), rows, line_height=LINE / box[3])
+        # One for the heading, and one for a long value, which has a line of its own.
+        line = min(LINE, max(box[3] / (len(rows) + 2), LEAST_LINE))
+        draw_table(figure.add_axes(box), rows, line_height=line / box[3])
 
 
 def draw_comparisons(comparisons: Mapping[str, Comparison], figure: Figure | None = None) -> Figure:

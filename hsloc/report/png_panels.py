@@ -17,7 +17,7 @@ from hsloc.report.data import Curve, with_gaps
 from hsloc.report.map_image import line_width, picture_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 _PLACE = np.array(((13.0, 0.0), (-9.0, 8.0), (-5.0, 0.0), (-9.0, -8.0), (13.0, 0.0))) / 13.0
 """An arrow, as vertices of a marker."""
+MOST_TO_CHECK = 40
+"""Places to check that are drawn: more would hide the map."""
 HALO = [withStroke(linewidth=3.0, foreground="white")]
 
 
@@ -117,7 +119,7 @@ def _draw_marks(axes: Axes, data: ReportData) -> None:
     for statuses, label, marker, colour, size, zorder in (
         ((Status.NO_RETURNS,), "scan without returns", "v", style.ORANGE, 5.0, 7),
         ((Status.REJECTED,), "scan rejected", "x", style.VERMILLION, 5.0, 8),
-        ((Status.RELOCALISED,), "pose found", "*", style.ORANGE, 13.0, 9),
+        ((Status.RELOCALISED,), "pose found", "*", style.ORANGE, 13.0, 12),
     ):
         xy = data.scans.xy[data.scans.where(*statuses)]
         if len(xy):
@@ -143,6 +145,22 @@ def _draw_places(axes: Axes, data: ReportData) -> None:
         axes.plot(
             [], [], linestyle="none", marker=MarkerStyle(_PLACE), color=style.ORANGE, markersize=12,
             markeredgecolor=style.INK, label="place that may be right",
+        )  # fmt: skip
+
+
+def draw_places_to_check(axes: Axes, places: Sequence[tuple[float, float]]) -> None:
+    """Where the reasons of the verdict were found (x, y in m), as warning signs; of many some, evenly."""
+    shown = np.array(places)[:: len(places) // MOST_TO_CHECK + 1]
+    if not len(shown):
+        return
+    axes.plot(
+        *shown.T, linestyle="none", marker="^", color="white", markersize=13, markeredgecolor=style.VERMILLION,
+        markeredgewidth=1.6, label="place to check", zorder=10,
+    )  # fmt: skip
+    for xy in shown:
+        axes.annotate(
+            "!", xy, xytext=(0, -1), textcoords="offset points", fontsize=8, fontweight="bold", color=style.VERMILLION,
+            ha="center", va="center", zorder=10, annotation_clip=True,
         )  # fmt: skip
 
 

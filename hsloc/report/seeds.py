@@ -13,7 +13,7 @@ import numpy as np
 from hsloc.report.table import DASH, LENGTHS, format_angle, format_length, format_share
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -21,6 +21,7 @@ LEVEL = 0.95
 """Coverage of the intervals."""
 RESAMPLES = 4000
 """Of the bootstrap: the ends of an interval vary by about 1 % of its length with the seed of the resampling."""
+_NUMBER = re.compile(r"[<>]? ?-?[\d.]+ ?(mm|cm|m|km|°|%.*)?")
 _LENGTHS = {unit: factor for _, factor, unit in LENGTHS}
 
 
@@ -67,6 +68,8 @@ def spread_text(spread: Spread, like: str = "1 m") -> str:
     if not isfinite(spread.mean):
         return DASH
     unit, factor, decimals = _scale(spread.mean, like)
+    if unit != " %":
+        decimals += _further_decimals(spread.std * factor, decimals)
 
     def text(value: float) -> str:
         return format_share(value).removesuffix(" %") if unit == " %" else f"{value * factor:.{decimals}f}"
@@ -87,6 +90,11 @@ def _scale(mean: float, like: str) -> tuple[str, float, int]:
     if "%" in like:
         return " %", 100.0, 1
     return "", 1.0, max(_decimals(like), 1)
+
+
+def _further_decimals(std: float, decimals: int) -> int:
+    """At most two, of which a small standard deviation needs one digit that is not zero."""
+    return next((more for more in range(3) if abs(std) >= 0.5 * 10.0 ** -(decimals + more)), 0)
 
 
 def _decimals(text: str) -> int:
@@ -136,13 +144,23 @@ def seed_rows(groups: Sequence[SeedGroup]) -> list[tuple[str, ...]]:
     """A line for the verdicts, and one for each number of a figure: its name, then its spread in each group."""
     verdicts = (counted([str((view["summary"] or {}).get("verdict", "")) for view in group.views]) for group in groups)
     figures = [[_figures(view) for view in group.views] for group in groups]
-    names = dict.fromkeys(name for group in figures for each in group for name in each)
+    names = figure_names([each for group in figures for each in group])
     return [("verdict", *verdicts)] + [
         (name, *(_cell([each[name] for each in group if name in each]) for group in figures)) for name in names
     ]
 
 
-def counted(words: Sequence[str]) -> str:
+def is_number(text: str) -> bool:
+    """Whether the value of a figure is one number with or without a unit, and not words or a count of something."""
+    return _NUMBER.fullmatch(text) is not None
+
+
+def figure_names(runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """All names of figures, in the order of the run that has most of them; then those that it has not."""
+    return list(dict.fromkeys(name for run in sorted(runs, key=len, reverse=True) for name in run))
+
+
+def counted(words: Iterable[str]) -> str:
     """`2 good, 1 check`: how often each word is there, in the order of the first ones."""
     return ", ".join(f"{count} {word}" for word, count in Counter(words).items())
 
@@ -150,7 +168,8 @@ def counted(words: Sequence[str]) -> str:
 def _figures(view: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Figures whose numbers are those that are shown; counts of several kinds are not."""
     found = (view["summary"] or {}).get("figures", ())
-    return {each["name"]: each for each in found if len(each.get("numbers", ())) == len(each["values"])}
+    shown = [each for each in found if len(each.get("numbers", ())) == len(each["values"])]
+    return {each["name"]: each for each in shown if not each["values"][0][:1].isdigit() or is_number(each["values"][0])}
 
 
 def _cell(figures: Sequence[dict[str, Any]]) -> str:

@@ -105,7 +105,7 @@ def _headline(metrics: RunMetrics) -> str:
             return f"{made} from {metrics.scans.used} scans."
         if mapping.keyscans == 0:
             return "Built no map: no scan had enough returns."
-        loops = "without a loop" if mapping.loops == 0 else f"with {_count(mapping.loops, 'loop')} closed"
+        loops = "without a loop" if mapping.loops == 0 else f"with {count(mapping.loops, 'loop')} closed"
         return f"{made} from {mapping.keyscans} scans, {loops}."
     share = metrics.localised.share_of_poses
     if share == 0.0:
@@ -127,7 +127,8 @@ def _lost_and_found(metrics: RunMetrics) -> str:
     return f"; the pose was lost {'once' if len(spans) == 1 else f'{len(spans)} times'}, for {total} in all{again}"
 
 
-def _count(number: int, noun: str) -> str:
+def count(number: int, noun: str) -> str:
+    """1 loop, 2 loops."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
@@ -152,4 +153,4 @@ def _facts(metrics: RunMetrics) -> list[str]:
     if stamp is not None and _YEAR_2000_NS <= stamp < _YEAR_2100_NS:
         parts.append(f"{datetime.fromtimestamp(stamp // 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC")
     parts += [f"{format_length(log.path_length_m)} path", format_duration(log.duration_s)]
-    return [*parts, f"{metrics.scans.total:,} scans".replace(",", " ")]
+    return [*parts, f"{metrics.scans.total} scans"]

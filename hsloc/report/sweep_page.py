@@ -8,8 +8,10 @@ from math import isfinite, nan
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+from hsloc import text_table
 from hsloc.report.html import page_text
 from hsloc.report.seeds import Spread, counted, spread_text
+from hsloc.report.summary import count
 from hsloc.report.table import DASH
 
 if TYPE_CHECKING:
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
 
     Row = Mapping[str, Any]
 
-_FIGURES = (("ape_m", "cm", "APE"), ("ape_deg", "°", ""), ("relations_m", "cm", "relations"))
+_FIGURES = (("ape_m", "cm", "APE rmse"), ("ape_deg", "°", ""), ("relations_m", "cm", "relations, mean"))
 _WORDS = ("good", "check", "failed")
 
 
@@ -63,6 +65,25 @@ def sweep_matrix(table: Sequence[Row]) -> SweepMatrix:
     )
 
 
+def sweep_lines(table: Sequence[Row]) -> list[str]:
+    """The matrix as a table in Markdown, after a line that explains it; nothing where every cell is one run alone."""
+    found = sweep_matrix(table)
+    if len(table) <= len(found.logs) and len(found.configs) < 2:
+        return []
+    lines = [
+        (log, config or "default", counted([_state(table[k]) for k in cell.rows]), ", ".join(cell.texts))
+        for log, cells in zip(found.logs, found.cells, strict=True)
+        for config, cell in zip(found.configs, cells, strict=True)
+    ]
+    if len(found.logs) > 1:
+        lines += [
+            ("all logs", config or "default", verdicts, ", ".join(means))
+            for config, (verdicts, *means) in zip(found.configs, found.overall, strict=True)
+        ]
+    title = "over seeds: mean ± standard deviation [95 % interval of the mean, by bootstrap]"
+    return ["", title, "", *text_table.table(("log", "configuration", "verdicts", "errors"), lines)]
+
+
 def sweep_page(table: Sequence[Row]) -> str:
     """The page, from the rows of the sweep's table: it holds all it shows, but for the reports that it links to."""
     found = sweep_matrix(table)
@@ -76,8 +97,9 @@ def sweep_page(table: Sequence[Row]) -> str:
         shown = "".join(f'<td class="words">{_lines(texts)}</td>' for texts in found.overall)
         lines.append(f'<tr class="overall"><th scope="row" class="words">all logs</th>{shown}</tr>')
     body = (
-        f"<header><h1>Sweep</h1></header><main><p>{len(table)} runs: {len(logs)} logs, {len(configs)} configurations, "
-        f'{seeds} seeds.</p><p class="muted">Absolute pose error (root mean square) of each log and configuration: '
+        f"<header><h1>Sweep</h1></header><main><p>{count(len(table), 'run')}: {count(len(logs), 'log')}, "
+        f"{count(len(configs), 'configuration')}, {count(seeds, 'seed')}.</p>"
+        '<p class="muted">Absolute pose error (root mean square) of each log and configuration: '
         "mean ± standard deviation over the seeds, and in brackets the 95 % interval of the mean (bootstrap). The last "
         "line is the mean over the logs of which every configuration has an error. A number is a seed, in the colour "
         "of its verdict, and links to the report of its run.</p>"
@@ -123,15 +145,20 @@ def _texts(rows: Sequence[Row]) -> list[str]:
     return found
 
 
+def _state(row: Row) -> str:
+    """The verdict of a run, or what became of it."""
+    return str(row["verdict"] or row["state"])
+
+
 def _known(rows: Sequence[Row], name: str) -> list[float]:
     return [float(row[name]) for row in rows if row[name] is not None and isfinite(float(row[name]))]
 
 
 def _overall(rows: Sequence[Row], logs: Sequence[str]) -> list[str]:
     """Counts of verdicts, and the mean over `logs` of the mean over seeds."""
-    found = [counted([str(row["verdict"] or row["state"]) for row in rows])]
+    found = [counted(map(_state, rows))]
     means = [Spread.of(_known([row for row in rows if row["log"] == log], "ape_m")).mean for log in logs]
     if means:
         mean = Spread(1, sum(means) / len(means), nan, nan, nan)
-        found.append(f"APE {spread_text(mean)}, over {len(means)} logs")
+        found.append(f"APE rmse {spread_text(mean)}, over {len(means)} logs")
     return found

@@ -46,7 +46,7 @@ def test_the_table_has_the_figures_of_the_reports_and_their_changes(
     _, first, second = (cell.strip() for cell in ape.split("|")[1:-1])
     own = {row.label: row for row in ResultSummary.of(run["metrics"]).figures}
     assert first == " / ".join(own["APE rmse"].values)
-    assert re.fullmatch(r"[\d.]+ cm / [\d.]+° \(\+[\d.]+ %\)", second)
+    assert re.fullmatch(r"[\d.]+ cm / [\d.]+° \(\+[\d.]+ % / [-+]?[\d.]+ %\)", second)
 
 
 def test_the_page_is_whole_and_loads_nothing(results: Path, tmp_path: Path) -> None:
@@ -75,6 +75,14 @@ def test_what_is_no_report_is_named(results: Path, tmp_path: Path, capsys: pytes
 
 
 def test_changes() -> None:
-    assert change([2.0], [3.0]) == " (+50 %)"
-    assert change([2.0], [1.99]) == " (-0.5 %)"
-    assert [change(a, b) for a, b in (([2.0], [2.0]), ([0.0], [1.0]), ([None], [1.0]), ([], []))] == [""] * 4
+    def changed(first: list[float | None], numbers: list[float | None], *values: str) -> str:
+        return change({"numbers": first}, {"numbers": numbers, "values": values})
+
+    assert changed([2.0], [3.0], "3.00 m") == "+50 %"
+    assert changed([2.0], [1.99], "1.99 m") == "-0.5 %"
+    assert changed([0.02, 0.1], [1.0, 0.1], "1.00 m", "0.10°") == "× 50 / 0 %"
+    assert changed([1.0], [0.981], "98.1 % of the poses") == "-1.9 pp"
+    same: list[tuple[list[float | None], list[float | None]]] = [([2.0], [2.0]), ([0.0], [1.0]), ([None], [1.0])]
+    assert [changed(a, b, "1.00 m") for a, b in same] == [""] * 3
+    assert changed([504.0], [60.0], "60 held by the motion gate") == ""
+    assert changed([2.0, 1.0], [3.0, 1.0], "3 of 1") == ""

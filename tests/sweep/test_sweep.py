@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -162,8 +163,8 @@ def test_the_table_in_four_forms(tmp_path: Path) -> None:
     assert [row["run"] for row in table] == ["office-default-seed0", "missing-default-seed0"]
     assert float(table[0]["ape_m"]) == good["ape_m"]
     lines = as_text(rows(outcomes)).splitlines()
-    assert "APE [m]" in lines[0]
-    assert "rel. [m]" not in lines[0]
+    assert "APE rmse [m]" in lines[0]
+    assert "relations, mean [m]" not in lines[0]
     assert lines[-1].startswith("missing-default-seed0: ")
     markdown = as_markdown(rows(outcomes)).splitlines()
     assert markdown[0].split("|")[1:4] == [" run                   ", " state  ", " verdict "]
@@ -190,6 +191,9 @@ def test_the_command_varies_the_named_parameters(tmp_path: Path, capsys: pytest.
     code, out, _ = command(capsys, *arguments[:-1], "--csv")  # type: ignore[arg-type]
     assert (code, out) == (0, (tmp_path / "sweep.csv").read_text())
     assert {row["state"] for row in csv.DictReader(io.StringIO(out))} == {"skipped"}
+    code, out, _ = command(capsys, *arguments[:-1])  # type: ignore[arg-type]
+    assert re.search(r"\| office \| hide\.budget=200 \| +1 good \| APE rmse [\d.]+ cm, [\d.]+° \|", out)
+    assert out.rstrip().splitlines()[-1] in (tmp_path / "sweep.md").read_text()
     code, out, err = command(capsys, OFFICE, tmp_path / "missing.mcap", "--out", tmp_path, "--end", "3")
     assert code == 1
     assert "1 of 2 runs failed" in err

@@ -129,7 +129,8 @@
           line.style.transform = `translateX(${left + (w - left - right) * Math.min(t / end, 1)}px)`;
           if (!output || !chart.t.length) continue;
           const value = chart.v[nearest(chart.t, t)];
-          output.textContent = value === null ? "–" : `${Math.abs(value) < 0.01 && value !== 0 ? "< 0.01" : Number(value.toPrecision(3))} ${chart.unit}`;
+          const space = chart.unit === "°" ? "" : " ";
+          output.textContent = value === null ? "–" : `${Math.abs(value) < 0.01 && value !== 0 ? "< 0.01" : Number(value.toPrecision(3))}${space}${chart.unit}`;
         }
       },
       end() { root.replaceChildren(); },

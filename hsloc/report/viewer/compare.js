@@ -2,13 +2,23 @@
 // Several results side by side: paths on the map of the first, curves over each other, figures with their differences.
 (() => {
   const INKS = ["blue", "vermillion", "green", "purple", "orange", "sky", "robot", "muted"];
+  const NUMBER = /^[<>]? ?-?[\d.]+ ?(mm|cm|m|km|°|%.*)?$/; // the text of a figure that is one number
   const make = (tag, text = "", className = "") => { const made = document.createElement(tag); made.textContent = text; made.className = className; return made; };
 
-  function change(first, value) {
-    if (first === null || value === null || first === undefined || value === undefined || first === value || first === 0) return "";
-    const percent = 100 * (value - first) / Math.abs(first);
-    if (Math.abs(percent) < 0.05) return "";
-    return `${percent > 0 ? "+" : "−"}${Math.abs(percent) < 10 ? Math.abs(percent).toFixed(1) : Math.abs(percent).toFixed(0)} %`;
+  // As hsloc/report/html.py: see there.
+  function changeOf(first, number, text) {
+    if (first === null || number === null || first === number || !NUMBER.test(text)) return "";
+    const signed = (value, digits) => `${value > 0 ? "+" : "−"}${Math.abs(value).toFixed(digits)}`;
+    if (text.includes("%")) { const points = 100 * (number - first); return Math.abs(points) < 0.05 ? "" : `${signed(points, 1)} pp`; }
+    if (first === 0) return "";
+    const factor = number / first, percent = 100 * (factor - 1);
+    if (factor >= 10 || (factor > 0 && factor <= 0.1)) return `× ${factor < 10 ? Number(factor.toPrecision(1)) : factor.toFixed(0)}`;
+    return Math.abs(percent) < 0.05 ? "" : `${signed(percent, Math.abs(percent) < 10 ? 1 : 0)} %`;
+  }
+  function change(first, figure) {
+    if (!first || !figure || figure.numbers?.length !== figure.values.length || first.numbers?.length !== figure.values.length) return "";
+    const parts = figure.values.map((text, k) => changeOf(first.numbers[k], figure.numbers[k], text));
+    return parts.some(Boolean) ? parts.map((part) => part || "0 %").join(" / ") : "";
   }
 
   // A table in a box that scrolls: the box, the row of its head, and its body.
@@ -63,10 +73,10 @@
       };
       line("verdict", runs.map((run) => run.data.summary?.verdict ? make("span", run.data.summary.verdict, `rv-verdict rv-${run.data.summary.verdict}`) : ""));
       const figures = runs.map((run) => new Map((run.data.summary?.figures ?? []).map((figure) => [figure.name, figure])));
-      for (const name of new Set(figures.flatMap((each) => [...each.keys()]))) {
+      for (const name of new Set([...figures].sort((a, b) => b.size - a.size).flatMap((each) => [...each.keys()]))) {
         const first = figures[0].get(name), any = figures.find((each) => each.has(name)).get(name);
         line(name, figures.map((each) => each.get(name)?.values.join(" / ") ?? "–"), any.explanation,
-          figures.map((each, k) => k && first ? change(first.numbers?.[0], each.get(name)?.numbers?.[0]) : ""));
+          figures.map((each, k) => k ? change(first, each.get(name)) : ""));
       }
       return box;
     }

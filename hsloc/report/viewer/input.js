@@ -1,6 +1,11 @@
 "use strict";
 // Mouse, fingers and keys of the map: see view.js, whose `ResultView` is the `view` here.
-globalThis.lengthText = (m) => m < 1 ? `${(100 * m).toFixed(m < 0.1 ? 1 : 0)} cm` : `${m.toFixed(2)} m`;
+// As the figures are written, but centimetres also of what is longer than ten metres.
+globalThis.lengthText = (m) => {
+  if (m < 5e-6) return "0 mm";
+  const [factor, unit] = m < 0.00095 ? [1000, "mm"] : m < 0.9995 ? [100, "cm"] : [1, "m"], value = factor * m;
+  return `${value.toFixed(value < 9.995 || unit === "m" ? 2 : value < 99.95 ? 1 : 0)} ${unit}`;
+};
 globalThis.listenToView = (view) => {
   function nearest(px, py, within = 14) {
     const path = view.data.trajectory, [mx, my] = view.metres(px, py);

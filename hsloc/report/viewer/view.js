@@ -146,13 +146,17 @@
     }
     all() {
       const [x0, y0, x1, y1] = this.data.extent;
-      this.scale = Math.min(this.$base.width / (x1 - x0), this.$base.height / (y1 - y0));
-      [this.x, this.y] = this.middle();
+      const side = this.besideTools(), width = this.$base.width - side;
+      this.scale = Math.min(width / (x1 - x0), this.$base.height / (y1 - y0));
+      [this.x, this.y] = this.middle(width);
+      this.x += side / 2 / this.scale;
       this.whole = true;
       this.draw();
     }
+    // Width of the column of buttons over the map, in pixels; none where they are below it, as on a phone.
+    besideTools() { return getComputedStyle(this.$tools).position === "absolute" ? this.ratio * (this.$tools.offsetWidth + 12) : 0; }
     // Where all is shown there is room beside it or above: rather for more of the map than for what is not known.
-    middle() {
+    middle(width) {
       const { map, extent: [x0, y0, x1, y1] } = this.data;
       if (!map || map.corner[2] !== 0) return [0, 0];
       const along = (low, high, corner, size, shown) => {
@@ -160,7 +164,7 @@
         if (last - first <= shown) return (first + last) / 2 - middle;
         return Math.min(Math.max(middle, first + shown / 2), last - shown / 2) - middle;
       };
-      return [along(x0, x1, map.corner[0], map.side * map.width, this.$base.width / this.scale),
+      return [along(x0, x1, map.corner[0], map.side * map.width, width / this.scale),
         along(y0, y1, map.corner[1], map.side * map.height, this.$base.height / this.scale)];
     }
     zoom(factor, px = this.$base.width / 2, py = this.$base.height / 2) {
@@ -344,7 +348,7 @@
         if (path.sigma?.[k] != null) words.push(`σ ${length(path.sigma[k])}`);
         if (path.error?.[k] != null) words.push(`error ${length(path.error[k])}`);
       }
-      if (scans) { const k = this.scanAt(this.time); words.push(`scan at ${scans.t[k].toFixed(1)} s ${scans.status[k]}`); }
+      if (scans) { const k = this.scanAt(this.time); words.push(`scan at ${scans.t[k].toFixed(1).replace("-0.0", "0.0")} s ${scans.status[k]}`); }
       this.$now.textContent = words.join(" · ");
       this.charts.now = this.time;
       this.charts.cursor(this.time);

@@ -117,7 +117,7 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
                 else None
             ),
         )
-        page.set_default_timeout(30_000)
+        page.set_default_timeout(120_000)  # reached by a busy machine alone
         page.goto(url)
         return page
 

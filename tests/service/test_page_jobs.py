@@ -81,6 +81,14 @@ def test_several_logs_are_several_jobs_or_one_and_the_table_finds_them(
     page.wait_for_function(r"() => /^They take .* of .*\.$/.test(document.querySelector('#quota').textContent)")
     page.wait_for_function("() => document.querySelectorAll('#file-table tbody tr').length === 3")
     need_accessible(page)
+    page.evaluate("location.hash = 'label=100%'")  # no label of a job, and not written as addresses are
+    page.wait_for_function("() => document.querySelector('#page-text').textContent === 'no such job'")
+    page.evaluate("location.hash = 'shared=hss_cut'")
+    page.wait_for_selector("#notice >> text=there is nothing at #shared=hss_cut")
+    page.select_option("#label-filter", "")
+    page.go_back()
+    page.go_back()
+    assert page.get_attribute("nav [href='#files']", "aria-current") == "page"
     page.click("#file-table button >> nth=0")  # used again, without an upload
     page.wait_for_function("() => document.querySelector('#stored').value !== ''")
     page.set_input_files("#log", [])
@@ -134,6 +142,10 @@ def name_and_label(page: Any) -> None:
     assert (page.input_value("#label-filter"), page.url.rpartition("#")[2]) == ("floor 2", "label=floor%202")
     page.select_option("#label-filter", "")
     page.wait_for_function("() => document.querySelectorAll('#jobs tbody tr').length > 2")
+    page.check("#tick-all")
+    assert page.text_content("#ticked-text") == f"{page.locator('#jobs tbody tr').count()} selected"
+    page.uncheck("#tick-all")
+    assert page.is_hidden("#ticked")
     for box in page.locator("#jobs tbody input").all()[:2]:
         box.check()
     page.fill("#ticked-label", "night")
@@ -152,9 +164,10 @@ def test_a_page_goes_on_when_the_server_was_restarted(make_live: Callable[..., L
     page.evaluate(f"location.hash = 'job={job}'")
     page.wait_for_selector("#job-state .running")
     assert live.end() == 0  # the stream ends in good order, and the job does not
-    page.wait_for_timeout(1000)
+    page.wait_for_selector("#offline >> text=The server does not answer")
     live.start()
-    page.wait_for_selector("#job-state .succeeded", timeout=30_000)
+    page.wait_for_selector("#job-state .succeeded", timeout=120_000)
+    assert page.is_hidden("#offline")
     context.close()
 
 

@@ -79,7 +79,9 @@ class Files:
     def need_size(self, size: int) -> None:
         """Raises ServiceError 413 for a file larger than any that is taken."""
         if size > self.settings.max_upload_bytes:
-            raise ServiceError(413, "too_large", f"{size} bytes; at most {self.settings.max_upload_bytes} are taken")
+            raise ServiceError(
+                413, "too_large", f"it has {size} bytes; at most {self.settings.max_upload_bytes} are taken"
+            )
 
     def need_room(self, who: Principal) -> None:
         """Raises ServiceError 507 where disk or quota are used up; asked now and then while bytes come in."""

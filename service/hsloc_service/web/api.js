@@ -12,6 +12,16 @@ export function useToken(text) {
   sessionStorage.setItem(KEY, token);
 }
 
+// Whether the server answered last: what is shown may be out of date where it did not.
+export const connection = new EventTarget();
+let isAnswering = true;
+function answering(is) {
+  if (is === isAnswering) return;
+  isAnswering = is;
+  connection.dispatchEvent(new CustomEvent("change", { detail: is }));
+}
+
+// What the server refuses, with the status of its answer; 0 where there was none.
 export class Refused extends Error {
   constructor(status, problem) {
     super(problem.message || `the server answered ${status}`);
@@ -23,7 +33,13 @@ export class Refused extends Error {
 export async function request(path, options = {}) {
   const headers = { ...options.headers };
   if (token) headers.Authorization = `Bearer ${token}`;
-  const answer = await fetch(path, { ...options, headers });
+  let answer;
+  try { answer = await fetch(path, { ...options, headers }); } catch (error) {
+    if (error.name === "AbortError") throw error;
+    answering(false);
+    throw new Refused(0, { message: `the server cannot be reached (${error.message})` });
+  }
+  answering(true);
   if (answer.ok || answer.status === 304) return answer;
   let problem = {};
   try { problem = await answer.json(); } catch { /* not ours: a proxy's page */ }

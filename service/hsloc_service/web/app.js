@@ -1,7 +1,7 @@
 // The page: which part of it is shown, by the address. #job=ID&t=SECONDS, #shared=SECRET&t=SECONDS, #compare=ID,ID,
 // #sweep=ID, #sweeps, #files, #label=TEXT; else the jobs.
 
-import { get, hasToken, onToken, post, useToken } from "./api.js";
+import { connection, get, hasToken, onToken, post, request, useToken } from "./api.js";
 import { $, bytes, guarded, notice } from "./dom.js";
 import * as files from "./files.js";
 import * as form from "./form.js";
@@ -35,6 +35,17 @@ $("token-form").addEventListener("submit", (event) => {
   route();
 });
 
+// --- a server that does not answer -----------------------------------------------------------------------------------
+let asking = null; // timer
+connection.addEventListener("change", ({ detail: isAnswering }) => {
+  $("offline").textContent = isAnswering ? "" : "The server does not answer: what is shown may be out of date, and what you asked for was not done. It is asked again …";
+  $("offline").hidden = isAnswering;
+  clearInterval(asking);
+  if (!isAnswering) { asking = setInterval(() => request("/healthz").catch(() => null), EVERY_MS); return; }
+  if (!$("server").textContent && !document.body.classList.contains("visitor")) about();
+  if ($("home").hidden && $("job").hidden) route(); // the other parts, and a job that could not be loaded
+});
+
 async function about() {
   const info = await guarded(() => get("/v1/info"));
   if (info) $("server").textContent = `version ${info.version}, ${bytes(info.free_bytes)} free, ${info.tenant}`;
@@ -47,7 +58,7 @@ async function about() {
 }
 
 // --- parts of the page -----------------------------------------------------------------------------------------------
-const useAgain = async (file) => { location.hash = ""; await form.use(file); $("stored").focus(); };
+const useAgain = async (file) => { location.hash = ""; (await form.use(file)).focus(); };
 
 function route(event) {
   const [, name, value = ""] = /^#(\w+)=?(.*)$/.exec(location.hash) ?? [];
@@ -57,6 +68,9 @@ function route(event) {
   const part = isShared ? "job" : name === "files" || name === "sweeps" || (ofJobs && ids.every((id) => ID.test(id))) ? name : "home";
   document.body.classList.toggle("visitor", isShared);
   for (const each of ["home", "job", "compare", "sweep", "sweeps", "files"]) $(each).hidden = each !== part;
+  for (const link of document.querySelectorAll("nav a")) {
+    if (link.dataset.parts.split(" ").includes(part)) link.setAttribute("aria-current", "page"); else link.removeAttribute("aria-current");
+  }
   document.title = "hsloc: where was the robot?";
   result.leave();
   sweeps.leave();
@@ -69,8 +83,16 @@ function route(event) {
   else if (part === "sweep") sweeps.show(ids[0]);
   else if (part === "sweeps") guarded(sweeps.list);
   else if (part === "files") guarded(() => files.show(useAgain));
-  else if (name === "label") guarded(async () => { await labels.known(); await jobs.refresh(decodeURIComponent(value)); });
-  else guarded(() => Promise.all([labels.known(), jobs.refresh()]));
+  else if (name === "label") guarded(async () => { await labels.known(); await jobs.refresh(decoded(value)); });
+  else {
+    if (location.hash.length > 1) notice(`there is nothing at ${location.hash}: the address is not whole`);
+    guarded(() => Promise.all([labels.known(), jobs.refresh()]));
+  }
+}
+
+// A label may be typed into the address as it is.
+function decoded(text) {
+  try { return decodeURIComponent(text); } catch { return text; }
 }
 
 async function compare(ids) {

@@ -47,14 +47,20 @@ export function notice(text) {
 
 export async function guarded(work) {
   try { return await work(); } catch (error) {
-    if (error.name !== "AbortError") notice(error instanceof Refused || error instanceof SyntaxError ? error.message : `the server cannot be reached (${error.message})`);
+    // That the server does not answer is shown above all parts of the page already.
+    if (error.name !== "AbortError" && error.status !== 0) notice(error instanceof Refused || error instanceof SyntaxError ? error.message : `this page has a fault: ${error.message}`);
     return undefined;
   }
 }
 
 export const bytes = (n) => n < 1e3 ? `${n} B` : n < 1e6 ? `${(n / 1e3).toFixed(0)} kB` : n < 1e9 ? `${(n / 1e6).toFixed(1)} MB` : `${(n / 1e9).toFixed(2)} GB`;
 export const when = (text) => new Date(text).toLocaleString([], { dateStyle: "short", timeStyle: "short" });
-export const duration = (s) => s < 60 ? `${s.toFixed(1)} s` : s < 3600 ? `${Math.floor(s / 60)} min ${String(Math.round(s % 60)).padStart(2, "0")} s` : `${Math.floor(s / 3600)} h ${String(Math.round(s % 3600 / 60)).padStart(2, "0")} min`;
+// As format_duration in hsloc/report/table.py.
+export function duration(s) {
+  const whole = Math.round(s), two = (n) => String(n).padStart(2, "0");
+  if (s < 60) return `${s.toFixed(1)} s`;
+  return whole < 3600 ? `${Math.floor(whole / 60)} min ${two(whole % 60)} s` : `${Math.floor(whole / 3600)} h ${two(Math.floor(whole % 3600 / 60))} min`;
+}
 
 // How long a job ran.
 export const ran = (job) => duration((new Date(job.ended) - new Date(job.started)) / 1000);

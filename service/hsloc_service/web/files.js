@@ -9,7 +9,7 @@ let next = null;
 function row(file, useAgain) {
   const line = element("tr"), size = file.state === "complete" ? bytes(file.size) : `${bytes(file.received)} of ${file.size === null ? "?" : bytes(file.size)}`;
   const buttons = element("div", "", "row");
-  if (file.state === "complete") buttons.append(button("New job", () => useAgain(file.id)));
+  if (file.state === "complete") buttons.append(button("New job", () => useAgain(file)));
   buttons.append(button("Delete", async () => {
     if (!confirm(`Delete the upload ${file.name}?`)) return;
     await request(`/v1/files/${file.id}`, { method: "DELETE" });

@@ -38,6 +38,7 @@ export function listen(submitted) {
     $("stop").hidden = $("upload-progress").hidden = false;
     const found = await guarded(work);
     if (uploading.signal.aborted) $("upload-text").textContent += ": paused; the same file goes on from here";
+    else { $("upload-text").textContent = ""; $("upload-progress").hidden = true; }
     $("go").disabled = $("inspect").disabled = false;
     $("go").textContent = uploading.signal.aborted ? "Go on" : "Upload and run";
     $("stop").hidden = true;
@@ -71,7 +72,11 @@ async function requests() {
   };
   // What is there already is not sent again when a later file was paused or refused.
   const send = async (file) => {
-    if (!sent.has(file)) sent.set(file, await upload(file, report(file.name), uploading.signal));
+    if (sent.has(file)) return sent.get(file);
+    try { sent.set(file, await upload(file, report(file.name), uploading.signal)); } catch (error) {
+      if (error.name !== "AbortError") error.message = `${file.name}: ${error.message}`;
+      throw error;
+    }
     return sent.get(file);
   };
   const map = [...$("map").files];
@@ -131,22 +136,24 @@ async function inspect() {
     const [first] = await requests();
     $("upload-text").textContent = "reading it …";
     await inspection.show(await post("/v1/inspect", first));
-    $("upload-text").textContent = "";
   } catch (error) {
     forget(error);
     throw error;
   }
 }
 
+const isMap = (file) => /\.(ya?ml|pgm|png|bmp)$/i.test(file.name);
+
 // Uploads and maps that another job can use; rebuilt only if they changed, so that an open list stays open.
 async function reusable() {
   const { files } = await get("/v1/files?limit=200"), complete = files.filter((file) => file.state === "complete");
-  const isMap = (file) => /\.(ya?ml|pgm|png|bmp)$/i.test(file.name), stem = (name) => name.replace(/\.[^.]+$/, "");
+  const stem = (name) => name.replace(/\.[^.]+$/, "");
   const logs = complete.filter((file) => !isMap(file)).map((file) => [file.id, `${file.name}, ${bytes(file.size)}, ${when(file.created)}`]);
   const images = complete.filter((file) => /\.(pgm|png|bmp)$/i.test(file.name));
   const maps = complete.filter((file) => /\.ya?ml$/i.test(file.name)).flatMap((yaml) => {
-    const image = images.find((each) => stem(each.name) === stem(yaml.name)) ?? images[0];
-    return image ? [[`${yaml.id} ${image.id}`, `${yaml.name} and ${image.name}, ${when(yaml.created)}`]] : [];
+    // Images of its name; where there is none, the YAML may state any of them.
+    const own = images.filter((each) => stem(each.name) === stem(yaml.name)).slice(0, 1);
+    return (own.length ? own : images).map((image) => [`${yaml.id} ${image.id}`, `${yaml.name} and ${image.name}, ${when(yaml.created)}`]);
   });
   const { jobs } = await get("/v1/jobs?limit=200&state=succeeded&brief=true");
   const built = jobs.filter((job) => job.summary?.mode === "slam" && job.request.mapper !== "point" && job.request.config?.mapper !== "point");
@@ -162,9 +169,13 @@ function fill(box, none, entries) {
   box.value = values.includes(before) ? before : "";
 }
 
-// For an upload that is to be used in a new job.
+// For an upload that is to be used in a new job: returns the list in which it is chosen.
 export async function use(file) {
   $("more-options").open = true;
   await guarded(reusable);
-  $("stored").value = file;
+  const box = $(isMap(file) ? "stored-map" : "stored");
+  const choice = [...box.options].find((option) => option.value.split(" ").includes(file.id));
+  if (choice) box.value = choice.value;
+  else notice(isMap(file) ? `${file.name}: a map is a YAML and an image; upload the other one, too` : `${file.name} is not among the newest uploads`);
+  return box;
 }

@@ -56,7 +56,7 @@ function row(job) {
   const line = element("tr"), box = element("input");
   box.type = "checkbox";
   box.checked = ticked.has(job.id);
-  box.setAttribute("aria-label", `tick ${job.log}`);
+  box.setAttribute("aria-label", `select ${job.title ?? job.log}`);
   box.addEventListener("change", () => { if (box.checked) ticked.add(job.id); else ticked.delete(job.id); tick(); });
   const link = element("a", job.title ?? job.log, "name");
   link.href = `#job=${job.id}`;
@@ -88,7 +88,12 @@ function forget(id) {
 }
 
 export async function refresh(label) {
-  if (label !== undefined) $("label-filter").value = label;
+  if (label !== undefined) {
+    // One that no job has any more is a choice, too, so that the table says so.
+    if (![...$("label-filter").options].some((option) => option.value === label)) $("label-filter").append(new Option(label, label));
+    $("label-filter").hidden = false;
+    $("label-filter").value = label;
+  }
   const query = new URLSearchParams({ brief: "true", limit: PAGE, offset, order: $("order").value });
   if ($("search").value.trim()) query.set("search", $("search").value.trim());
   const [name, value] = $("filter").value.split("=");
@@ -111,7 +116,9 @@ export async function refresh(label) {
 
 function tick() {
   $("ticked").hidden = ticked.size === 0;
-  $("ticked-text").textContent = `${ticked.size} ticked`;
+  $("ticked-text").textContent = `${ticked.size} selected`;
+  const boxes = [...$("jobs").tBodies[0].querySelectorAll("input")];
+  $("tick-all").checked = boxes.length > 0 && boxes.every((box) => box.checked);
   $("compare-ticked").disabled = ticked.size < 2;
 }
 
@@ -130,11 +137,15 @@ export function listen() {
   $("order").addEventListener("change", again);
   $("older").addEventListener("click", () => { offset += PAGE; guarded(refresh); });
   $("newer").addEventListener("click", () => { offset = Math.max(offset - PAGE, 0); guarded(refresh); });
+  $("tick-all").addEventListener("change", () => {
+    const wanted = $("tick-all").checked;
+    for (const box of $("jobs").tBodies[0].querySelectorAll("input")) if (box.checked !== wanted) box.click();
+  });
   $("compare-ticked").addEventListener("click", () => { location.hash = `compare=${[...ticked].join(",")}`; });
   $("rerun-ticked").addEventListener("click", () => guarded(() => each((id) => post(`/v1/jobs/${id}/rerun`))));
   $("label-ticked").addEventListener("click", () => guarded(async () => {
     const added = words($("ticked-label").value);
-    if (!added.length) throw new SyntaxError("type a label for the jobs that are ticked");
+    if (!added.length) throw new SyntaxError("type a label for the jobs that are selected");
     for (const id of ticked) await describe(id, { labels: [...(await get(`/v1/jobs/${id}`)).labels, ...added] });
     $("ticked-label").value = "";
     await known();

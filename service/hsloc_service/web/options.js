@@ -8,7 +8,7 @@ function control(option) {
   let made;
   if (option.kind === "choice") {
     made = document.createElement("select");
-    if (option.default === null) made.append(new Option("as usual", ""));
+    if (option.default === null) made.append(new Option("default", ""));
     made.append(...option.choices.map((choice) => new Option(choice, choice, choice === option.default, choice === option.default)));
   } else if (option.name === "config") {
     made = document.createElement("textarea");
@@ -38,7 +38,7 @@ export function build(box, options) {
       groups.set(option.group, grid);
       if (option.group) {
         const section = document.createElement("details"), title = document.createElement("summary");
-        title.textContent = option.group;
+        title.textContent = option.group.replace(/ \(exit code .*\)/, "");
         section.append(title, grid);
         box.append(section);
       } else box.append(grid);
@@ -48,7 +48,7 @@ export function build(box, options) {
     if (option.kind === "switch") { label.className = "check"; label.append(made, ` ${text}`); } else label.append(`${text} `, made);
     const help = document.createElement("small");
     help.className = "quiet";
-    help.textContent = option.help;
+    help.textContent = option.help.replaceAll("`", "");
     help.id = made.id = `option-${option.name}`;
     help.id += "-help";
     made.setAttribute("aria-describedby", help.id);

@@ -56,6 +56,7 @@ function begin() {
   watching = new AbortController();
   $("result").hidden = $("job-log").hidden = $("start-here").hidden = $("state-loops").hidden = true;
   $("headline").replaceChildren();
+  $("facts").textContent = "";
   $("job-log").lastElementChild.textContent = $("job-notes").textContent = "";
   return watching.signal;
 }
@@ -101,7 +102,7 @@ function render(job, isMine = true) {
   // "succeeded" beside the verdict "failed" would be read as a contradiction.
   const ended = job.state === "succeeded" && job.summary?.verdict_text && job.started ? `ran for ${ran(job)}` : null;
   state.replaceChildren(element("span", ended ?? job.state, `state ${job.state}${ended ? " quiet" : ""}`));
-  if (job.reason) state.append(` (${job.reason})`);
+  if (job.reason) state.append(` (${job.reason.replaceAll("_", " ")})`);
   if (job.message) state.append(`: ${job.message}`);
   if (job.state === "queued") state.append(`: waits for a slot${place(job.queue)}`);
   const progress = job.progress;
@@ -277,6 +278,9 @@ function summary(job, whole) {
   const headline = element("span", short.headline ?? "");
   $("headline").replaceChildren(badge(job), " ", headline);
   if (short.verdict_text) badgeText($("headline").firstChild, short.verdict_text);
+  // What the verdict means, without its word; jobs of earlier versions have no text of it.
+  const meaning = (short.verdict_text ?? "").split(": ").slice(1).join(": ");
+  $("facts").textContent = [meaning, ...(whole?.facts ?? [])].filter(Boolean).join(" · ");
   $("key-figures").replaceChildren(...(short.key_figures ?? []).map((name) => {
     const figure = figures.find((each) => each.name === name), box = element("div");
     box.append(element("dt", name), element("dd", figure?.values.join(" / ") ?? ""), element("dd", figure?.explanation ?? "", "quiet"));

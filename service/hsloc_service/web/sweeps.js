@@ -12,8 +12,10 @@ export function leave() { clearTimeout(timer); timer = null; }
 export function seeds(text) {
   const found = text.split(",").flatMap((part) => {
     const [, first, last] = /^\s*(\d+)\s*(?:-\s*(\d+)\s*)?$/.exec(part) ?? [];
-    if (first === undefined || Number(last ?? first) - Number(first) > 999) throw new SyntaxError(`seeds: ${part.trim() || "nothing"} is no whole number, nor a span such as 0-9`);
-    return Array.from({ length: Number(last ?? first) - Number(first) + 1 }, (_, k) => Number(first) + k);
+    const span = Number(last ?? first) - Number(first);
+    if (!(span >= 0)) throw new SyntaxError(`seeds: ${part.trim() || "nothing"} is no whole number, nor a span such as 0-9`);
+    if (span > 999) throw new SyntaxError(`seeds: ${part.trim()} are more than 1000`);
+    return Array.from({ length: span + 1 }, (_, k) => Number(first) + k);
   });
   return [...new Set(found)];
 }

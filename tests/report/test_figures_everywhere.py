@@ -117,6 +117,7 @@ def test_the_interval_of_a_mean_has_its_nominal_coverage() -> None:
         held += spread.low <= np.exp(0.5 * 0.3**2) <= spread.high
     assert 0.88 <= held / runs <= 0.99  # 0.95 within three standard deviations of 120 draws
     assert spread_text(Spread(3, 0.0123, 0.002, 0.0104, 0.0141), "9.9 mm") == "1.23 ± 0.20 cm [1.04, 1.41]"
+    assert spread_text(Spread(3, 0.00911, 2e-5, 0.00909, 0.00913), "9.1 mm") == "0.911 ± 0.002 cm [0.909, 0.913]"
     assert spread_text(Spread.of([0.5]), "50.0 %") == "50.0 %"
     views = [(f"a, seed {k % 2}", {"run": {"seed": k % 2, "group": k // 2}, "summary": None}) for k in range(4)]
     assert [group.name for group in seed_groups(views)] == ["a: 2 seeds (runs 1, 2)", "a: 2 seeds (runs 3, 4)"]

@@ -19,11 +19,12 @@ from hsloc.evaluation.maps import MapComparison
 from hsloc.evaluation.metrics import compare
 from hsloc.model import OccupancyGrid, Pose2, Trajectory
 from hsloc.model.pose2 import compose_poses
+from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.report.charts import run_charts
 from hsloc.report.data import Curve, ReportParts, jumps_of, reason_counts, status_counts, with_gaps
 from hsloc.report.map_image import darkest_of_blocks, grey_levels, line_width, shown_extent
-from hsloc.report.png import draw_report
-from hsloc.report.png_panels import format_round_length, round_length
+from hsloc.report.png import draw_report, report_figure
+from hsloc.report.png_panels import MOST_TO_CHECK, format_round_length, round_length
 from hsloc.report.table import format_angle, format_duration, format_length, table_rows
 from hsloc.run_metrics import MapMetrics, ResidualMetrics
 
@@ -248,6 +249,20 @@ def test_the_table_shows_what_metrics_hold(run: Any) -> None:
     assert "APE rmse of odometry" not in rows
     alone = replace(metrics, odometry_alone=metrics.errors, errors=None)
     assert "APE rmse" not in {row.label for row in table_rows(alone)}
+
+
+def test_places_to_check_are_marked_and_the_first_reason_fits(run: Any) -> None:
+    places = tuple((float(k), -1.0) for k in range(120))
+    reason = VerdictReason(Verdict.CHECK, "slip", "the wheels slipped", "look at the places" * 9, places=places)
+    metrics = replace(run["metrics"], verdict_reasons=(reason, reason))
+    figure = report_figure(ReportParts(title="", **{**run, "metrics": metrics}))
+    texts = [text.get_text() for text in figure.texts]
+    assert (
+        "the wheels slipped, near (0.0, -1.0) m, (1.0, -1.0) m, (2.0, -1.0) m and 117 more (and 1 other reason)"
+        in texts
+    )
+    (drawn,) = [line for axes in figure.axes for line in axes.lines if line.get_label() == "place to check"]
+    assert 20 <= len(drawn.get_xdata()) <= MOST_TO_CHECK
 
 
 def test_pyplot_stays_out() -> None:

@@ -262,7 +262,7 @@ def test_places_to_check_are_marked_and_the_first_reason_fits(run: Any) -> None:
         in texts
     )
     (drawn,) = [line for axes in figure.axes for line in axes.lines if line.get_label() == "place to check"]
-    assert 20 <= len(drawn.get_xdata()) <= MOST_TO_CHECK
+    assert 20 <= np.size(drawn.get_xdata()) <= MOST_TO_CHECK
 
 
 def test_pyplot_stays_out() -> None:

@@ -88,6 +88,9 @@ def test_several_logs_are_several_jobs_or_one_and_the_table_finds_them(
     page.select_option("#label-filter", "")
     page.go_back()
     page.go_back()
+    page.focus(".skip")
+    page.keyboard.press("Enter")  # skips to the content, and leaves the part that is shown
+    assert page.evaluate("[document.activeElement.id, location.hash]") == ["main", "#files"]
     assert page.get_attribute("nav [href='#files']", "aria-current") == "page"
     page.click("#file-table button >> nth=0")  # used again, without an upload
     page.wait_for_function("() => document.querySelector('#stored').value !== ''")

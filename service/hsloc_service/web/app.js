@@ -86,7 +86,11 @@ function route(event) {
   else if (name === "label") guarded(async () => { await labels.known(); await jobs.refresh(decoded(value)); });
   else {
     if (location.hash.length > 1) notice(`there is nothing at ${location.hash}: the address is not whole`);
-    guarded(() => Promise.all([labels.known(), jobs.refresh()]));
+    guarded(async () => {
+      const known = labels.known();
+      if ($("label-filter").value) await known; // which may not be a label any more
+      await Promise.all([known, jobs.refresh()]);
+    });
   }
 }
 
@@ -133,6 +137,8 @@ $("try-sample").addEventListener("click", () => guarded(async () => {
     location.hash = `job=${job.id}`;
   } finally { $("try-sample").disabled = false; }
 }));
+// The address says which part is shown: it stays.
+document.querySelector(".skip").addEventListener("click", (event) => { event.preventDefault(); $("main").focus(); });
 addEventListener("hashchange", route);
 if (!location.hash.startsWith("#shared=")) about();
 route();

@@ -104,7 +104,7 @@ export async function refresh(label) {
   const lines = jobs.map(row), body = $("jobs").tBodies[0];
   if (lines.length !== body.rows.length || lines.some((line, k) => body.rows[k] !== line)) body.replaceChildren(...lines);
   for (const id of rows.keys()) if (!jobs.some((job) => job.id === id)) forget(id);
-  const filtered = Boolean(value || $("search").value.trim() || $("label-filter").value);
+  const filtered = Boolean(value || query.has("search") || query.has("label"));
   $("no-jobs").hidden = total > 0 || filtered;
   for (const part of [$("jobs"), document.querySelector(".filters"), document.querySelector(".pages")]) part.hidden = total === 0 && !filtered;
   $("page-text").textContent = total ? `${offset + 1} to ${offset + jobs.length} of ${total}` : filtered ? "no such job" : "";

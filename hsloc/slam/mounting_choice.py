@@ -103,8 +103,11 @@ def direction_warnings(
 ) -> list[RunWarning]:
     """A warning for each laser that looks elsewhere than assumed, or where `stated`, than the log states it.
 
-    `log` is the opened log of these `paths` and `options`. Raises LogError as `open_log` does.
+    `log` is the opened log of these `paths` and `options`, before mountings were chosen. Raises LogError as `open_log`
+    does.
     """
+    if options.mountings:
+        log = open_log(paths, options)
     summary = log.summary
     if summary.odom_topic is None or summary.scan_topic is None:
         return []
@@ -116,10 +119,12 @@ def direction_warnings(
         if not stated and extrinsics != "identity":
             continue
         reading = replace(
-            options, scan_topic=topic or None, deskew=False, start_s=None, end_s=None,
+            options, deskew=False, start_s=None, end_s=None,
+            scan_topic=topic if len(lasers) > 1 else options.scan_topic,
             time_offset=None if options.time_offset == AUTO else options.time_offset,
         )  # fmt: skip
-        motion = _motion(open_log(paths, reading).events(), parameters, _SCANS_OF_DIRECTION)
+        opened = log if reading == options else open_log(paths, reading)
+        motion = _motion(opened.events(), parameters, _SCANS_OF_DIRECTION)
         error, place_sigma, sigma = _direction(motion)
         yaw = error.theta
         if abs(yaw) <= max(_LEAST_RAD, _MIN_SIGMAS * sigma):

@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
 
 _SQUARE = 0.8
-"""Side of the coarsest squares of places [m]: of 0.4, 0.8 and 1.6 m the fastest on floors of 2,000 to 40,000 m2."""
+"""Side of the squares of places that a search usually begins with [m]: of 0.4, 0.8 and 1.6 m the fastest on floors of
+2,000 to 40,000 m2."""
 _COARSER = 2
 """Levels that a search may begin coarser, where few objects are seen from far: with 400 posts on 170 x 230 m nearly all
 of the work was at the coarsest level."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from hsloc.model.pose2 import relative_poses, wrap_angles
 from hsloc.model.verdict import counted, spans_of
-from hsloc.slam.jumps import jumps
+from hsloc.slam.jumps import jumps, tears
 from hsloc.slam.slips import STRETCHES_DEEP, joined
 
 if TYPE_CHECKING:
@@ -354,9 +354,10 @@ def _torn_loops(r: Recorded) -> Reason | None:
 
 
 def _jumps(r: Recorded) -> Reason | None:
-    wrong = jumps(r.stamps_ns, r.poses, r.odometry)
-    text = f"the map moves the robot faster than it drives in {counted(len(wrong), 'stretch')}: loops join places that "
-    return _reason(r, "jump", text + "only look alike, or it was carried", wrong, failed=True) if wrong else None
+    wrong, torn = (find(r.stamps_ns, r.poses, r.odometry) for find in (jumps, tears))
+    text = f"the map moves the robot faster than it drives in {counted(len(wrong), 'stretch')}: "
+    text += "loops join places that only look alike, or it was carried" if torn else "scans within them are misplaced"
+    return _reason(r, "jump", text, wrong, failed=bool(torn)) if wrong else None
 
 
 def _blind(r: Recorded) -> Reason | None:

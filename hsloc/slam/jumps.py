@@ -53,6 +53,35 @@ def jumps(stamps_ns: I64, poses: F64, odometry: F64 | None) -> list[tuple[int, i
     return [(first - 1, last) for first, last in spans_of(torn)]
 
 
+def tears(stamps_ns: I64, poses: F64, odometry: F64 | None) -> list[tuple[int, int]]:
+    """The jumps at which the path is torn: also from some keyscans before to some after it disagrees with the odometry.
+
+    At the others only keyscans on one side of the jump are misplaced, and the map around them is not.
+    """
+    found = jumps(stamps_ns, poses, odometry)
+    return [jump for jump in found if odometry is None or not _is_bridged(poses, odometry, jump)]
+
+
+def _is_bridged(poses: F64, odometry: F64, jump: tuple[int, int]) -> bool:
+    """Whether poses are as far apart as by the odometry if a few keyscans before the jump, or after it, are left out.
+
+    Lengths are compared: odometry may be wrong in its direction there, as some count backwards as forwards.
+    """
+    (first, last), few, end = jump, _STEPS[-1], len(poses)
+    for before, after in (
+        (range(first - 2 * few, first - few + 1), range(last, last + few + 1)),
+        (range(first - few, first + 1), range(last + few, last + 2 * few + 1)),
+    ):
+        rows = [k for k in before if k >= 0], [k for k in after if k < end]
+        moved, driven = (
+            np.hypot(*(path[rows[1], None, :2] - path[None, rows[0], :2]).transpose(2, 0, 1))
+            for path in (poses, odometry)
+        )
+        if moved.size and np.median(np.abs(moved - driven)) <= _LEAST_M:
+            return True
+    return False
+
+
 def _speed(seconds: F64, path: F64, quantile: float) -> float:
     speed = np.hypot(*np.diff(path[:, :2], axis=0).T) / np.maximum(np.abs(np.diff(seconds)), 1e-3)
     return float(np.quantile(speed, quantile))

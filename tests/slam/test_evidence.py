@@ -227,6 +227,15 @@ def test_a_path_that_loops_tore_is_a_failed_map(lap: Recorded, steps: int) -> No
     assert "jump" in codes(replace(lap, poses=torn, odometry=None))[1]
 
 
+def test_a_few_scans_beside_the_path_do_not_condemn_the_map(lap: Recorded) -> None:
+    beside = lap.poses.copy()
+    beside[50:54, 0] += 7.0
+    found = weigh(replace(lap, poses=beside))
+    (reason,) = [each for each in found.reasons if each.code == "jump"]
+    assert reason.verdict == "check"
+    assert "misplaced" in reason.text
+
+
 def test_loops_that_contradict_each_other_are_reported(lap: Recorded) -> None:
     assert codes(replace(lap, torn=np.array([(20, 120), (30, 140)]))) == ("check", ["torn-loop"])
 

@@ -43,6 +43,37 @@ def list_beams(ranges: F32, limits: F32, beams: I32, hit_of_beam: I32, clean: F3
 
 
 @njit(cache=True, nogil=True)
+def drop_isolated(ranges: F32, limits: F32, spacing: float, kept: F32) -> tuple[int, int]:
+    """Write the ranges to `kept` (n,), isolated hits as NaN; returns how many hit, and how many of these are isolated.
+
+    A hit is isolated if none of the two beams on each side hit the same wall: none is as near as a wall seen at 10 deg
+    would leave it (`spacing` is the angle between beams in rad). Hits are finite and within the `limits` (2,).
+    """
+    hits = 0
+    isolated = 0
+    n = len(ranges)
+    for i in range(n):
+        kept[i] = ranges[i]
+        a = np.float64(ranges[i])
+        if not (np.isfinite(a) and limits[0] <= ranges[i] <= limits[1]):
+            continue
+        hits += 1
+        is_alone = True
+        for k in (i - 2, i - 1, i + 1, i + 2):
+            if k < 0 or k >= n or not (np.isfinite(ranges[k]) and limits[0] <= ranges[k] <= limits[1]):
+                continue
+            b = np.float64(ranges[k])
+            angle = abs(k - i) * spacing
+            gap = sqrt(max(a * a + b * b - 2.0 * a * b * cos(angle), 0.0))
+            if gap <= 0.1 + 6.0 * angle * min(a, b):
+                is_alone = False
+        if is_alone:
+            isolated += 1
+            kept[i] = np.float32(np.nan)
+    return hits, isolated
+
+
+@njit(cache=True, nogil=True)
 def fit_surfels(
     points: F32, beams: I32, spacing: float, radius: float, normals: F32, centroids: F32, origin: F64
 ) -> None:

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.kernels.surfels import drop_isolated
 from hsloc.model.events import Heading, Odometry, PairedScan, Scan, Truth
 from hsloc.model.pose2 import IDENTITY, Pose2, relative_poses
 from hsloc.model.trajectory import Trajectory
@@ -57,6 +58,9 @@ _MOVED_M, _MOVED_RAD = 0.05, 0.05
 """Motion (m, rad) after which no scan is the same: several times the steps in which lidars give ranges."""
 _FROZEN_M = 0.5
 """Way (m) without a scan from which on a result is worth a look: then odometry errs by centimetres."""
+_MOST_ISOLATED = 0.05
+"""Part of the hits of a scan from which on isolated ones are left out of it: more than thin things are. Usual are 1, 1
+and 3 % on Intel, Freiburg 079 and ACES; of 100 scans 5 have more than 6, 3 and 9 %."""
 _STUCK_SHARE = 0.5
 """Scans with the stamp of the one before that are no chance, as a part of all."""
 _END_S, _LONGEST_END_S = 2.0, 1e6
@@ -350,3 +354,19 @@ def _is_bare(scan: Scan) -> bool:
     """Whether a scan may look the same from another place: it has few returns, or all at one range."""
     ranges = scan.ranges[np.isfinite(scan.ranges)]
     return len(ranges) < _LEAST_HITS or bool(np.ptp(ranges) == 0.0)
+
+
+def without_isolated(events: Iterable[Event]) -> Iterator[Event]:
+    """The events; scans of which many hits are isolated without these: rain, dust, sunlight, a bad receiver.
+
+    They lie in free space, and make places look unlike themselves. Few are thin things, as legs of a chair, and stay.
+    """
+    for event in events:
+        if isinstance(event, Scan):
+            kept = np.empty(len(event.ranges), dtype=np.float32)
+            limits = np.array((event.range_min, event.range_max)).astype(np.float32)
+            hits, isolated = drop_isolated(event.ranges, limits, abs(event.angle_increment), kept)
+            if isolated > _MOST_ISOLATED * hits:
+                yield replace(event, ranges=kept)
+                continue
+        yield event

@@ -13,7 +13,7 @@ from hsloc.errors import ConfigError, LogError
 from hsloc.kernels.cache import compilation_reported
 from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.preprocessing.odometry import ContinuousOdometry, OdometryWatch, UnusableOdometry
-from hsloc.preprocessing.scans import ScanWatch
+from hsloc.preprocessing.scans import ScanWatch, without_isolated
 from hsloc.replay.clock_offset import ClockEvidence, LateScans, clock_offsets, offsets_of_mapping, open_as_meant
 from hsloc.replay.engine import rarely_collected, replay
 from hsloc.replay.estimators import make_localiser, make_mapper
@@ -323,13 +323,14 @@ def _events(request: RunRequest, log: Log, lidar_only: bool, localise: bool) -> 
     """
     if not lidar_only:
         # The point mapper cannot do without odometry, whatever that is like.
-        return log.events() if request.config.mapper == "point" and not localise else OdometryWatch(log.events())
+        events = log.events() if request.config.mapper == "point" and not localise else OdometryWatch(log.events())
+        return events if localise else without_isolated(events)
     unused = (Odometry, Heading) if request.no_odometry else (Odometry,)
     events = (event for event in log.events() if not isinstance(event, unused))
     if localise:
         rng = np.random.default_rng((request.seed, 1))
         return with_laser_odometry(events, request.config.graph_mapper.front_end, rng)
-    return events
+    return without_isolated(events)
 
 
 def _share(progress: Callable[[Progress], None] | None, total: float, scans: int) -> Callable[[float], None] | None:

@@ -1,0 +1,36 @@
+"""Hits that stand alone are left out of a scan where they are many, as in rain or dust; few are thin things."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hsloc.model import Odometry, Pose2, Scan
+from hsloc.preprocessing.scans import without_isolated
+
+ROOM = (3.0 / np.maximum(*np.abs([np.cos(np.radians(np.arange(360))), np.sin(np.radians(np.arange(360)))]))).astype(
+    "f4"
+)
+
+
+def scan_with(outliers: int) -> tuple[Scan, np.ndarray]:
+    """A square room of 6 m, some of whose ranges are too short, four beams and more apart."""
+    rows = np.arange(outliers) * (360 // outliers)
+    ranges = ROOM.copy()
+    ranges[rows] *= np.random.default_rng(0).uniform(0.2, 0.7, outliers).astype(np.float32)
+    return Scan(0, ranges, 0.0, np.radians(1.0), 0.1, 10.0), rows
+
+
+@pytest.mark.parametrize(("outliers", "are_dropped"), [(9, False), (17, False), (19, True), (60, True)])
+def test_isolated_hits_are_dropped_where_they_are_many(outliers: int, are_dropped: bool) -> None:
+    scan, rows = scan_with(outliers)
+    odometry = Odometry(1, Pose2(0.0, 0.0, 0.0))
+    kept, same = without_isolated([scan, odometry])
+    assert same is odometry
+    assert isinstance(kept, Scan)
+    if not are_dropped:
+        assert kept is scan
+        return
+    others = np.setdiff1d(np.arange(360), rows)
+    assert np.isnan(kept.ranges[rows]).all()
+    assert np.array_equal(kept.ranges[others], scan.ranges[others])

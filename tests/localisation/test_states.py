@@ -111,7 +111,7 @@ def test_an_ambiguous_stretch_names_its_places() -> None:
     assert [place.pose.x for place in track.places] == [0.25 * 9, 50.0]
     assert 0.5 < track.places[0].probability < 0.9
     (reason,) = localisation_reasons(log.at_odometry(16), path(16), (search, track))
-    assert f"as x {track.places[0].pose.x:.1f} m, y 0.0 m (" in reason.text
+    assert f"at x {track.places[0].pose.x:.1f} m, y 0.0 m (" in reason.text
 
 
 def test_scans_before_a_relocalisation_belong_to_the_track_that_was_found() -> None:

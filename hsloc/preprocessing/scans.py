@@ -15,8 +15,9 @@ has a scan of about the same time; the last of them has the others as companions
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from dataclasses import replace
+from statistics import median
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,8 +60,10 @@ _MOVED_M, _MOVED_RAD = 0.05, 0.05
 _FROZEN_M = 0.5
 """Way (m) without a scan from which on a result is worth a look: then odometry errs by centimetres."""
 _MOST_ISOLATED = 0.05
-"""Part of the hits of a scan from which on isolated ones are left out of it: more than thin things are. Usual are 1, 1
-and 3 % on Intel, Freiburg 079 and ACES; of 100 scans 5 have more than 6, 3 and 9 %."""
+"""Part of the hits of a scan, and of half of those before it, from which on isolated ones are left out: more than thin
+things are. Usual are 1, 1 and 3 % on Intel, Freiburg 079 and ACES, 8 % with a tenth of the ranges of Intel shortened."""
+_RECENT_SCANS, _LEAST_SCANS = 51, 10
+"""Scans of a laser, at most and at least, of which half must have as many: one place may be full of thin things."""
 _STUCK_SHARE = 0.5
 """Scans with the stamp of the one before that are no chance, as a part of all."""
 _END_S, _LONGEST_END_S = 2.0, 1e6
@@ -357,16 +360,19 @@ def _is_bare(scan: Scan) -> bool:
 
 
 def without_isolated(events: Iterable[Event]) -> Iterator[Event]:
-    """The events; scans of which many hits are isolated without these: rain, dust, sunlight, a bad receiver.
+    """The events; where many hits of a laser are isolated, scan after scan, without these: rain, dust, a bad receiver.
 
     They lie in free space, and make places look unlike themselves. Few are thin things, as legs of a chair, and stay.
     """
+    recent: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_RECENT_SCANS))
     for event in events:
         if isinstance(event, Scan):
             kept = np.empty(len(event.ranges), dtype=np.float32)
             limits = np.array((event.range_min, event.range_max)).astype(np.float32)
             hits, isolated = drop_isolated(event.ranges, limits, abs(event.angle_increment), kept)
-            if isolated > _MOST_ISOLATED * hits:
+            shares = recent[event.frame_id]
+            shares.append(isolated / max(hits, 1))
+            if len(shares) >= _LEAST_SCANS and shares[-1] > _MOST_ISOLATED and median(shares) > _MOST_ISOLATED:
                 yield replace(event, ranges=kept)
                 continue
         yield event

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -25,8 +27,9 @@ def scan_with(outliers: int) -> tuple[Scan, np.ndarray]:
 def test_isolated_hits_are_dropped_where_they_are_many(outliers: int, are_dropped: bool) -> None:
     scan, rows = scan_with(outliers)
     odometry = Odometry(1, Pose2(0.0, 0.0, 0.0))
-    kept, same = without_isolated([scan, odometry])
+    *before, kept, same = without_isolated([*[scan] * 10, odometry])
     assert same is odometry
+    assert all(each is scan for each in before), "too few to say that it lasts"
     assert isinstance(kept, Scan)
     if not are_dropped:
         assert kept is scan
@@ -34,3 +37,9 @@ def test_isolated_hits_are_dropped_where_they_are_many(outliers: int, are_droppe
     others = np.setdiff1d(np.arange(360), rows)
     assert np.isnan(kept.ranges[rows]).all()
     assert np.array_equal(kept.ranges[others], scan.ranges[others])
+
+
+def test_one_scan_or_another_laser_with_many_is_left_as_it_is() -> None:
+    (clean, _), (noisy, _) = scan_with(9), scan_with(60)
+    scans = [*[clean] * 20, noisy, *[replace(noisy, frame_id="rear")] * 9]
+    assert all(kept is scan for kept, scan in zip(without_isolated(scans), scans, strict=True))

@@ -354,7 +354,8 @@ def _torn_loops(r: Recorded) -> Reason | None:
 
 
 def _jumps(r: Recorded) -> Reason | None:
-    wrong, torn = (find(r.stamps_ns, r.poses, r.odometry) for find in (jumps, tears))
+    wrong = jumps(r.stamps_ns, r.poses, r.odometry)
+    torn = tears(wrong, r.poses, r.odometry)
     text = f"the map moves the robot faster than it drives in {counted(len(wrong), 'stretch')}: "
     text += "loops join places that only look alike, or it was carried" if torn else "scans within them are misplaced"
     return _reason(r, "jump", text, wrong, failed=bool(torn)) if wrong else None

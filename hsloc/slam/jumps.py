@@ -53,12 +53,11 @@ def jumps(stamps_ns: I64, poses: F64, odometry: F64 | None) -> list[tuple[int, i
     return [(first - 1, last) for first, last in spans_of(torn)]
 
 
-def tears(stamps_ns: I64, poses: F64, odometry: F64 | None) -> list[tuple[int, int]]:
+def tears(found: list[tuple[int, int]], poses: F64, odometry: F64 | None) -> list[tuple[int, int]]:
     """The jumps at which the path is torn: also from some keyscans before to some after it disagrees with the odometry.
 
     At the others only keyscans on one side of the jump are misplaced, and the map around them is not.
     """
-    found = jumps(stamps_ns, poses, odometry)
     return [jump for jump in found if odometry is None or not _is_bridged(poses, odometry, jump)]
 
 

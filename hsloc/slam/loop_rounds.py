@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from hsloc.slam.jumps import tears
+from hsloc.slam.jumps import jumps, tears
 from hsloc.slam.loop_closer import LoopCloser, loop_edges
 from hsloc.slam.pose_graph import Edges, compose_steps, solve_edges
 
@@ -43,7 +43,8 @@ def close_loops(
         edges = loop_edges(closer.accepted, places.reference, p.robust)
         poses = solve_edges(places.expand(closer.poses), Edges.concatenate([session.chain, edges]))
         # Across the gap between two logs nothing was driven.
-        torn = [] if session.ties or rounds_left == 0 else tears(session.stamps_ns, poses, odometry)
+        found = [] if session.ties or rounds_left == 0 else jumps(session.stamps_ns, poses, odometry)
+        torn = tears(found, poses, odometry)
         across = _across(closer.accepted, places.reference, torn)
         tearing = [pair for pair in across if pair not in session.asserted]
         if not tearing:

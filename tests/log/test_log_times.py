@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import log_formats
 import pytest
-from log_builders import START, describe, write_run
+from log_builders import START, describe
 
 from hsloc.log import check_log, open_log
 
@@ -19,19 +19,8 @@ SECOND = 1_000_000_000
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_run(tmp_path_factory.mktemp("times") / "run.mcap")
-
-
-@pytest.fixture(scope="module")
 def expected(plain: Path) -> list[tuple[str, int, float]]:
     return [describe(event) for event in open_log(plain).events()]
-
-
-@pytest.fixture(scope="module")
-def db3(plain: Path) -> Path:
-    (found,) = log_formats.bag2(plain, plain.with_name("bag2")).glob("*.db3")
-    return found
 
 
 @pytest.mark.parametrize("wrong", [2**64 - 5, 2**63 + 7, 0, START + 10**9 * SECOND])

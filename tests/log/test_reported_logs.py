@@ -17,7 +17,7 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
-from log_builders import describe, scan_payloads, write_raw, write_run
+from log_builders import describe, scan_payloads, write_raw
 
 from hsloc.errors import LogError, LogFormatError, TopicError
 from hsloc.log import ReadOptions, open_log
@@ -31,19 +31,8 @@ SECOND = 1_000_000_000
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_run(tmp_path_factory.mktemp("reported") / "run.mcap")
-
-
-@pytest.fixture(scope="module")
 def expected(plain: Path) -> list[tuple[str, int, float]]:
     return events_of(plain)
-
-
-@pytest.fixture(scope="module")
-def db3(plain: Path) -> Path:
-    (found,) = log_formats.bag2(plain, plain.with_name("bag2")).glob("*.db3")
-    return found
 
 
 @pytest.fixture(scope="module")

@@ -154,7 +154,7 @@ _ODOMETRY_TURN = 0.5
 """The same of the heading [rad]."""
 _WEAK_M = 0.125
 """Standard deviation [m] of the motion by the scans from which on a slip of half a metre, the largest that wheels were
-seen to make in a second, would not be noticed: as noticed counts what has 4 standard deviations (`slips`)."""
+seen to make in a second, may go unnoticed: it is four of these."""
 _HARM_M = 0.25
 """Displacement [m] of a part of the map from which on it is wrong: a doorway is missed by a quarter of its width."""
 _SLIPS_M = np.linspace(_HARM_M, 1.0, 16)

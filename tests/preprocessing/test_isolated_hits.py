@@ -43,3 +43,9 @@ def test_one_scan_or_another_laser_with_many_is_left_as_it_is() -> None:
     (clean, _), (noisy, _) = scan_with(9), scan_with(60)
     scans = [*[clean] * 20, noisy, *[replace(noisy, frame_id="rear")] * 9]
     assert all(kept is scan for kept, scan in zip(without_isolated(scans), scans, strict=True))
+
+
+def test_a_robot_that_waits_among_thin_things_keeps_them() -> None:
+    (clean, _), (thin, _) = scan_with(9), scan_with(60)
+    scans = [*[clean] * 200, *[thin] * 150]
+    assert all(kept is scan for kept, scan in zip(without_isolated(scans), scans, strict=True))

@@ -21,6 +21,7 @@ from hsloc.matching import LikelihoodField
 from hsloc.model import Event, OccupancyGrid, Pose2, Scan, wrap_angles
 from hsloc.replay.clock_offset import ClockEvidence
 from hsloc.replay.engine import replay
+from hsloc.replay.map_and_start import ScaleEvidence
 from hsloc.replay.run_history import RunHistory
 from hsloc.simulation import presets
 from hsloc.simulation.built_in import built_in
@@ -33,6 +34,7 @@ from hsloc.slam.time_offset import estimate_offset
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hsloc.localisation.map_scale import MapScale
     from hsloc.localisation.states import StateRows
 
 NOISE_20 = OdometryNoise(4e-2, 2.4e-3, 8e-2, 4e-2)
@@ -155,47 +157,76 @@ def scored(
 ) -> Scored:
     """Localise on a map; wrong are poses off by more than 0.25 m or 5 deg, and all where the map `is_wrong`.
 
-    As in `hsloc.run`, stamps of scans that turn out to be late or early are corrected, and the drive replayed again.
+    As in `hsloc.run`, the drive is replayed again with stamps of scans that turn out to be late or early corrected, and
+    on a map whose resolution turns out to be wrong with that corrected.
     """
     drive, state = list(drive), rng.bit_generator.state
-    field, config = LikelihoodField.from_grid(grid), Config()
-    found, evidence = _localised(drive, grid, field, start, rng, is_wrong)
+    found, before = _scored_on(drive, grid, start, rng, is_wrong)
+    if before.hints:
+        assert before.scale is not None
+        rng.bit_generator.state = state
+        begin = None if start is None else before.scale.moved(before.start)
+        again, after = _scored_on(drive, grid, begin, rng, is_wrong, before.scale)
+        if after.is_better(before):
+            return again
+    return found
+
+
+def _scored_on(
+    drive: list[Event],
+    grid: OccupancyGrid,
+    start: Pose2 | None,
+    rng: np.random.Generator,
+    is_wrong: bool,
+    scale: MapScale | None = None,
+) -> tuple[Scored, ScaleEvidence]:
+    """On the map, or on that of another scale; and what that shows of the scale."""
+    state, config = rng.bit_generator.state, Config()
+
+    def localised(each: list[Event]) -> tuple[Scored, ClockEvidence, ScaleEvidence]:
+        rng.bit_generator.state = state
+        return _localised(each, grid if scale is None else scale.applied(grid), start, rng, is_wrong, scale)
+
+    found, evidence, of_scale = localised(drive)
     if evidence.hints:
         offset = estimate_offset(drive, config.graph_mapper.front_end, np.random.default_rng(0))
         if offset.is_certain:
             by = round((offset.seconds - offset.half_sweep_s) * 1e9)
             moved = [replace(each, stamp_ns=each.stamp_ns - by) if isinstance(each, Scan) else each for each in drive]
             moved.sort(key=lambda event: event.stamp_ns)
-            rng.bit_generator.state = state
-            again, after = _localised(moved, grid, field, start, rng, is_wrong)
+            again, after, of_moved = localised(moved)
             if after.is_better(evidence):
-                return again
-    return found
+                return again, of_moved
+    return found, of_scale
 
 
 def _localised(
-    drive: Iterable[Event],
+    drive: list[Event],
     grid: OccupancyGrid,
-    field: LikelihoodField,
     start: Pose2 | None,
     rng: np.random.Generator,
     is_wrong: bool,
-) -> tuple[Scored, ClockEvidence]:
-    config = Config()
+    corrected: MapScale | None,
+) -> tuple[Scored, ClockEvidence, ScaleEvidence]:
+    field, config = LikelihoodField.from_grid(grid), Config()
     localiser = Localiser.from_parameters(grid, field, config.make_matcher(), config.localiser, rng, start)
     history = RunHistory(config.localiser.smoothing_model())
     for event, estimate in replay(drive, localiser):
         history.add(event, estimate)
     trajectory, _ = history.trajectory()
-    states = history.states(localiser.map_scale, history.mounting_error(), grid)
+    scale = localiser.map_scale
+    if scale is not None and corrected is not None:
+        scale = replace(scale, corrected=corrected.value)
+    states = history.states(scale, history.mounting_error(), grid)
     reference = history.reference()
     assert states is not None
     assert reference is not None
     off = trajectory.poses - reference.poses
     off[:, 2] = wrap_angles(off[:, 2])
     wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.25) | (np.abs(off[:, 2]) > np.radians(5.0)) | is_wrong
-    evidence = ClockEvidence.of(history.diagnostics(), history.odometry(), trajectory, states.is_localised())
-    return Scored(off, wrong, states), evidence
+    of_clock = ClockEvidence.of(history.diagnostics(), history.odometry(), trajectory, states.is_localised())
+    of_scale = ScaleEvidence.of(scale, history.diagnostics(), history.odometry(), trajectory)
+    return Scored(off, wrong, states), of_clock, of_scale
 
 
 def measure(name: str, seed: int, is_known: bool) -> str:

@@ -128,7 +128,10 @@ class WarningCode(StrEnum):
     STRAY_SCAN = "stray_scan"
     """Single scans of a built map that were rejected do not fit the scans around them: they are beside their place."""
     MAP_SCALE = "map_scale"
-    """The map is larger or smaller than what the lidar measures: the resolution in its YAML may be wrong."""
+    """The map is larger or smaller than what the lidar measures: the resolution in its YAML may be wrong.
+
+    Where the odometry agrees with the lidar, another resolution was used.
+    """
     MAP_MIRRORED = "map_mirrored"
     """The mirrored scans fit the map better than the scans: its image is mirrored, or the angles of the laser are."""
     PLAN_NOT_FOUND = "plan_not_found"

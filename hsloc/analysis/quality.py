@@ -112,16 +112,26 @@ def _plan_warnings(mapping: MappingResult, result: Result) -> list[RunWarning]:
 
 
 def _scale_warnings(result: Result) -> list[RunWarning]:
-    scale, cell = result.map_scale, result.grid.resolution
-    if scale is None or not scale.is_significant:
+    scale, given = result.map_scale, result.given_resolution
+    if scale is None or not (scale.is_significant or given is not None):
         return []
-    size = "larger" if scale.value > 1.0 else "smaller"
+    value, cell = scale.of_given_map, result.grid.resolution if given is None else given
+    size = "larger" if value > 1.0 else "smaller"
+    if given is None:
+        so = f"poses are off by {abs(value - 1.0):.3f} m per metre from the map's corner"
+        remedy = f"if the ranges are right, set resolution: {cell / value:.5g} in the map's YAML (it is {cell:g})"
+    else:
+        so = "the odometry agrees with the lidar, so the map was used with another resolution"
+        remedy = (
+            f"set resolution: {result.grid.resolution:.5g} in the map's YAML (it is {cell:g}), where the poses are; "
+            "for poses on the map as it is, --set localiser.correct_map_scale=false"
+        )
     return [
         RunWarning(
             WarningCode.MAP_SCALE,
-            f"the map is {100 * abs(scale.value - 1.0):.1f} % {size} than the lidar measures: scale {scale.value:.4f} "
-            f"± {scale.sigma:.4f}, so poses are off by {abs(scale.value - 1.0):.3f} m per metre from the map's corner",
-            f"if the ranges are right, set resolution: {cell / scale.value:.5g} in the map's YAML (it is {cell:g})",
+            f"the map is {100 * abs(value - 1.0):.1f} % {size} than the lidar measures: scale {value:.4f} "
+            f"± {scale.sigma:.4f}; {so}",
+            remedy,
         )
     ]
 

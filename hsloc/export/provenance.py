@@ -45,7 +45,7 @@ def _options(result: Result) -> dict[str, Any]:
     del found["seed"]
     if request.map_path is not None:
         cells = sha256(grid.cells.tobytes()).hexdigest()
-        found["map"] = (cells, grid.resolution, grid.origin, grid.occupied_threshold)
+        found["map"] = (cells, result.given_resolution or grid.resolution, grid.origin, grid.occupied_threshold)
     if request.align_to is not None:
         found["align_to"] = [_sha256(path) for path in map_files(request.align_to)]
     if request.resume is not None:

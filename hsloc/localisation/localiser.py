@@ -80,6 +80,8 @@ class LocaliserParameters(Parameters):
     """Standard deviation of a given initial pose in x and y [m]."""
     initial_sigma_angle: Positive = radians(15.0)
     """Standard deviation of a given initial pose in heading [rad]."""
+    correct_map_scale: bool = True
+    """Whether a map whose resolution is wrong, as lidar and odometry agree, is corrected and the log replayed again."""
     certify: bool = False
     """Whether each match is followed by a proof that no pose of its window is fitter."""
     certificate: CertificateParameters = field(default_factory=CertificateParameters)
@@ -331,13 +333,7 @@ class Localiser:
         return match
 
     def _refuse(
-        self,
-        paired: PairedScan,
-        predicted: Pose2,
-        covariance: F64,
-        match: Match,
-        evaluations: int,
-        reason: str,
+        self, paired: PairedScan, predicted: Pose2, covariance: F64, match: Match, evaluations: int, reason: str
     ) -> Estimate:
         """The prediction stands; after too many refusals the pose is lost."""
         refusals = self._match_gate.refuse()

@@ -13,7 +13,7 @@ The same distances, averaged over each row of cells, show how well the walls are
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, hypot, inf, sin, sqrt
 from typing import TYPE_CHECKING
 
@@ -24,13 +24,14 @@ from hsloc.kernels.fitness import point_scores
 from hsloc.matching.covariance import CORRELATED, MAX_GAP, POINT_SIGMA
 from hsloc.matching.local_refinement import refine
 from hsloc.matching.window import Window
+from hsloc.model.pose2 import Pose2
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.model.events import PairedScan
-    from hsloc.model.pose2 import Pose2
+    from hsloc.model.occupancy_grid import OccupancyGrid
 
     F64 = NDArray[np.float64]
 
@@ -71,11 +72,16 @@ _DOUBTED_SIGMAS = 2.0
 
 @dataclass(frozen=True, slots=True)
 class MapScale:
-    """Length on the map by length as the lidar measures it, its standard deviation, and the map's corner (m)."""
+    """Length on the map by length as the lidar measures it, its standard deviation, and the map's corner (m).
+
+    Of a map whose cells were made larger or smaller before, `corrected` is by what their side was divided, and `value`
+    is what is left.
+    """
 
     value: float
     sigma: float
     corner: tuple[float, float] = (0.0, 0.0)
+    corrected: float = 1.0
 
     @property
     def is_significant(self) -> bool:
@@ -87,13 +93,35 @@ class MapScale:
         """Whether poses far from the map's corner may be wrong by the scale: it need not be beyond doubt for that."""
         return abs(self.value - 1.0) > max(_DOUBTED_SIGMAS * self.sigma, _LEAST)
 
+    @property
+    def of_given_map(self) -> float:
+        """The scale of the map as it was given."""
+        return self.value * self.corrected
+
+    def applied(self, grid: OccupancyGrid) -> OccupancyGrid:
+        """The map with cells of the size that the lidar measures; its corner stays where it is."""
+        return replace(grid, resolution=grid.resolution / self.value)
+
+    def moved(self, pose: Pose2) -> Pose2:
+        """A pose on the map: that in the same cell of the map of `applied`."""
+        x, y = self.corner
+        return Pose2(x + (pose.x - x) / self.value, y + (pose.y - y) / self.value, pose.theta)
+
+    @property
+    def moves_poses(self) -> bool:
+        """Whether poses may be wrong by the scale.
+
+        A resolution that is given is right by itself; one that was corrected is known to a standard deviation only.
+        """
+        return self.is_doubted or self.corrected != 1.0
+
     def pose_errors(self, poses: F64) -> F64:
         """Errors (n, 3) of poses (n, 3) that come from the scale (m, m, 0): the cells grow from the corner.
 
-        0 where the scale is not doubted.
+        0 where the scale moves no poses.
         """
         errors = np.zeros((len(poses), 3))
-        if self.is_doubted:
+        if self.moves_poses:
             largest = abs(self.value - 1.0) + self.sigma
             errors[:, :2] = largest * np.abs(poses[:, :2] - self.corner)
         return errors

@@ -7,11 +7,17 @@ given, the one the log states if it still holds, or unknown.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
+from math import log
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from hsloc.errors import MapError
 from hsloc.maps import read_map, read_metadata
 from hsloc.model.events import Odometry
+from hsloc.model.pose2 import Pose2
+from hsloc.replay.matched_scans import are_matched, is_lost
 from hsloc.slam.map_state import STATE_FILE, fingerprint, read_state
 from hsloc.slam.parameters import Resume
 from hsloc.warnings import RunWarning, WarningCode
@@ -21,11 +27,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hsloc.config import Config
+    from hsloc.localisation.map_scale import MapScale
     from hsloc.log import Log, LogSummary
     from hsloc.matching.match import Matcher
+    from hsloc.model.estimate import ScanDiagnostics
     from hsloc.model.events import Event
     from hsloc.model.occupancy_grid import OccupancyGrid
-    from hsloc.model.pose2 import Pose2
+    from hsloc.model.trajectory import Trajectory
     from hsloc.request import RunRequest
     from hsloc.slam.map_state import MapState
 
@@ -37,6 +45,9 @@ _FARTHEST = 5.0
 """Greatest path length [m] over which odometry carries a pose stated later back to the first event."""
 _OUTSIDE = 5.0
 """A start may lie so far outside the map (m): a robot may look into it from a part that was never drawn."""
+_CHORD_M, _SPACING_M = 3.0, 0.5
+"""Path length of a chord whose lengths by matches and by odometry are compared, and of two beginnings (m): matches are
+off by 1 to 2 cm."""
 _GIVE_START = "give the start with --initial-pose"
 
 
@@ -230,3 +241,67 @@ def _is_on(grid: OccupancyGrid, pose: Pose2) -> bool:
         -_OUTSIDE <= local.x <= width * grid.resolution + _OUTSIDE
         and -_OUTSIDE <= local.y <= height * grid.resolution + _OUTSIDE
     )
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleEvidence:
+    """What the result of a localiser shows of the scale of its map.
+
+    `fitness` is the mean of the matched scans; `by_odometry` is the length of its way by that of the odometry, NaN if
+    that is not known; `is_lost` says that most scans found no match. `start` is T_map_base at the first message of the
+    odometry, by the first match: a start that is given was weighed against it.
+    """
+
+    scale: MapScale | None
+    fitness: float
+    by_odometry: float
+    is_lost: bool
+    start: Pose2
+
+    @classmethod
+    def of(
+        cls, scale: MapScale | None, scans: ScanDiagnostics, odometry: Trajectory, trajectory: Trajectory
+    ) -> ScaleEvidence:
+        """Of a localiser's result with one pose for each message of the odometry."""
+        matched = are_matched(scans.status)
+        fitness = float(scans.fitness[matched].mean()) if matched.any() else 0.0
+        k = 0
+        if matched.any():
+            first = np.searchsorted(odometry.stamps_ns, scans.stamps_ns[np.argmax(matched)], side="right")
+            k = min(int(first), len(odometry) - 1)
+        there, odom, begin = (
+            Pose2.from_array(pose) for pose in (trajectory.poses[k], odometry.poses[k], odometry.poses[0])
+        )
+        ratio = _length_ratio(trajectory, odometry)
+        return cls(scale, fitness, ratio, is_lost(scans.status), there @ odom.between(begin))
+
+    @property
+    def hints(self) -> bool:
+        """Whether map and lidar differ beyond doubt, so that it is worth while to replay on a corrected map."""
+        return self.scale is not None and self.scale.is_significant and not self.is_lost
+
+    def is_better(self, before: ScaleEvidence) -> bool:
+        """Whether the map was wrong, by this run on the corrected one.
+
+        Its scans fit better than `before`, and nothing is left of the error. Lidar and map alone do not tell which of
+        them is wrong, so the odometry has to measure lengths more like the lidar than like the map. Lengths of `before`
+        do not show it: scans that fit nowhere put poses up to 0.3 m aside.
+        """
+        if self.scale is None or before.scale is None or self.scale.is_doubted:
+            return False
+        if self.is_lost or not self.by_odometry > 0.0:
+            return False
+        from_lidar = log(self.by_odometry)
+        agrees = abs(from_lidar) < abs(from_lidar + log(before.scale.value))
+        return agrees and self.fitness > before.fitness
+
+
+def _length_ratio(trajectory: Trajectory, odometry: Trajectory) -> float:
+    """Median of the lengths of chords of a trajectory by those of the odometry; NaN for a robot that hardly moved."""
+    steps = np.hypot(*np.diff(odometry.poses[:, :2], axis=0).T)
+    way = np.concatenate(((0.0,), np.cumsum(steps)))
+    begins = np.arange(0.0, way[-1] - _CHORD_M, _SPACING_M)
+    first, last = np.searchsorted(way, begins), np.searchsorted(way, begins + _CHORD_M)
+    ours, theirs = (np.hypot(*(each.poses[last] - each.poses[first])[:, :2].T) for each in (trajectory, odometry))
+    straight = theirs > 0.5 * _CHORD_M
+    return float(np.median(ours[straight] / theirs[straight])) if straight.any() else float("nan")

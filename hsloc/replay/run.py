@@ -17,7 +17,7 @@ from hsloc.preprocessing.scans import ScanWatch, without_isolated
 from hsloc.replay.clock_offset import ClockEvidence, LateScans, clock_offsets, offsets_of_mapping, open_as_meant
 from hsloc.replay.engine import rarely_collected, replay
 from hsloc.replay.estimators import make_localiser, make_mapper
-from hsloc.replay.map_and_start import find_map, find_start, first_odometry, load_state, require_map
+from hsloc.replay.map_and_start import ScaleEvidence, find_map, find_start, first_odometry, load_state, require_map
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory, pose_covariances
 from hsloc.request import RunRequest
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from hsloc.model.estimate import Ambiguity, ScanDiagnostics
     from hsloc.model.events import Event
     from hsloc.model.occupancy_grid import OccupancyGrid
+    from hsloc.model.pose2 import Pose2
     from hsloc.model.trajectory import Trajectory
     from hsloc.replay.engine import Estimator
     from hsloc.slam.result import MappingResult
@@ -93,6 +94,8 @@ class Result:
     states: StateRows | None = None
     tracked: NDArray[np.bool_] | None = None
     map_scale: MapScale | None = None
+    given_resolution: float | None = None
+    """Side of a cell of the map as it was given (m), where that was wrong and `grid` has another."""
     mounting_error: MountingError | None = None
     ambiguities: tuple[Ambiguity, ...] = ()
     lidar_only: bool = False
@@ -133,6 +136,10 @@ class Result:
         """Whether the stamps of scans and odometry agree, by the headings of a localiser's result with odometry."""
         return ClockEvidence.of(self.diagnostics, self.odometry, self.trajectory, self.localised)
 
+    def scale_evidence(self) -> ScaleEvidence:
+        """Which scale the map has, by a localiser's result with odometry."""
+        return ScaleEvidence.of(self.map_scale, self.diagnostics, self.odometry, self.trajectory)
+
     @property
     def matcher_name(self) -> str | None:
         """The scan matcher that was used; None for the graph mapper, which has its own."""
@@ -169,9 +176,35 @@ def run(
 
 
 def _run(request: RunRequest, progress: Callable[[Progress], None] | None) -> Result:
-    """The run; without the odometry of the log where that proves unusable on the way."""
+    """The run; on a map of another scale where that proves wrong on the way."""
+    result = _run_on(request, progress)
+    if result.mode != "localise" or result.lidar_only or not request.config.localiser.correct_map_scale:
+        return result
+    if result.map_scale is None or not result.map_scale.is_significant:
+        return result
+    evidence = result.scale_evidence()
+    if evidence.hints:
+        again = _run_on(request, progress, (result.map_scale, evidence.start))
+        if again.scale_evidence().is_better(evidence):
+            return replace(again, seconds=_sum(result.seconds, again.seconds))
+    return result
+
+
+def _sum(first: Mapping[str, float], second: Mapping[str, float]) -> dict[str, float]:
+    return {name: value + second[name] for name, value in first.items()}
+
+
+def _run_on(
+    request: RunRequest,
+    progress: Callable[[Progress], None] | None,
+    correction: tuple[MapScale, Pose2] | None = None,
+) -> Result:
+    """The run on the map, or with `correction` on that of its scale with the first pose as the start if one is given.
+
+    Without the odometry of the log where that proves unusable on the way.
+    """
     try:
-        result = _run_with(request, progress, lidar_only=request.no_odometry)
+        result = _run_with(request, progress, lidar_only=request.no_odometry, correction=correction)
     except UnusableOdometry as error:
         warning = RunWarning(
             WarningCode.ODOMETRY_UNUSABLE,
@@ -194,9 +227,11 @@ def _run(request: RunRequest, progress: Callable[[Progress], None] | None) -> Re
     offsets, option = clock_offsets(request, result.reading or request.reading(), deskew=result.deskewed)
     if option is not None:
         warnings = tuple(warning for _, warning in clock_warnings(offsets, removed=True))
-        again = _run_with(request, progress, lidar_only=False, warnings=warnings, time_offset=option)
+        again = _run_with(
+            request, progress, lidar_only=False, warnings=warnings, time_offset=option, correction=correction
+        )
         if again.clock_evidence().is_better(evidence):
-            seconds = {name: value + again.seconds[name] for name, value in result.seconds.items()}
+            seconds = _sum(result.seconds, again.seconds)
             certain = {topic: offset for topic, offset in offsets.items() if offset.is_certain}
             return replace(again, seconds=seconds, corrected_offsets=certain)
     return replace(result, clock_offsets=offsets)
@@ -209,6 +244,7 @@ def _run_with(
     lidar_only: bool,
     warnings: tuple[RunWarning, ...] = (),
     time_offset: str | None = None,
+    correction: tuple[MapScale, Pose2] | None = None,
 ) -> Result:
     begin = time.perf_counter()
     log, reading, of_log = open_as_meant(request, lidar_only, time_offset)
@@ -227,6 +263,7 @@ def _run_with(
         or (request.no_odometry and request.map_path is None)
     )
     localise = request.mode == "localise" or (grid is not None and not builds)
+    given_resolution: float | None = None
     opened = time.perf_counter()
     if progress is not None:
         progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
@@ -235,6 +272,10 @@ def _run_with(
             raise ConfigError("loops are stated for a map that is built; add --mode slam, or leave them out")
         start, of_start = find_start(request, log, require_map(grid))
         warnings = (*warnings, *of_start)
+        if correction is not None:
+            scale_before, first_pose = correction
+            given_resolution, grid = require_map(grid).resolution, scale_before.applied(require_map(grid))
+            start = None if start is None else scale_before.moved(first_pose)
         likelihood = request.config.make_field(require_map(grid))
         localiser = make_localiser(request, require_map(grid), likelihood, start)
         estimator: Estimator = localiser
@@ -275,6 +316,8 @@ def _run_with(
         grid = estimator.grid()
     trajectory, localised = history.trajectory() if mapping is None else history.mapped(mapping)
     scale = None if localiser is None else localiser.map_scale
+    if scale is not None and correction is not None:
+        scale = replace(scale, corrected=correction[0].value)
     mounting = history.mounting_error() if localise else None
     states = history.states(scale, mounting, grid) if localise else None
     tracked = localised
@@ -300,6 +343,7 @@ def _run_with(
         states=states,
         tracked=tracked,
         map_scale=scale,
+        given_resolution=given_resolution,
         mounting_error=mounting,
         ambiguities=history.ambiguities(states),
         lidar_only=lidar_only,

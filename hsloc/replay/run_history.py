@@ -258,8 +258,8 @@ class RunHistory:
             rows = with_odometry_alone(
                 rows, poses, self._states.scanned, self._is_alone(), lambda motion: factor * noise.covariance(motion)
             )
-        if scale is not None and scale.is_doubted:
-            reason = f"the scale of the map is {scale.value:.3f} ± {scale.sigma:.3f}"
+        if scale is not None and scale.moves_poses:
+            reason = f"the scale of the map is {scale.of_given_map:.3f} ± {scale.sigma:.3f}"
             rows = with_pose_errors(rows, scale.pose_errors(self.trajectory()[0].poses), reason)
         if mounting is not None and mounting.is_significant:
             errors = mounting.pose_errors(self.trajectory()[0].poses)

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, multiple, rule
+from live_service import IN_MEMORY
 from sqlalchemy import update
 from test_leases import Parts
 
@@ -61,7 +62,7 @@ class Histories(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.root = Path(tempfile.mkdtemp())
+        self.root = Path(tempfile.mkdtemp(dir=IN_MEMORY))
         self.parts = Parts(self.root)
         self.leases = self.parts.leases(lease_s=1000.0, max_attempts=MAX_ATTEMPTS)
         self.models: dict[str, Model] = {}
@@ -222,7 +223,7 @@ class Histories(RuleBasedStateMachine):
 
 
 Histories.TestCase.settings = settings(
-    max_examples=40,
+    max_examples=25,
     stateful_step_count=30,
     derandomize=True,
     suppress_health_check=[HealthCheck.too_slow],

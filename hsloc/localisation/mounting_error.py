@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import hypot, inf, radians
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,15 +29,17 @@ if TYPE_CHECKING:
 
 _FEWEST = 40
 """Steps below which nothing is said: about 8 m."""
-_BLOCKS = 10
+PARTS = 10
 """Parts of the run whose errors count as independent of each other: what odometry gets wrong lasts for many steps."""
 _LEAST_OTHER_SIDE = 0.1
 """Part of the rotation that goes to the other side, at least: to one side alone, slip looks like another place."""
 _LONGEST_M = 1.0
 """Steps that are longer hold refused scans (m)."""
-_MIN_SIGMAS = 7.0
+MIN_SIGMAS = 7.0
 """Minimum ratio of an error to its standard deviation: once in 16,000 runs, as it is Student's of 9 degrees of freedom:
 4 would be once in 320. True errors of 10 cm and 3 deg have ratios of 10 to 13 after a minute."""
+PRIOR = 1e-6
+"""Information of the prior, so that what no step shows is found to be zero."""
 _LEAST_M, _LEAST_RAD = 0.05, radians(2.0)
 """Smaller errors are not reported: a ruler and an eye do no better."""
 
@@ -56,12 +58,12 @@ class MountingError:
     def is_displaced(self) -> bool:
         """Whether the place is wrong beyond doubt, and by enough to matter."""
         size = hypot(self.error.x, self.error.y)
-        return size > max(_LEAST_M, _MIN_SIGMAS * hypot(*self.sigma[:2]))
+        return size > max(_LEAST_M, MIN_SIGMAS * hypot(*self.sigma[:2]))
 
     @property
     def is_turned(self) -> bool:
         """Whether the yaw is wrong beyond doubt, and by enough to matter."""
-        return abs(self.error.theta) > max(_LEAST_RAD, _MIN_SIGMAS * self.sigma[2])
+        return abs(self.error.theta) > max(_LEAST_RAD, MIN_SIGMAS * self.sigma[2])
 
     @property
     def is_significant(self) -> bool:
@@ -105,17 +107,25 @@ def mounting_error(anchors: Sequence[Anchor]) -> MountingError | None:
         weight = 1.0 / scale**2 / (1.0 + ((residual / scale) ** 2).sum(axis=1, keepdims=True) / 4.0)
         information = np.einsum("nip,ni,niq->npq", rows, weight, rows)
         vectors = np.einsum("nip,ni,ni->np", rows, weight, apart)
-        values = np.linalg.solve(information.sum(axis=0) + 1e-6 * np.eye(4), vectors.sum(axis=0))
-    block = np.arange(len(step)) * _BLOCKS // len(step)
-    total, sums = information.sum(axis=0) + 1e-6 * np.eye(4), vectors.sum(axis=0)
-    without = np.array(
-        [
-            np.linalg.solve(total - information[block == k].sum(axis=0), sums - vectors[block == k].sum(axis=0))
-            for k in range(_BLOCKS)
-        ]
-    )
-    sigma = np.sqrt((_BLOCKS - 1) / _BLOCKS * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
+        values = np.linalg.solve(information.sum(axis=0) + PRIOR * np.eye(4), vectors.sum(axis=0))
+    without = without_each_part(information, vectors, PARTS)
+    sigma = np.sqrt((PARTS - 1) / PARTS * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     x, y, yaw = values[1:].tolist()
     if is_one_sided:
         return MountingError(Pose2(0.0, 0.0, yaw), (inf, inf, float(sigma[3])))
     return MountingError(Pose2(x, y, yaw), (float(sigma[1]), float(sigma[2]), float(sigma[3])))
+
+
+def without_each_part(information: NDArray[Any], vectors: NDArray[Any], parts: int) -> NDArray[Any]:
+    """Solutions (parts, p) of normal equations without each of so many parts of their rows in turn (jackknife).
+
+    `information` (n, p, p) and `vectors` (n, p), real or complex, are those of each row.
+    """
+    part = np.arange(len(vectors)) * parts // len(vectors)
+    total, sums = information.sum(axis=0) + PRIOR * np.eye(vectors.shape[1]), vectors.sum(axis=0)
+    return np.array(
+        [
+            np.linalg.solve(total - information[part == k].sum(axis=0), sums - vectors[part == k].sum(axis=0))
+            for k in range(parts)
+        ]
+    )

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import HslocError
+from hsloc.localisation.mounting_error import MIN_SIGMAS, PARTS, PRIOR, without_each_part
 from hsloc.log import laser_mounting, open_log
 from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import Pose2, relative_poses, wrap_angle, wrap_angles
@@ -56,12 +57,11 @@ _LEAST_T = 3.0
 """Minimum t of the difference of two mountings: were both equally wrong, one would be chosen in one of 200 logs."""
 
 
-_SCANS_OF_DIRECTION = 600
-"""Scans that are matched to see where a laser looks: a minute, in which a robot drives 20 m."""
+_LOOKS = (40, 60, 90, 135, 200, 300, 450, 600)
+"""Numbers of scans after which it is looked whether it is settled where a laser looks: each half as many again, so that
+few are matched in vain. The last are a minute, in which a robot drives 20 m."""
 _LEAST_RAD = radians(10.0)
 """Smallest error of a yaw that is looked for here. Smaller ones leave the matches on a map right, and show in them."""
-_PARTS, _MIN_SIGMAS = 10, 7.0
-"""Parts of the log, and minimum ratio to the standard deviation: as for errors of a mounting by matches on a map."""
 _FEWEST_OF_DIRECTION = 20
 """Minimum number of steps: 4 m, two in each part."""
 _SCALES_OF_DIRECTION = (0.5, 2.0)
@@ -124,10 +124,9 @@ def direction_warnings(
             time_offset=None if options.time_offset == AUTO else options.time_offset,
         )  # fmt: skip
         opened = log if reading == options else open_log(paths, reading)
-        motion = _motion(opened.events(), parameters, _SCANS_OF_DIRECTION)
-        error, place_sigma, sigma = _direction(motion)
+        error, place_sigma, sigma = _direction(_motions(opened.events(), parameters, _LOOKS))
         yaw = error.theta
-        if abs(yaw) <= max(_LEAST_RAD, _MIN_SIGMAS * sigma):
+        if abs(yaw) <= max(_LEAST_RAD, MIN_SIGMAS * sigma):
             continue
         looks = f"turned by {degrees(yaw):.0f} deg" if abs(yaw) < pi - _LEAST_RAD else "backwards"
         where = "is assumed to" if extrinsics == "identity" else f"is stated to ({extrinsics})"
@@ -135,7 +134,7 @@ def direction_warnings(
         pose = error @ mounting if is_placed else Pose2(mounting.x, mounting.y, wrap_angle(mounting.theta + yaw))
         text = (
             f"the laser{f' of {topic}' if topic else ''} looks {looks} from where it {where}, by its scans and the "
-            f"odometry (+- {degrees(sigma):.1f} deg)"
+            f"odometry (± {degrees(sigma):.1f} deg)"
         )
         place = "the place exactly" if is_placed else "the place, which is not known yet"
         remedy = f"--laser-pose={pose.x:.3f},{pose.y:.3f},{pose.theta:.3f}; hsloc calibrate finds {place}"
@@ -143,7 +142,24 @@ def direction_warnings(
     return found
 
 
-def _direction(motion: _Motion) -> tuple[Pose2, float, float]:
+def _direction(motions: Iterable[_Motion]) -> tuple[Pose2, float, float]:
+    """As `_direction_by`, of the first of these motions, each longer than the one before, that settles it, or the last.
+
+    Settled is that the laser looks where it is said to, as far beyond doubt as an error must be, and that its steps
+    agree with those of the odometry: among pillars some matches are wrong, in either direction. Of a laser that looks
+    elsewhere the pose is stated, and all that is measured of it counts.
+    """
+    found = Pose2(), inf, inf
+    for motion in motions:
+        found = _direction_by(motion)
+        seen, driven = motion.by_scans[:, :2], motion.by_odometry[:, :2]
+        agree = np.sum(seen * driven) >= LEAST_AGREEMENT * sqrt(float(np.sum(seen**2) * np.sum(driven**2)))
+        if agree and abs(found[0].theta) + MIN_SIGMAS * found[2] < _LEAST_RAD:
+            break
+    return found
+
+
+def _direction_by(motion: _Motion) -> tuple[Pose2, float, float]:
     """The laser is at this pose `@` its mounting; standard deviations of place (m) and yaw (rad), infinite: not known.
 
     A laser that is mounted elsewhere by a place p and a yaw sees a step S of the base as
@@ -166,22 +182,15 @@ def _direction(motion: _Motion) -> tuple[Pose2, float, float]:
         weight = 1.0 / (1.0 + (misfit / scale) ** 2)
         information = np.einsum("np,n,nq->npq", rows.conj(), weight, rows)
         vectors = rows.conj() * (weight * seen)[:, None]
-        prior = 1e-6 * np.eye(2)
-        values = np.linalg.solve(information.sum(axis=0) + prior, vectors.sum(axis=0))
-    part = np.arange(len(seen)) * _PARTS // len(seen)
-    without = np.array(
-        [
-            np.linalg.solve(information[part != k].sum(axis=0) + prior, vectors[part != k].sum(axis=0))
-            for k in range(_PARTS)
-        ]
-    )
+        values = np.linalg.solve(information.sum(axis=0) + PRIOR * np.eye(2), vectors.sum(axis=0))
+    without = without_each_part(information, vectors, PARTS)
     low, high = _SCALES_OF_DIRECTION
     if not all(low < abs(each) < high for each in (values[0], *without[:, 0])):
         return nothing
     every = np.vstack((values, without))
     turns = every[:, 0].conj() / np.abs(every[:, 0])  # e^(i yaw)
     places = every[:, 1] * turns
-    spread = (_PARTS - 1) / _PARTS
+    spread = (PARTS - 1) / PARTS
     yaw_sigma = sqrt(spread * float(np.sum(np.angle(turns[1:] / turns[0]) ** 2)))
     place_sigma = sqrt(spread * float(np.sum(np.abs(places[1:] - places[0]) ** 2)))
     error = Pose2(float(places[0].real), float(places[0].imag), float(np.angle(turns[0])))
@@ -239,7 +248,7 @@ def _in_words(transform: Transform3) -> str:
 
 def _misfits(options: ReadOptions, paths: Sequence[Path], parameters: FrontEndParameters) -> F64:
     """What the steps of scans and odometry differ in (m), a scale of the odometry allowed for; rotations by a lever."""
-    motion = _motion(open_log(paths, options).events(), parameters)
+    *_, motion = _motions(open_log(paths, options).events(), parameters, (_MOST_SCANS,))
     seen, driven = motion.by_scans[:, :2], motion.by_odometry[:, :2]
     scale = np.clip(np.sum(seen * driven) / max(float(np.sum(driven**2)), 1e-12), *_SCALES)
     apart = seen - scale * driven
@@ -247,10 +256,14 @@ def _misfits(options: ReadOptions, paths: Sequence[Path], parameters: FrontEndPa
     return np.asarray(np.sqrt(np.sum(apart**2, axis=1) + turned**2))
 
 
-def _motion(events: Iterable[Event], parameters: FrontEndParameters, most: int = _MOST_SCANS) -> _Motion:
-    """The motion of the base by scans and odometry, their clocks put together."""
+def _motions(events: Iterable[Event], parameters: FrontEndParameters, looks: Sequence[int]) -> Iterator[_Motion]:
+    """The motion of the base by scans and odometry, their clocks put together, after each of these numbers of scans.
+
+    The last is that of all scans, if there are less.
+    """
     odometry: list[tuple[int, float, float, float]] = []
     middles: dict[int, int] = {}
+    most = looks[-1]
 
     def kept() -> Iterator[Event]:
         for event in ContinuousOdometry(events):
@@ -262,11 +275,17 @@ def _motion(events: Iterable[Event], parameters: FrontEndParameters, most: int =
                 middles[event.stamp_ns] = event.stamp_ns + half_sweep_ns(event)
                 yield event
 
-    scans = [
-        (middles[event.stamp_ns], *event.T_odom_base.to_array().tolist())
-        for event in with_laser_odometry(kept(), parameters, np.random.default_rng(0))
-        if isinstance(event, Odometry)
-    ]
+    scans: list[tuple[int, float, float, float]] = []
+    for event in with_laser_odometry(kept(), parameters, np.random.default_rng(0)):
+        if isinstance(event, Odometry):
+            scans.append((middles[event.stamp_ns], *event.T_odom_base.to_array().tolist()))
+            if len(scans) in looks[:-1]:
+                yield _compared(scans, odometry)
+    yield _compared(scans, odometry)
+
+
+def _compared(scans: list[tuple[int, float, float, float]], odometry: list[tuple[int, float, float, float]]) -> _Motion:
+    """Steps of the poses (stamp, x, y, theta) by scans and by odometry."""
     nothing = np.zeros((0, 3))
     if len(scans) < 2 or len(odometry) < 2:
         return _Motion(np.zeros(0, dtype=np.int64), nothing, nothing)

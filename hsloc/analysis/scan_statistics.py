@@ -6,12 +6,12 @@ Each class takes the scans whose pose is known, one by one with their poses, in 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import degrees, hypot, radians
+from math import cos, degrees, hypot, radians, sin
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.beams import look_up, trace
+from hsloc.kernels.beams import count_seen, look_up
 from hsloc.matching.harmony_search import HarmonySearch
 from hsloc.matching.likelihood_field import distances_to_walls
 from hsloc.matching.window import Window
@@ -327,7 +327,7 @@ class CoverageCounter:
         self._side = max(COVERAGE_CELL_M, max(height, width) / COVERAGE_CELLS)
         shape = (max(int(np.ceil(height / self._side)), 1), max(int(np.ceil(width / self._side)), 1))
         self._counts = np.zeros(shape, dtype=np.int32)
-        self._hits, self._passes = np.zeros(shape, dtype=np.int32), np.zeros(shape, dtype=np.int32)
+        self._work = np.zeros(shape, dtype=np.int32), np.zeros(shape, dtype=np.int32)
         self._T_map_corner = grid.origin
         self._T_corner_map = grid.origin.inverse()
 
@@ -335,11 +335,8 @@ class CoverageCounter:
         """A scan, and the pose of the base at its stamp."""
         T_corner_base = self._T_corner_map @ T_map_base
         laser = T_corner_base @ scan.T_base_laser
-        ends = (T_corner_base @ scan.points_base()) / self._side
-        origins = np.broadcast_to(np.array((laser.x, laser.y)) / self._side, ends.shape)
-        self._hits[:], self._passes[:] = 0, 0
-        trace(self._hits, self._passes, origins, ends, np.ones(len(ends), dtype=np.uint8))
-        self._counts += (self._hits + self._passes) > 0
+        pose = (T_corner_base.x, T_corner_base.y, cos(T_corner_base.theta), sin(T_corner_base.theta))
+        count_seen(self._counts, self._work, scan.points_base(), pose, (laser.x, laser.y), self._side)
 
     def coverage(self) -> Coverage:
         """What was counted."""

@@ -39,6 +39,7 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
     localised = result.localised if result.tracked is None else result.tracked
     first = None if result.follows_scans else Pose2.from_array(odometry[0])
     row = -1
+    known: tuple[Pose2, Pose2] | None = None
 
     def correction(row: int) -> tuple[Pose2, Pose2]:
         # In Python's own numbers, which are ten times as fast as numpy's single ones.
@@ -55,11 +56,12 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
                     row += 1
                     yield PosedEvent(event, IDENTITY, Pose2(*poses[row].tolist()), True)
                 else:
-                    T_map_odom = correction(max(row, 0))[0]
+                    T_map_odom = (known or correction(0))[0]
                     yield PosedEvent(event, T_map_odom, T_map_odom @ event.T_odom_base, bool(localised[max(row, 0)]))
             elif isinstance(event, Odometry) and not result.follows_scans:
                 row += 1
-                yield PosedEvent(event, *correction(row), bool(localised[row]))
+                known = correction(row)
+                yield PosedEvent(event, *known, bool(localised[row]))
             if progress is not None and row % 500 == 0:
                 progress(row / len(result.trajectory))
 

@@ -1,4 +1,4 @@
-"""Beams of a scan: their hits and misses on a grid of cells, where each ends on a map, and what their walls hold.
+"""Beams of a scan: points, hits and misses on a grid of cells, where each ends on a map, and what their walls hold.
 
 What a matched scan says about the pose is the information of point-to-wall distances, 3 x 3. The direction in which a
 point is held is the normal of the wall that the *scan* shows, as in Censi (2007), "An accurate closed-form estimate of
@@ -46,6 +46,28 @@ _COLUMNS = 1 << 40
 
 
 @njit(cache=True, nogil=True)
+def place_hits(ranges: F32, limits: tuple[float, float], directions: F64, pose: tuple[float, ...], points: F64) -> int:
+    """Write the hits of a scan, in the order of its beams, to the first rows of `points` (n, 2); returns how many.
+
+    Hits are finite and within the `limits`, both included. `directions` (n, 2) are unit vectors along the beams;
+    `pose` is x, y (m), cosine and sine of the heading of the laser in the frame of the points.
+    """
+    x, y, c, s = pose
+    low, high = np.float32(limits[0]), np.float32(limits[1])
+    count = 0
+    for k in range(len(ranges)):
+        value = ranges[k]
+        if not (np.isfinite(value) and low <= value <= high):
+            continue
+        ahead = np.float64(value) * directions[k, 0]
+        aside = np.float64(value) * directions[k, 1]
+        points[count, 0] = x + c * ahead - s * aside
+        points[count, 1] = y + s * ahead + c * aside
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
 def trace(hits: I32, misses: I32, origins: F64, ends: F64, is_hit: U8) -> None:
     """Add beams from `origins` to `ends` (n, 2), in cells (cell [v, u] covers [u, u + 1) x [v, v + 1)).
 
@@ -81,6 +103,32 @@ def trace(hits: I32, misses: I32, origins: F64, ends: F64, is_hit: U8) -> None:
                 next_v += part_v
         if is_hit[i] and 0 <= u1 < width and 0 <= v1 < height:
             hits[v1, u1] += 1
+
+
+@njit(cache=True, nogil=True)
+def count_seen(
+    counts: I32, work: tuple[I32, I32], points: F64, pose: tuple[float, ...], origin: tuple[float, float], side: float
+) -> None:
+    """Add one to each of the cells of side `side` (m) that a scan saw: a beam passed through it, or ended in it.
+
+    `points` (n, 2) are seen from `pose`: x, y (m), cosine and sine of the heading; the laser is at `origin` (m).
+    `work` is two arrays as large as `counts`.
+    """
+    hits, misses = work
+    hits[:] = 0
+    misses[:] = 0
+    x, y, c, s = pose
+    origins, ends = np.empty_like(points), np.empty_like(points)
+    for i in range(len(points)):
+        ends[i, 0] = (x + c * points[i, 0] - s * points[i, 1]) / side
+        ends[i, 1] = (y + s * points[i, 0] + c * points[i, 1]) / side
+        origins[i, 0] = origin[0] / side
+        origins[i, 1] = origin[1] / side
+    trace(hits, misses, origins, ends, np.ones(len(points), dtype=np.uint8))
+    for v in range(counts.shape[0]):
+        for u in range(counts.shape[1]):
+            if hits[v, u] + misses[v, u] > 0:
+                counts[v, u] += 1
 
 
 @njit(cache=True, nogil=True)

@@ -161,7 +161,9 @@ def splat(field: GrowingField, points: F64, table: F32, radius: float, known: fl
         added += 1
         for v in range(iv - reach, iv + reach + 1):
             dy = np.float32(v) - y
-            for u in range(iu - reach, iu + reach + 1):
+            # The circle is no wider than that in this row; the comparison below decides.
+            half = int(sqrt(max(limit - dy * dy, np.float32(0.0)))) + 2
+            for u in range(iu - min(half, reach), iu + min(half, reach) + 1):
                 dx = np.float32(u) - x
                 squared = dx * dx + dy * dy
                 if squared <= limit:

@@ -59,7 +59,7 @@ def drop_isolated(ranges: F32, limits: F32, spacing: float, kept: F32) -> tuple[
             continue
         hits += 1
         is_alone = True
-        for k in (i - 2, i - 1, i + 1, i + 2):
+        for k in (i + 1, i - 1, i + 2, i - 2):
             if k < 0 or k >= n or not (np.isfinite(ranges[k]) and limits[0] <= ranges[k] <= limits[1]):
                 continue
             b = np.float64(ranges[k])
@@ -67,6 +67,7 @@ def drop_isolated(ranges: F32, limits: F32, spacing: float, kept: F32) -> tuple[
             gap = sqrt(max(a * a + b * b - 2.0 * a * b * cos(angle), 0.0))
             if gap <= 0.1 + 6.0 * angle * min(a, b):
                 is_alone = False
+                break
         if is_alone:
             isolated += 1
             kept[i] = np.float32(np.nan)

@@ -63,11 +63,11 @@ class RangeRule:
         return NO_RETURN_CM / 100.0 if self.clip is None else self.clip
 
     def apply(self, ranges: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Readings with their special values as in ROS (REP 117)."""
+        """Readings with their special values as in ROS (REP 117); the same array where there is none."""
         centimetres = ranges * np.float32(100.0)
-        result = ranges.copy()
         if not (centimetres > self._first_special_cm).any():
-            return result
+            return ranges
+        result = ranges.copy()
         result[np.abs(centimetres - NO_RETURN_CM) < 0.5] = np.inf
         result[np.isfinite(ranges) & (centimetres > NO_RETURN_CM + 0.5)] = np.nan
         if self.clip is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
+from math import cos, sin
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -88,12 +89,22 @@ class Scan:
 
     def points_base(self) -> NDArray[np.float64]:
         """The hits as points in the base's frame, metres, shape (m, 2), in the order of the beams."""
-        hits = self.hits()
-        directions = _directions(len(hits), self.angle_min, self.angle_increment)[hits]
-        points = self.T_base_laser @ (self.ranges[hits].astype(np.float64)[:, None] * directions)
+        # Numba takes half a second to import, and not all who read a log need points.
+        from hsloc.kernels.beams import place_hits
+
+        n, laser = len(self.ranges), self.T_base_laser
+        found = np.empty((n, 2))
+        count = place_hits(
+            np.ascontiguousarray(self.ranges),
+            (float(self.range_min), float(self.range_max)),
+            _directions(n, self.angle_min, self.angle_increment),
+            (float(laser.x), float(laser.y), cos(laser.theta), sin(laser.theta)),
+            found,
+        )
+        points: NDArray[np.float64] = found[:count]
         if self.T_base_beam is None:
             return points
-        x, y, theta = self.T_base_beam[hits].T
+        x, y, theta = self.T_base_beam[self.hits()].T
         c, s = np.cos(theta), np.sin(theta)
         return np.column_stack((x + c * points[:, 0] - s * points[:, 1], y + s * points[:, 0] + c * points[:, 1]))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from math import isfinite
+from math import isfinite, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -125,8 +125,9 @@ class RunHistory:
             self._sigma.extend((float("nan"),) * 3)
             self._covariance.extend((float("nan"),) * 9)
         else:
-            self._sigma.extend(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
-            self._covariance.extend(covariance.ravel())
+            values = covariance.ravel().tolist()  # Python's own numbers: this is done for each scan.
+            self._sigma.extend(sqrt(max(variance, 0.0)) for variance in values[::4])
+            self._covariance.extend(values)
         self._evaluations.append(estimate.evaluations)
         if estimate.certificate is not None:
             self._certificates.append(estimate.certificate)

@@ -188,12 +188,12 @@ class FrontEnd:
         self._tracker = KnownMapTracker(known, self._way)
         self._redraw()
 
-    def update(self, paired: PairedScan, points: F64) -> LocalMatch:
-        """Take a scan and its hits (n, 2) in the base's frame."""
+    def update(self, paired: PairedScan) -> LocalMatch:
+        """Take a scan."""
         p = self._parameters
-        enough = len(points) >= p.min_points
         if self._T_odom_key is None:
-            if not enough:
+            points = paired.points_base()
+            if len(points) < p.min_points:
                 return LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.NO_RETURNS, False, reason=f"{len(points)} returns")
             return self._keep(paired, points, LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.MATCHED, True, 1.0))
         motion, covariance = self._predict(paired)
@@ -202,7 +202,8 @@ class FrontEnd:
         gate = self._known_map_gate if is_followed else self._motion_gate
         if self._use_odometry and not gate.is_open(motion):
             return LocalMatch(predicted, motion, covariance, Status.PREDICTED, False, reason="motion gate")
-        if not enough:
+        points = paired.points_base()
+        if len(points) < p.min_points:
             found = LocalMatch(predicted, motion, covariance, Status.NO_RETURNS, False, reason=f"{len(points)} returns")
         else:
             scans = moving_scans(paired, points)
@@ -331,9 +332,9 @@ class FrontEnd:
             max(window.half_theta, p.wide_window_angle),
         )
         for hide, box in ((p.hide, window), (p.hide_wide, wide)):
-            match = hide.match(points, local, box, self._rng)
-            evaluations += match.evaluations
-            found = self._recent.register(scans, match.pose, predicted, covariance)
+            (start,), _, spent = hide.match_boxes(points, local, [box], self._rng)
+            evaluations += spent
+            found = self._recent.register(scans, start, predicted, covariance)
             fits = local.fitness(points, found.pose)
             better = found.agreement > best.agreement + _BETTER or fits > fitness + _BETTER
             if (better or best.refusal()) and not found.refusal() and self._is_credible(found, fits, predicted):

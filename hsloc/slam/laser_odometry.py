@@ -36,6 +36,6 @@ def with_laser_odometry(events: Iterable[Event], parameters: FrontEndParameters,
             continue
         if isinstance(event, Scan):
             paired = PairedScan(event, IDENTITY, heading=heading)
-            found = front_end.update(paired, paired.points_base())
+            found = front_end.update(paired)
             yield Odometry(event.stamp_ns, found.pose)
         yield event

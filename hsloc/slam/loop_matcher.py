@@ -145,11 +145,11 @@ class LoopMatcher:
         half, half_angle = window
         likelihood, pooled = self._field(first)
         points = self._cloud(second)
-        match = p.hide.match(points, likelihood, Window(centre, half, half, half_angle), self._rng)
+        (start,), _, _ = p.hide.match_boxes(points, likelihood, [Window(centre, half, half, half_angle)], self._rng)
         prior = np.diag((1.0 / half**2, 1.0 / half**2, 1.0 / half_angle**2)) * p.sigmas**2
-        pose, information, paired, conflict = self._registered(first, second, match.pose, centre, prior)
-        if match.pose.distance(pose) > p.distinct_distance:
-            pose = match.pose
+        pose, information, paired, conflict = self._registered(first, second, start, centre, prior)
+        if start.distance(pose) > p.distinct_distance:
+            pose = start
         fitness = likelihood.fitness(points, pose)
         consistency = paired / (paired + conflict) if paired > 0.0 else 0.0
         rival, reason = float("nan"), ""

@@ -83,9 +83,8 @@ class Mapper:
             self._track.add(event.T_odom_base, is_scan=True)
             pose = self._T_map_odom @ event.T_odom_base
             return Estimate(event.scan.stamp_ns, pose, Status.PREDICTED, reason=HELD)
-        points = event.points_base()
         covariance = self._matcher.covariance
-        found = self._matcher.update(event, points)
+        found = self._matcher.update(event)
         if found.is_keyscan or found.anchor is not None:
             covariance = self._matcher.covariance
         else:

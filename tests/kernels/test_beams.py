@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import cos, sin
 from typing import TYPE_CHECKING, Any
 
 import naive
@@ -15,11 +16,14 @@ from hsloc.kernels.beams import (
     THROUGH,
     UNMAPPED,
     classify_beams,
+    count_seen,
+    place_hits,
     trace,
     wall_information,
     wall_normals,
     wall_rows,
 )
+from hsloc.model.pose2 import Pose2
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,6 +40,34 @@ CELLS = np.array(
 )
 
 GAP, NOISE = 0.2, 1e-4
+
+
+def test_each_scan_counts_once_in_each_cell_that_it_saw(rng: np.random.Generator) -> None:
+    counts, work = np.zeros((12, 15), dtype=np.int32), (np.ones((12, 15), np.int32), np.ones((12, 15), np.int32))
+    expected = np.zeros((12, 15), dtype=np.int32)
+    pose, side = Pose2(1.5, 1.2, 0.4), 0.25
+    for _ in range(3):
+        points = rng.uniform(-2.0, 2.0, (20, 2))
+        count_seen(counts, work, points, (pose.x, pose.y, cos(pose.theta), sin(pose.theta)), (1.6, 1.3), side)
+        hits, misses = np.zeros((12, 15), dtype=np.int32), np.zeros((12, 15), dtype=np.int32)
+        origins = np.full((20, 2), (1.6, 1.3)) / side
+        trace(hits, misses, origins, (pose @ points) / side, np.ones(20, dtype=np.uint8))
+        expected += hits + misses > 0
+    assert np.array_equal(counts, expected)
+    assert counts.max() == 3
+
+
+def test_hits_are_placed_to_the_last_bit_as_array_arithmetic_places_them(rng: np.random.Generator) -> None:
+    ranges = rng.uniform(0.0, 12.0, 200).astype(np.float32)
+    ranges[rng.integers(0, 200, 30)] = rng.choice(np.array([np.nan, np.inf, -np.inf, 0.1, 10.0], np.float32), 30)
+    directions, points = rng.normal(size=(200, 2)), np.full((200, 2), np.nan)
+    x, y, c, s = 0.3, -0.2, np.cos(0.7), np.sin(0.7)
+    hits = np.isfinite(ranges) & (ranges >= np.float32(0.1)) & (ranges <= np.float32(10.0))
+    assert place_hits(ranges, (0.1, 10.0), directions, (x, y, float(c), float(s)), points) == hits.sum() > 100
+    ahead, aside = (ranges[hits].astype(np.float64)[:, None] * directions[hits]).T
+    expected = np.column_stack((x + c * ahead - s * aside, y + s * ahead + c * aside))
+    assert points[: hits.sum()].tobytes() == expected.tobytes()
+    assert np.isnan(points[hits.sum() :]).all()
 
 
 def traced(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import gzip
 import zlib
-from collections import deque
+from collections import defaultdict, deque
 from dataclasses import replace
 from heapq import heappop, heappush
 from io import BufferedReader
@@ -109,6 +109,7 @@ class TextSource:
         self._laser_lines_count = False
         self._scan_offset_ns = self._odometry_offset_ns = 0
         self._kept: list[tuple[str, Line]] = []
+        self._kept_events: list[tuple[str, tuple[Event, ...]]] | None = None
         self._kept_losses: Losses | None = None
         self.losses_at_opening = Losses()
         self.summary = self._survey()
@@ -118,11 +119,15 @@ class TextSource:
         """Whether all lines are kept, and the file is not needed any more."""
         return self._kept_losses is not None
 
-    def _parsed(self, losses: Losses) -> Iterator[tuple[str, Line]]:
+    def _parsed(self, losses: Losses) -> Iterator[tuple[str, tuple[Event, ...]]]:
+        """Keyword and events of each line; of lines that are kept the events are kept in their place."""
         if self._kept_losses is None:
-            return self._parsed_file(losses)
+            return ((keyword, tuple(self._events_of(line))) for keyword, line in self._parsed_file(losses))
         losses.add(self._kept_losses)
-        return iter(self._kept)
+        if self._kept_events is None:
+            self._kept_events = [(keyword, tuple(self._events_of(line))) for keyword, line in self._kept]
+            self._kept = []
+        return iter(self._kept_events)
 
     def _kept_lines(self) -> Iterator[tuple[str, Line]]:
         """The lines of the file, which are kept if there is room for all of them."""
@@ -176,8 +181,8 @@ class TextSource:
 
     def observations(self, losses: Losses) -> Iterator[Observation]:
         """As `Source.observations`; a text log has no clock beside its stamps."""
-        for keyword, line in self._parsed(losses):
-            for event in self._events_of(line):
+        for keyword, events in self._parsed(losses):
+            for event in events:
                 if isinstance(event, Scan):
                     limits = event.range_min, event.range_max
                     values = event.angle_min, event.angle_increment, event.time_increment, *limits, event.ranges
@@ -311,18 +316,18 @@ class TextSource:
         """
         latest: int | None = None
         last: dict[tuple[str, type], int] = {}
-        recent: dict[tuple[str, type], deque[int]] = {}
+        recent = defaultdict[tuple[str, type], deque[int]](lambda: deque(maxlen=2 * AGREEING))
         number = 0
         offsets = {Scan: self._scan_offset_ns, Odometry: self._odometry_offset_ns}
         earliest = min(*offsets.values(), 0)
         waiting: list[tuple[int, int, Event]] = []
-        for keyword, line in self._parsed(losses):
-            for event in self._events_of(line):
+        for keyword, events in self._parsed(losses):
+            for event in events:
                 key = (keyword, type(event))
                 if event.stamp_ns < last.get(key, event.stamp_ns):
                     losses.stamps_backwards[keyword] += 1
                 last[key] = event.stamp_ns
-                around = recent.setdefault(key, deque(maxlen=2 * AGREEING))
+                around = recent[key]
                 around.append(event.stamp_ns)
                 if len(around) == 2 * AGREEING and (step := _step_back(around)) is not None:
                     losses.clock_steps.setdefault(keyword, []).append((step, around[AGREEING - 1]))

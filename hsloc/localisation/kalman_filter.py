@@ -231,9 +231,12 @@ def _between(odometry: F64, anchors: Sequence[Anchor]) -> _Between:
     return _Between(rows, first, second, share)
 
 
-def between_matches(poses: F64, odometry: F64, anchors: Sequence[Anchor], matched: F64) -> F64:
+def between_matches(
+    poses: F64, odometry: F64, anchors: Sequence[Anchor], matched: F64, *, leads_to_first: bool = False
+) -> F64:
     """The poses (n, 3) of a run, those between two matches of a track replaced by the mean of what both predict.
 
+    With `leads_to_first` those before the first match lead to it: a start that is given is a guess.
     `odometry` (n, 3) belongs to the poses, `matched` (m, 3) are the poses at the anchors.
     """
     if len(anchors) < 2:
@@ -246,6 +249,8 @@ def between_matches(poses: F64, odometry: F64, anchors: Sequence[Anchor], matche
     off = back - ahead
     off[:, 2] = wrap_angles(off[:, 2])
     smoothed = poses.copy()
+    begin = anchors[0].count if leads_to_first else 0
+    smoothed[:begin] = compose_poses(T_map_odom[0], odometry[:begin])
     smoothed[rows] = ahead + share * off
     smoothed[rows, 2] = wrap_angles(smoothed[rows, 2])
     return smoothed

@@ -211,7 +211,10 @@ class RunHistory:
         estimated = _trajectory(self._odometry_stamps, self._poses)
         if self._motion_model is not None and self._anchors:
             matched = self._smooth().poses
-            poses = between_matches(estimated.poses, self.odometry().poses, self._anchors, matched)
+            # Where scans were refused before, the first match may be that of another place.
+            is_first = self._anchor_scans[0] == 0
+            odometry = self.odometry().poses
+            poses = between_matches(estimated.poses, odometry, self._anchors, matched, leads_to_first=is_first)
             estimated = Trajectory(estimated.stamps_ns, poses)
         if not self._revisions:
             return estimated, np.array(self._localised, dtype=np.bool_)

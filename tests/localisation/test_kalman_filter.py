@@ -112,6 +112,16 @@ def test_between_two_matches_an_error_of_the_odometry_is_shared_out() -> None:
     assert smoothed == pytest.approx(true, abs=1e-9)
 
 
+def test_poses_before_the_first_match_lead_to_it_where_it_is_that_of_the_start() -> None:
+    odometry = straight(5, 0.1)
+    guessed = odometry + np.array((0.0, 0.3, 0.0))
+    anchors = [anchor(3, Pose2(0.2, 0.0, 0.0), Pose2(0.2, 0.0, 0.0), SURE, begins=True)]
+    anchors.append(anchor(5, Pose2(0.4, 0.0, 0.0), Pose2(0.4, 0.0, 0.0), SURE))
+    matched = np.array([a.T_map_base.to_array() for a in anchors])
+    assert between_matches(guessed, odometry, anchors, matched, leads_to_first=True)[:3] == pytest.approx(odometry[:3])
+    assert (between_matches(guessed, odometry, anchors, matched)[:3] == guessed[:3]).all()
+
+
 def test_over_the_begin_of_another_track_nothing_is_shared_out() -> None:
     odometry = straight(5, 0.1)
     anchors = [

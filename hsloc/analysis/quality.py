@@ -121,9 +121,9 @@ def _scale_warnings(result: Result) -> list[RunWarning]:
         so = f"poses are off by {abs(value - 1.0):.3f} m per metre from the map's corner"
         remedy = f"if the ranges are right, set resolution: {cell / value:.5g} in the map's YAML (it is {cell:g})"
     else:
-        so = "the odometry agrees with the lidar, so the map was used with another resolution"
+        so = "the odometry agrees with the lidar, so the poses are on a map with the resolution that both measure"
         remedy = (
-            f"set resolution: {result.grid.resolution:.5g} in the map's YAML (it is {cell:g}), where the poses are; "
+            f"set resolution: {result.grid.resolution:.5g} in the map's YAML (it is {cell:g}); "
             "for poses on the map as it is, --set localiser.correct_map_scale=false"
         )
     return [

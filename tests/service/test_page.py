@@ -139,7 +139,7 @@ def look_before_it_runs(page: Any) -> None:
     assert (page.input_value("[data-option=initial_pose]") or "").endswith(", 0.000")
     picture(page, "10-inspected")
     page.evaluate("document.querySelector('[data-option=initial_pose]').value = ''")
-    page.evaluate("""document.querySelector('[data-option="read.end_s"]').value = '20'""")
+    page.evaluate("""document.querySelector('[data-option="read.end_s"]').value = '10'""")
 
 
 def share_by_a_link(page: Any, open_page: Callable[..., Any]) -> None:
@@ -288,7 +288,7 @@ def look_around_by_keyboard(page: Any) -> None:
     assert page.text_content(".rv-now") == now
     page.focus("#view input[type=range]")
     page.keyboard.press("End")
-    assert (page.text_content(".rv-now") or "").startswith("20.0 s")
+    assert (page.text_content(".rv-now") or "").startswith("10.0 s")
     page.keyboard.press("Home")
     assert (page.text_content(".rv-now") or "").startswith("0.0 s")
     page.select_option("#view [data-do=speed]", "5")

@@ -130,11 +130,11 @@ def test_the_scans_of_a_log_alone_show_it(late: float) -> None:
 def test_a_run_warns_of_late_scans_and_auto_removes_it(tmp_path: Path) -> None:
     late = replace(END, time_offset="/scan=0.2")
     warned = run(RunRequest(logs=(OFFICE,), read=late))
-    warnings = [w for w in analyse(warned).metrics.warnings if w.code.startswith("clock_offset")]
-    (warning,) = warnings
+    metrics = analyse(warned).metrics
+    (warning,) = (w for w in metrics.warnings if w.code.startswith("clock_offset"))
     assert "0.20" in warning.text
     assert re.search(r"--time-offset /scan=-?0\.00", warning.remedy)
-    assert analyse(warned).metrics.verdict == "check"
+    assert metrics.verdict == "check"
     found = offsets_of_log((OFFICE,), END, FrontEndParameters())
     assert as_option(found, deskew=False) is None
     (sweeping,) = ({topic: offset._replace(seconds=0.2, half_sweep_s=0.05)} for topic, offset in found.items())

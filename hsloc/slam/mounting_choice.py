@@ -259,7 +259,7 @@ def _misfits(options: ReadOptions, paths: Sequence[Path], parameters: FrontEndPa
 def _motions(events: Iterable[Event], parameters: FrontEndParameters, looks: Sequence[int]) -> Iterator[_Motion]:
     """The motion of the base by scans and odometry, their clocks put together, after each of these numbers of scans.
 
-    The last is that of all scans, if there are less.
+    The last is that of all scans, where there are fewer.
     """
     odometry: list[tuple[int, float, float, float]] = []
     middles: dict[int, int] = {}

@@ -1,4 +1,4 @@
-"""Beams of a scan: points, hits and misses on a grid of cells, where each ends on a map, and what their walls hold.
+"""Beams of a scan: their hits and misses on a grid of cells, where each ends on a map, and what their walls hold.
 
 What a matched scan says about the pose is the information of point-to-wall distances, 3 x 3. The direction in which a
 point is held is the normal of the wall that the *scan* shows, as in Censi (2007), "An accurate closed-form estimate of
@@ -43,28 +43,6 @@ DOUBTFUL_WEIGHT = 20.0
 """A wall seen on this many cells counts by half: what is seen on a few cells may be a door or an object."""
 _COLUMNS = 1 << 40
 """Rows and columns of cells are distinguished by an offset larger than any map."""
-
-
-@njit(cache=True, nogil=True)
-def place_hits(ranges: F32, limits: tuple[float, float], directions: F64, pose: tuple[float, ...], points: F64) -> int:
-    """Write the hits of a scan, in the order of its beams, to the first rows of `points` (n, 2); returns how many.
-
-    Hits are finite and within the `limits`, both included. `directions` (n, 2) are unit vectors along the beams;
-    `pose` is x, y (m), cosine and sine of the heading of the laser in the frame of the points.
-    """
-    x, y, c, s = pose
-    low, high = np.float32(limits[0]), np.float32(limits[1])
-    count = 0
-    for k in range(len(ranges)):
-        value = ranges[k]
-        if not (np.isfinite(value) and low <= value <= high):
-            continue
-        ahead = np.float64(value) * directions[k, 0]
-        aside = np.float64(value) * directions[k, 1]
-        points[count, 0] = x + c * ahead - s * aside
-        points[count, 1] = y + s * ahead + c * aside
-        count += 1
-    return count
 
 
 @njit(cache=True, nogil=True)

@@ -24,6 +24,28 @@ _DIRECTIONS = 16
 
 
 @njit(cache=True, nogil=True)
+def place_hits(ranges: F32, limits: tuple[float, float], directions: F64, pose: tuple[float, ...], points: F64) -> int:
+    """Write the hits of a scan, in the order of its beams, to the first rows of `points` (n, 2); returns how many.
+
+    Hits are finite and within the `limits`, both included. `directions` (n, 2) are unit vectors along the beams;
+    `pose` is x, y (m), cosine and sine of the heading of the laser in the frame of the points.
+    """
+    x, y, c, s = pose
+    low, high = np.float32(limits[0]), np.float32(limits[1])
+    count = 0
+    for k in range(len(ranges)):
+        value = ranges[k]
+        if not (np.isfinite(value) and low <= value <= high):
+            continue
+        ahead = np.float64(value) * directions[k, 0]
+        aside = np.float64(value) * directions[k, 1]
+        points[count, 0] = x + c * ahead - s * aside
+        points[count, 1] = y + s * ahead + c * aside
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
 def list_beams(ranges: F32, limits: F32, beams: I32, hit_of_beam: I32, clean: F32) -> int:
     """Write the beams that hit to `beams` (n,), for each beam its hit or -1, and `clean` ranges; returns how many hit.
 

@@ -90,7 +90,7 @@ class Scan:
     def points_base(self) -> NDArray[np.float64]:
         """The hits as points in the base's frame, metres, shape (m, 2), in the order of the beams."""
         # Numba takes half a second to import, and not all who read a log need points.
-        from hsloc.kernels.beams import place_hits
+        from hsloc.kernels.surfels import place_hits
 
         n, laser = len(self.ranges), self.T_base_laser
         found = np.empty((n, 2))

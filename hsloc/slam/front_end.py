@@ -197,9 +197,8 @@ class FrontEnd:
                 return LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.NO_RETURNS, False, reason=f"{len(points)} returns")
             return self._keep(paired, points, LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.MATCHED, True, 1.0))
         motion, covariance = self._predict(paired)
-        predicted = self._T_map_key @ motion
-        is_followed = self._tracker is not None and self._tracker.is_following
-        gate = self._known_map_gate if is_followed else self._motion_gate
+        predicted, tracker = self._T_map_key @ motion, self._tracker
+        gate = self._known_map_gate if tracker is not None and tracker.is_following else self._motion_gate
         if self._use_odometry and not gate.is_open(motion):
             return LocalMatch(predicted, motion, covariance, Status.PREDICTED, False, reason="motion gate")
         points = paired.points_base()

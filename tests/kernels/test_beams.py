@@ -17,7 +17,6 @@ from hsloc.kernels.beams import (
     UNMAPPED,
     classify_beams,
     count_seen,
-    place_hits,
     trace,
     wall_information,
     wall_normals,
@@ -55,19 +54,6 @@ def test_each_scan_counts_once_in_each_cell_that_it_saw(rng: np.random.Generator
         expected += hits + misses > 0
     assert np.array_equal(counts, expected)
     assert counts.max() == 3
-
-
-def test_hits_are_placed_to_the_last_bit_as_array_arithmetic_places_them(rng: np.random.Generator) -> None:
-    ranges = rng.uniform(0.0, 12.0, 200).astype(np.float32)
-    ranges[rng.integers(0, 200, 30)] = rng.choice(np.array([np.nan, np.inf, -np.inf, 0.1, 10.0], np.float32), 30)
-    directions, points = rng.normal(size=(200, 2)), np.full((200, 2), np.nan)
-    x, y, c, s = 0.3, -0.2, np.cos(0.7), np.sin(0.7)
-    hits = np.isfinite(ranges) & (ranges >= np.float32(0.1)) & (ranges <= np.float32(10.0))
-    assert place_hits(ranges, (0.1, 10.0), directions, (x, y, float(c), float(s)), points) == hits.sum() > 100
-    ahead, aside = (ranges[hits].astype(np.float64)[:, None] * directions[hits]).T
-    expected = np.column_stack((x + c * ahead - s * aside, y + s * ahead + c * aside))
-    assert points[: hits.sum()].tobytes() == expected.tobytes()
-    assert np.isnan(points[hits.sum() :]).all()
 
 
 def traced(

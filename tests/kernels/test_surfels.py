@@ -1,4 +1,4 @@
-"""Hits that stand alone, against a plain version."""
+"""Hits that stand alone, and where hits are, against plain versions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hsloc.kernels.surfels import drop_isolated
+from hsloc.kernels.surfels import drop_isolated, place_hits
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -54,3 +54,16 @@ def test_a_wall_at_a_grazing_angle_and_a_post_of_two_beams_are_kept() -> None:
     kept = np.empty_like(ranges)
     assert drop_isolated(ranges, LIMITS, SPACING, kept) == (160, 1)
     assert np.isnan(kept[40])
+
+
+def test_hits_are_placed_to_the_last_bit_as_array_arithmetic_places_them(rng: np.random.Generator) -> None:
+    ranges = rng.uniform(0.0, 12.0, 200).astype(np.float32)
+    ranges[rng.integers(0, 200, 30)] = rng.choice(np.array([np.nan, np.inf, -np.inf, 0.1, 10.0], np.float32), 30)
+    directions, points = rng.normal(size=(200, 2)), np.full((200, 2), np.nan)
+    x, y, c, s = 0.3, -0.2, np.cos(0.7), np.sin(0.7)
+    hits = np.isfinite(ranges) & (ranges >= np.float32(0.1)) & (ranges <= np.float32(10.0))
+    assert place_hits(ranges, (0.1, 10.0), directions, (x, y, float(c), float(s)), points) == hits.sum() > 100
+    ahead, aside = (ranges[hits].astype(np.float64)[:, None] * directions[hits]).T
+    expected = np.column_stack((x + c * ahead - s * aside, y + s * ahead + c * aside))
+    assert points[: hits.sum()].tobytes() == expected.tobytes()
+    assert np.isnan(points[hits.sum() :]).all()

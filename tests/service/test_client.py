@@ -26,6 +26,13 @@ if TYPE_CHECKING:
     from live_service import Live
 
 
+REAL = {
+    "HSLOC_WORKER_COMMAND": ",".join(Settings().worker_command),
+    "HSLOC_SANDBOX": "none",  # in which a job could not keep what it compiles
+    "HSLOC_JOB_MEMORY_BYTES": "4G",
+}
+
+
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
     path = tmp_path / "run one.mcap"
@@ -155,7 +162,7 @@ def test_a_job_whose_result_does_not_keep_a_limit_is_below_threshold(
     make_live: Callable[..., Live], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A limit, --duration and --set travel to the job; the answer is an outcome of the job and exit code 4."""
-    live = make_live(HSLOC_WORKER_COMMAND=",".join(Settings().worker_command), HSLOC_JOB_MEMORY_BYTES="4G")
+    live = make_live(**REAL)
     argv = ["submit", str(RECORDINGS / "slip.mcap"), "--url", live.url, "--wait", "-q", "--duration", "4"]
     assert main([*argv, "--set", "matcher.budget=150", "--max-ape", "0.0001", "--min-localised", "0.9"]) == 4
     printed = capsys.readouterr()
@@ -174,7 +181,7 @@ def test_a_job_whose_result_does_not_keep_a_limit_is_below_threshold(
 def test_a_reference_is_uploaded_and_named_without_the_servers_folders(
     make_live: Callable[..., Live], tmp_path: Path
 ) -> None:
-    live = make_live(HSLOC_WORKER_COMMAND=",".join(Settings().worker_command), HSLOC_JOB_MEMORY_BYTES="4G")
+    live = make_live(**REAL)
     assert main(["replay", str(RECORDINGS / "slip.mcap"), "-q", "--end", "4", "--out", str(tmp_path / "here")]) == 0
     argv = ["submit", str(RECORDINGS / "slip.mcap"), "--url", live.url, "-q", "--end", "4"]
     argv += ["--reference", str(tmp_path / "here" / "reference.tum"), "--out", str(tmp_path / "there")]

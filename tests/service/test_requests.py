@@ -87,10 +87,10 @@ def test_two_parts_then_an_extended_map_scored_by_relations(
     client = make_client(worker_command=REAL, job_memory_bytes=4 << 30)
     parts = cut(OFFICE, 4.0, 9.0, tmp_path)
     logs = [upload(client, path.read_bytes(), "run.mcap") for path in parts]
+    replay(tmp_path, *map(str, parts), "--mode", "slam", "--out", "drawn")  # first: a job keeps nothing it compiles
     drawn = client.post("/v1/jobs", json={"logs": logs, "mode": "slam"})
     assert drawn.status_code == 201, drawn.text
     assert drawn.json()["log"] == "run.mcap, run.mcap"
-    replay(tmp_path, *map(str, parts), "--mode", "slam", "--out", "drawn")
     same_bytes(client, drawn.json()["id"], tmp_path / "drawn")
     lines = (tmp_path / "drawn" / "trajectory.tum").read_text().splitlines()
     assert float(lines[-1].split()[0]) - float(lines[0].split()[0]) > 7.5  # both parts are in it
@@ -106,14 +106,14 @@ def test_two_parts_then_an_extended_map_scored_by_relations(
         "config": {"graph_mapper": {"passes": 2}},  # not those of the map: there is a warning that names its file
     }
     (tmp_path / "other.yaml").write_text("graph_mapper: {passes: 2}\n")
-    extended = client.post("/v1/jobs", json=more)
-    assert extended.status_code == 201, extended.text
     replay(
         tmp_path / "drawn",
         *(str(OFFICE), "--resume", "map.npz", "--relations", str(tmp_path / "some.relations")),
         *("--start", "5", "--end", "12", "--config", str(tmp_path / "other.yaml")),
         *("--out", str(tmp_path / "extended")),
     )
+    extended = client.post("/v1/jobs", json=more)
+    assert extended.status_code == 201, extended.text
     same_bytes(client, extended.json()["id"], tmp_path / "extended")
     metrics = json.loads((tmp_path / "extended" / "metrics.json").read_text())
     assert metrics["run"]["map"] == "map.npz, extended"
@@ -123,10 +123,10 @@ def test_two_parts_then_an_extended_map_scored_by_relations(
     assert summary["metrics"]["relations"] == metrics["relations"]
 
     on_it = {"log": more["log"], "resume": more["resume"], "mode": "localise", "unknown_start": True}
-    localised = client.post("/v1/jobs", json={**on_it, "read": {"end_s": 6.0}})
-    assert localised.status_code == 201, localised.text
     on_map = ("--mode", "localise", "--map", "map.npz", "--unknown-start", "--end", "6")
     replay(tmp_path / "drawn", str(OFFICE), *on_map, "--out", str(tmp_path / "localised"))
+    localised = client.post("/v1/jobs", json={**on_it, "read": {"end_s": 6.0}})
+    assert localised.status_code == 201, localised.text
     same_bytes(client, localised.json()["id"], tmp_path / "localised")
     metrics = json.loads((tmp_path / "localised" / "metrics.json").read_text())
     assert (metrics["run"]["mode"], metrics["run"]["map"]) == ("localise", "map.npz")

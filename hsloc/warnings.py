@@ -77,6 +77,8 @@ class WarningCode(StrEnum):
     """The same by a tenth of a second or more."""
     CLOCK_OFFSET_APPLIED = "clock_offset_applied"
     """The offset between scans and odometry was estimated and removed: as asked for, or as the result showed it."""
+    SCANS_DESKEWED = "scans_deskewed"
+    """The robot moved while the lidar turned, as the result showed: beams were moved to where it was (`--deskew`)."""
     CLOCK_DRIFT = "clock_drift"
     """The clocks of scans and odometry do not run equally fast: their offset changes during the log."""
     CLOCK_SET = "clock_set"

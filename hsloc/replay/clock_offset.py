@@ -2,7 +2,7 @@
 
 The pose of a matched scan follows what the lidar saw; odometry with the same stamp should have turned as much. Where it
 did not, the correction of each match belongs to another moment, and poses are wrong by what the robot moved meanwhile.
-Stamps are then corrected, and the log is replayed once more.
+Stamps are then corrected, or the beams of a lidar that turns while the robot does, and the log is replayed once more.
 """
 
 from __future__ import annotations
@@ -185,6 +185,58 @@ def offsets_of_mapping(
 
 def _is_given(request: RunRequest) -> bool:
     return request.read.time_offset is not None or bool(request.reading().offsets_s())
+
+
+@dataclass(frozen=True, slots=True)
+class ClockCorrection:
+    """How a log is replayed once more, if that `is_needed`: what is asked for, and the warnings that say so.
+
+    `offsets` (s) are those that the scans show by themselves, by topic; `option` is the value of `--time-offset`.
+    """
+
+    request: RunRequest
+    offsets: Mapping[str, Offset]
+    option: str | None
+    warnings: tuple[RunWarning, ...]
+    is_needed: bool
+
+    @property
+    def removed(self) -> dict[str, Offset]:
+        """The offsets that are removed."""
+        return {topic: offset for topic, offset in self.offsets.items() if offset.is_certain}
+
+    @classmethod
+    def of(
+        cls, request: RunRequest, reading: ReadOptions, evidence: ClockEvidence, *, deskewed: bool
+    ) -> ClockCorrection:
+        """Of the `evidence` in a localiser's result with the log as it was read; its scans were `deskewed` or not."""
+        found, option = clock_offsets(request, reading, deskew=deskewed)
+        warnings = tuple(warning for _, warning in clock_warnings(found, removed=True))
+        swept = None if option is not None or deskewed else _swept_scans(request, evidence, found)
+        if swept is not None:
+            request, warnings = replace(request, read=replace(request.read, deskew=True)), (*warnings, swept)
+        return cls(request, found, option, warnings, option is not None or swept is not None)
+
+
+def _swept_scans(request: RunRequest, evidence: ClockEvidence, found: Mapping[str, Offset]) -> RunWarning | None:
+    """The warning that beams were moved to where the robot was when each was measured, where the result shows the need.
+
+    A scan shows the robot in the middle of its sweep. Where that is the whole offset of the matches, and the clocks
+    have none by themselves (`found`), the header's `time_increment` is right, and poses are wrong by what the robot
+    moved in half a sweep.
+    """
+    known = [offset for offset in found.values() if isfinite(offset.sigma) and not offset.is_mirrored]
+    halves = [offset.half_sweep_s for offset in known if not offset.is_significant and not offset.drift_s]
+    if evidence.is_lost or _is_given(request) or not halves or len(halves) < len(found):
+        return None
+    half = float(np.mean(halves))
+    if not evidence.offset.is_significant or evidence.offset.seconds * half >= 0.0:
+        return None
+    return RunWarning(
+        WarningCode.SCANS_DESKEWED,
+        f"a sweep of the lidar takes {2.0 * abs(half):.3f} s, in which the robot moved: beams were put where it was",
+        "--deskew does that from the start, and saves a replay",
+    )
 
 
 def clock_offsets(request: RunRequest, reading: ReadOptions, *, deskew: bool) -> tuple[dict[str, Offset], str | None]:

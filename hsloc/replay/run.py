@@ -14,7 +14,7 @@ from hsloc.kernels.cache import compilation_reported
 from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.preprocessing.odometry import ContinuousOdometry, OdometryWatch, UnusableOdometry
 from hsloc.preprocessing.scans import ScanWatch, without_isolated
-from hsloc.replay.clock_offset import ClockEvidence, LateScans, clock_offsets, offsets_of_mapping, open_as_meant
+from hsloc.replay.clock_offset import ClockCorrection, ClockEvidence, LateScans, offsets_of_mapping, open_as_meant
 from hsloc.replay.engine import rarely_collected, replay
 from hsloc.replay.estimators import make_localiser, make_mapper
 from hsloc.replay.map_and_start import ScaleEvidence, find_map, find_start, first_odometry, load_state, require_map
@@ -224,17 +224,19 @@ def _run_on(
     evidence = result.clock_evidence()
     if not evidence.hints:
         return result
-    offsets, option = clock_offsets(request, result.reading or request.reading(), deskew=result.deskewed)
-    if option is not None:
-        warnings = tuple(warning for _, warning in clock_warnings(offsets, removed=True))
+    found = ClockCorrection.of(request, result.reading or request.reading(), evidence, deskewed=result.deskewed)
+    if found.is_needed:
         again = _run_with(
-            request, progress, lidar_only=False, warnings=warnings, time_offset=option, correction=correction
+            found.request,
+            progress,
+            lidar_only=False,
+            warnings=found.warnings,
+            time_offset=found.option,
+            correction=correction,
         )
         if again.clock_evidence().is_better(evidence):
-            seconds = _sum(result.seconds, again.seconds)
-            certain = {topic: offset for topic, offset in offsets.items() if offset.is_certain}
-            return replace(again, seconds=seconds, corrected_offsets=certain)
-    return replace(result, clock_offsets=offsets)
+            return replace(again, seconds=_sum(result.seconds, again.seconds), corrected_offsets=found.removed)
+    return replace(result, clock_offsets=found.offsets)
 
 
 def _run_with(

@@ -17,6 +17,7 @@ from hsloc.replay.run import run
 from hsloc.request import RunRequest
 from hsloc.simulation.presets import preset
 from hsloc.simulation.recorder import record
+from hsloc.warnings import WarningCode
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -116,10 +117,15 @@ def test_a_turning_lidar_is_localised_three_times_better(tmp_path: Path) -> None
     scenario = preset("office")
     scenario = replace(scenario, seed=8, duration_s=25.0, sensor=replace(scenario.sensor, motion_distortion=True))  # type: ignore[arg-type]
     record(scenario, tmp_path / "skew.mcap")
-    errors = {}
-    for deskew in (False, True):
-        result = run(RunRequest(logs=(tmp_path / "skew.mcap",), read=ReadOptions(deskew=deskew)))
+    as_recorded, deskewed = ReadOptions(time_offset="/scan=0"), ReadOptions(deskew=True)
+    errors = []
+    for read in (as_recorded, deskewed, ReadOptions()):
+        result = run(RunRequest(logs=(tmp_path / "skew.mcap",), read=read))
+        codes = [warning.code for warning in result.warnings]
+        assert codes == ([WarningCode.SCANS_DESKEWED] if read == ReadOptions() else [])
+        assert result.deskewed == (read != as_recorded)
         difference = result.trajectory.interpolated(result.reference.stamps_ns) - result.reference.poses
-        errors[deskew] = float(np.sqrt(np.mean(difference[:, 0] ** 2 + difference[:, 1] ** 2)))
-    assert errors[True] < 0.015
-    assert errors[False] > 3.0 * errors[True]
+        errors.append(float(np.sqrt(np.mean(difference[:, 0] ** 2 + difference[:, 1] ** 2))))
+    assert errors[1] < 0.015
+    assert errors[0] > 3.0 * errors[1]
+    assert errors[2] == errors[1], "a result that shows the need is deskewed by itself"

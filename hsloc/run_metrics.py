@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from hsloc.log import LaserSummary
 
-SCHEMA_VERSION = "1.0"
+SCHEMA_VERSION = "1.1"
 """Major number: a key was removed, renamed or changed its meaning. Minor number: a key was added."""
 
 
@@ -216,6 +216,20 @@ class PlanMetrics:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ScaleMetrics:
+    """Size of a given map by what the lidar measures."""
+
+    value: float
+    """Ratio of a length on the map, as it was given, to that length as the lidar measures it [m/m]."""
+    sigma: float
+    """Standard deviation of that ratio [m/m]."""
+    resolution: float
+    """Side of a cell of the map that the poses lie on [m]."""
+    corrected: bool
+    """Whether that is another one than in the map's file, as lidar and odometry agree."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MapMetrics:
     """How well map and scans agree, and how good a map is that this run built."""
 
@@ -229,6 +243,8 @@ class MapMetrics:
     """Comparison with the map in the log; only of a map that this run built, where the log has a map and truth."""
     plan: PlanMetrics | None = None
     """Its place on a floor plan; left out where none was given."""
+    scale: ScaleMetrics | None = None
+    """Its size by the lidar; only of a given map that was localised on, where the scans determine it."""
     comparison_error: str | None = None
     """Why the map was not compared with the one in the log."""
 

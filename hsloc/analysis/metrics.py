@@ -28,6 +28,7 @@ from hsloc.run_metrics import (
     ResidualMetrics,
     RunIdentity,
     RunTimings,
+    ScaleMetrics,
     ScanCounts,
 )
 from hsloc.version import __version__
@@ -139,7 +140,7 @@ def certificate_metrics(result: Result) -> CertificateMetrics | None:
 def map_metrics(result: Result, residuals: ResidualMetrics, comparison: Comparison | None) -> MapMetrics:
     """How well scans and map agree; for a built map also how crisp and how consistent it is, and against a true one."""
     if result.mode != "slam":
-        return MapMetrics(residuals=residuals)
+        return MapMetrics(residuals=residuals, scale=_scale_metrics(result))
     compared = error_text = None
     if result.true_grid is not None and result.reference is not None:
         try:
@@ -157,6 +158,18 @@ def map_metrics(result: Result, residuals: ResidualMetrics, comparison: Comparis
         comparison=compared,
         comparison_error=error_text,
         plan=_plan_metrics(result),
+    )
+
+
+def _scale_metrics(result: Result) -> ScaleMetrics | None:
+    scale = result.map_scale
+    if scale is None or not isfinite(scale.sigma):
+        return None
+    return ScaleMetrics(
+        value=scale.of_given_map,
+        sigma=scale.sigma,
+        resolution=result.grid.resolution,
+        corrected=result.given_resolution is not None,
     )
 
 

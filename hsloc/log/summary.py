@@ -330,6 +330,11 @@ class Losses:
         """An independent copy."""
         return deepcopy(self)
 
+    def as_cause(self) -> str:
+        """What could not be read, as the end of a message; empty where all could."""
+        lost = [*self.lines(), *self.reasons]
+        return f": {'; '.join(lost)}" if lost else ""
+
     def lines(self) -> list[str]:
         """Everything counted, in words; empty where nothing happened."""
         named = (

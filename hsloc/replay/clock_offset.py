@@ -61,6 +61,23 @@ class LateScans(Exception):
         return whole
 
 
+class SweptScans(Exception):
+    """The lidar turned while the robot did; internal: whoever maps begins again with `request`, which deskews.
+
+    `warning` says so.
+    """
+
+    def __init__(self, request: RunRequest, half_sweep_s: float) -> None:
+        super().__init__()
+        self.request = replace(request, read=replace(request.read, deskew=True))
+        self.warning = RunWarning(
+            WarningCode.SCANS_DESKEWED,
+            f"a sweep of the lidar takes {2.0 * abs(half_sweep_s):.3f} s, in which the robot moved: beams were put "
+            "where it was",
+            "--deskew does that from the start, and saves a replay",
+        )
+
+
 MAPS_CORRECTED_FROM_S = 0.15
 """Offset (s) from which on a map is built again with corrected stamps.
 
@@ -164,7 +181,8 @@ def offsets_of_mapping(
     """The offsets (s) by topic that a log shows which has been matched, before its map is solved.
 
     Raises LateScans where one is certain and the user has given none, if these are to be corrected: from
-    `MAPS_CORRECTED_FROM_S` on.
+    `MAPS_CORRECTED_FROM_S` on; and SweptScans where there is none from the middle of the sweeps, which is as certainly
+    another time than that of the stamps.
     """
     if reading.stamps != "header":
         return {}
@@ -177,6 +195,10 @@ def offsets_of_mapping(
         found = {log.summary.scan_topic or "": offset}
         is_free = offset.is_certain and not _is_given(request)
         option = as_option(found, deskew=deskew) if is_free else None
+    if correct and offset is not None and not (offset.is_significant or _is_given(request)):
+        of_stamps = offset._replace(seconds=-offset.half_sweep_s)
+        if of_stamps.is_certain:
+            raise SweptScans(request, offset.half_sweep_s)
     is_large = any(each.is_certain and abs(each.seconds) >= MAPS_CORRECTED_FROM_S for each in found.values())
     if correct and option is not None and is_large:
         raise LateScans({name: each for name, each in found.items() if each.is_certain}, option)
@@ -214,12 +236,12 @@ class ClockCorrection:
         warnings = tuple(warning for _, warning in clock_warnings(found, removed=True))
         swept = None if option is not None or deskewed else _swept_scans(request, evidence, found)
         if swept is not None:
-            request, warnings = replace(request, read=replace(request.read, deskew=True)), (*warnings, swept)
+            request, warnings = swept.request, (*warnings, swept.warning)
         return cls(request, found, option, warnings, option is not None or swept is not None)
 
 
-def _swept_scans(request: RunRequest, evidence: ClockEvidence, found: Mapping[str, Offset]) -> RunWarning | None:
-    """The warning that beams were moved to where the robot was when each was measured, where the result shows the need.
+def _swept_scans(request: RunRequest, evidence: ClockEvidence, found: Mapping[str, Offset]) -> SweptScans | None:
+    """Whether the result of a localiser shows that its scans have to be deskewed.
 
     A scan shows the robot in the middle of its sweep. Where that is the whole offset of the matches, and the clocks
     have none by themselves (`found`), the header's `time_increment` is right, and poses are wrong by what the robot
@@ -232,11 +254,7 @@ def _swept_scans(request: RunRequest, evidence: ClockEvidence, found: Mapping[st
     half = float(np.mean(halves))
     if not evidence.offset.is_significant or evidence.offset.seconds * half >= 0.0:
         return None
-    return RunWarning(
-        WarningCode.SCANS_DESKEWED,
-        f"a sweep of the lidar takes {2.0 * abs(half):.3f} s, in which the robot moved: beams were put where it was",
-        "--deskew does that from the start, and saves a replay",
-    )
+    return SweptScans(request, half)
 
 
 def clock_offsets(request: RunRequest, reading: ReadOptions, *, deskew: bool) -> tuple[dict[str, Offset], str | None]:

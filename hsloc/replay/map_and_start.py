@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.errors import MapError
+from hsloc.errors import LogError, MapError
 from hsloc.maps import read_map, read_metadata
 from hsloc.model.events import Odometry
 from hsloc.model.pose2 import Pose2
@@ -241,6 +241,18 @@ def _is_on(grid: OccupancyGrid, pose: Pose2) -> bool:
         -_OUTSIDE <= local.x <= width * grid.resolution + _OUTSIDE
         and -_OUTSIDE <= local.y <= height * grid.resolution + _OUTSIDE
     )
+
+
+def require_data(request: RunRequest, log: Log, *, scans: bool, odometry: bool) -> None:
+    """Raise LogError where a run had no scans, or no odometry, that could be read."""
+    is_cut, lost = request.read.start_s is not None or request.read.end_s is not None, log.losses.as_cause()
+    for is_there, name, topic, remedy in (
+        (scans, "scan", log.summary.scan_topic, ""),
+        (odometry, "odometry", log.summary.odom_topic, "; the scans alone can do: --no-odom"),
+    ):
+        if not is_there:
+            where = "between --start and --end" if is_cut else f"on {topic} that could be read"
+            raise LogError(f"{request.logs[0]}: no {name} {where}{lost}{remedy}")
 
 
 @dataclass(frozen=True, slots=True)

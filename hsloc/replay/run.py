@@ -9,15 +9,30 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hsloc.errors import ConfigError, LogError
+from hsloc.errors import ConfigError
 from hsloc.kernels.cache import compilation_reported
 from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.preprocessing.odometry import ContinuousOdometry, OdometryWatch, UnusableOdometry
 from hsloc.preprocessing.scans import ScanWatch, without_isolated
-from hsloc.replay.clock_offset import ClockCorrection, ClockEvidence, LateScans, offsets_of_mapping, open_as_meant
+from hsloc.replay.clock_offset import (
+    ClockCorrection,
+    ClockEvidence,
+    LateScans,
+    SweptScans,
+    offsets_of_mapping,
+    open_as_meant,
+)
 from hsloc.replay.engine import rarely_collected, replay
 from hsloc.replay.estimators import make_localiser, make_mapper
-from hsloc.replay.map_and_start import ScaleEvidence, find_map, find_start, first_odometry, load_state, require_map
+from hsloc.replay.map_and_start import (
+    ScaleEvidence,
+    find_map,
+    find_start,
+    first_odometry,
+    load_state,
+    require_data,
+    require_map,
+)
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory, pose_covariances
 from hsloc.request import RunRequest
@@ -180,11 +195,9 @@ def _run(request: RunRequest, progress: Callable[[Progress], None] | None) -> Re
     result = _run_on(request, progress)
     if result.mode != "localise" or result.lidar_only or not request.config.localiser.correct_map_scale:
         return result
-    if result.map_scale is None or not result.map_scale.is_significant:
-        return result
-    evidence = result.scale_evidence()
-    if evidence.hints:
-        again = _run_on(request, progress, (result.map_scale, evidence.start))
+    scale, evidence = result.map_scale, result.scale_evidence()
+    if scale is not None and evidence.hints:
+        again = _run_on(request, progress, (scale, evidence.start))
         if again.scale_evidence().is_better(evidence):
             return replace(again, seconds=_sum(result.seconds, again.seconds))
     return result
@@ -199,9 +212,9 @@ def _run_on(
     progress: Callable[[Progress], None] | None,
     correction: tuple[MapScale, Pose2] | None = None,
 ) -> Result:
-    """The run on the map, or with `correction` on that of its scale with the first pose as the start if one is given.
+    """The run, with `correction` on the map of that scale from that pose on if a start is given.
 
-    Without the odometry of the log where that proves unusable on the way.
+    Once more with what shows on the way: without odometry that is unusable, with other stamps, deskewed.
     """
     try:
         result = _run_with(request, progress, lidar_only=request.no_odometry, correction=correction)
@@ -217,8 +230,10 @@ def _run_on(
         whole = late.with_rest(result.clock_offsets or {})
         warnings = (*result.warnings, *(warning for _, warning in clock_warnings(whole, removed=True)))
         return replace(result, warnings=warnings, corrected_offsets=whole)
-    settled = (WarningCode.CLOCK_OFFSET_APPLIED, WarningCode.CLOCK_SET)
-    is_settled = any(warning.code in settled for warning in result.warnings)
+    except SweptScans as swept:
+        result = _run_on(swept.request, progress, correction)
+        return replace(result, warnings=(*result.warnings, swept.warning))
+    is_settled = {WarningCode.CLOCK_OFFSET_APPLIED, WarningCode.CLOCK_SET} & {each.code for each in result.warnings}
     if result.mode != "localise" or result.lidar_only or is_settled:
         return result
     evidence = result.clock_evidence()
@@ -265,8 +280,7 @@ def _run_with(
         or (request.no_odometry and request.map_path is None)
     )
     localise = request.mode == "localise" or (grid is not None and not builds)
-    given_resolution: float | None = None
-    opened = time.perf_counter()
+    given_resolution, opened = None, time.perf_counter()
     if progress is not None:
         progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
     if localise:
@@ -292,18 +306,11 @@ def _run_with(
     # Turns that were joined of segments are known beam by beam; a whole turn is deskewed if the user asks for it.
     deskew = request.read.deskew or (log.summary.segments > 1 and not lidar_only)
     with rarely_collected():
-        for event, estimate in replay(
-            _reported(log, watched, history, progress), estimator, deskew=deskew, first=first
-        ):
+        reported = _reported(log, watched, history, progress)
+        for event, estimate in replay(reported, estimator, deskew=deskew, first=first):
             history.add(event, estimate)
     replayed = time.perf_counter()
-    is_cut = request.read.start_s is not None or request.read.end_s is not None
-    if history.scans == 0:
-        where = "between --start and --end" if is_cut else f"on {log.summary.scan_topic} that could be read"
-        raise LogError(f"{request.logs[0]}: no scan {where}{_lost(log)}")
-    if first is None and not lidar_only:
-        where = "between --start and --end" if is_cut else f"on {log.summary.odom_topic} that could be read"
-        raise LogError(f"{request.logs[0]}: no odometry {where}{_lost(log)}; the scans alone can do: --no-odom")
+    require_data(request, log, scans=history.scans > 0, odometry=first is not None or lidar_only)
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
     of_steps = log.losses.step_warnings(log.summary)
     mapping, true_grid, offsets = None, None if localise else grid, None
@@ -356,12 +363,6 @@ def _run_with(
     )
 
 
-def _lost(log: Log) -> str:
-    """What could not be read, as the end of a message; empty where all could."""
-    lost = [*log.losses.lines(), *log.losses.reasons]
-    return f": {'; '.join(lost)}" if lost else ""
-
-
 def _events(request: RunRequest, log: Log, lidar_only: bool, localise: bool) -> Iterable[Event]:
     """The events of the log; its odometry watched, or left out, or replaced for a localiser by that of the scans.
 
@@ -392,8 +393,7 @@ def _reported(
     if progress is None:
         yield from events
         return
-    total = log.summary.duration_s
-    origin = log.summary.origin_ns
+    total, origin = log.summary.duration_s, log.summary.origin_ns
     for event in events:
         yield event
         if isinstance(event, Scan):

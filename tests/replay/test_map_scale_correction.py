@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from paths import RECORDINGS
 
+from hsloc.analysis.metrics import map_metrics
 from hsloc.analysis.quality import quality_warnings
 from hsloc.localisation.map_scale import MapScale
 from hsloc.maps import save_map
@@ -16,6 +17,7 @@ from hsloc.model import Pose2, Trajectory
 from hsloc.model.estimate import ScanDiagnostics, Status
 from hsloc.replay.map_and_start import ScaleEvidence
 from hsloc.replay.run import run
+from hsloc.run_metrics import ResidualMetrics
 from hsloc.simulation.built_in import built_in
 from hsloc.warnings import WarningCode
 
@@ -36,6 +38,11 @@ def test_on_a_map_that_is_too_large_poses_are_right_in_metres(tmp_path: Path) ->
     assert found.localised[1:].all()
     assert found.given_resolution == pytest.approx(0.051)
     assert found.grid.resolution == pytest.approx(0.05, rel=0.002)
+    no_points = ResidualMetrics(points=0, median=None, p95=None, within_15_cm=None)
+    scale = map_metrics(found, no_points, comparison=None).scale
+    assert scale is not None
+    assert (scale.corrected, scale.resolution) == (True, found.grid.resolution)
+    assert scale.value == pytest.approx(1.02, abs=3.0 * scale.sigma)
     (warning,) = (each for each in quality_warnings(found) if each.code == WarningCode.MAP_SCALE)
     assert "larger than the lidar" in warning.text
     assert f"set resolution: {found.grid.resolution:.5g} in the map's YAML (it is 0.051)" in warning.remedy

@@ -177,8 +177,8 @@ OPTIONS: tuple[Option, ...] = (
     Option(
         name="scan_fix", flag="--scan-fix", kind="topics", metavar="FIELD=VALUE", place="read", group=_READING,
         help="Override a field of the scans: increment=RAD, increment=angles or negate, angles=degrees or negate, "
-        "time_increment=S or interval, range_min=M, range_max=M, ranges=millimetres or centimetres, echo=strongest; "
-        "several, or with commas.",
+        "time_increment=S, interval or reverse, range_min=M, range_max=M, ranges=millimetres or centimetres, "
+        "echo=strongest; several, or with commas.",
     ),
     Option(
         name="slice", flag="--slice", kind="text", metavar="LOW,HIGH", place="read", group=_READING,

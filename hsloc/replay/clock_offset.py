@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import isfinite
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from hsloc.slam.time_offset import (
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from hsloc.replay.run_history import RunHistory
     from hsloc.request import RunRequest
     from hsloc.slam.time_offset import Offset
+
+R = TypeVar("R")
 
 
 class LateScans(Exception):
@@ -62,20 +64,36 @@ class LateScans(Exception):
 
 
 class SweptScans(Exception):
-    """The lidar turned while the robot did; internal: whoever maps begins again with `request`, which deskews.
+    """The lidar turned while the robot did, for `half_sweep_s` to the middle; internal: who maps begins again.
 
-    `warning` says so.
+    `fitness` is the mean of the matches as recorded.
     """
 
-    def __init__(self, request: RunRequest, half_sweep_s: float) -> None:
+    def __init__(self, request: RunRequest, half_sweep_s: float, fitness: float) -> None:
         super().__init__()
-        self.request = replace(request, read=replace(request.read, deskew=True))
-        self.warning = RunWarning(
-            WarningCode.SCANS_DESKEWED,
-            f"a sweep of the lidar takes {2.0 * abs(half_sweep_s):.3f} s, in which the robot moved: beams were put "
-            "where it was",
-            "--deskew does that from the start, and saves a replay",
-        )
+        self._request, self._half_s, self._fitness = request, half_sweep_s, fitness
+
+    def best(self, attempt: Callable[[RunRequest, RunWarning], R], fitness: Callable[[R], float]) -> R | None:
+        """Of replays that deskew in the order of the header and in the opposite one that which fits better.
+
+        None where neither fits better than without. The order is not known from the header: drivers of lidars that turn
+        clockwise list the beams the other way round, with a `time_increment` that is positive all the same.
+        """
+        read = replace(self._request.read, deskew=True)
+        fixes = self._request.read.scan_fix
+        moved = "in which the robot moved: beams were put where it was"
+        text = f"a sweep of the lidar takes {2.0 * abs(self._half_s):.3f} s, {moved}"
+        ways = [(read, "", "--deskew does that from the start, and saves replays")]
+        if fixes is None or "time_increment" not in fixes:
+            fix = "time_increment=reverse" if fixes is None else f"{fixes},time_increment=reverse"
+            remedy = f"--deskew --scan-fix {fix} does that from the start, and saves replays"
+            ways.append((replace(read, scan_fix=fix), "; the last beam was measured first", remedy))
+        tried = [
+            attempt(replace(self._request, read=each), RunWarning(WarningCode.SCANS_DESKEWED, text + order, remedy))
+            for each, order, remedy in ways
+        ]
+        found = max(tried, key=fitness)
+        return found if fitness(found) > self._fitness else None
 
 
 MAPS_CORRECTED_FROM_S = 0.15
@@ -100,7 +118,7 @@ def open_as_meant(
     """The log, and how it is read: with the right one of several mountings, and the offset of its scans if asked for.
 
     Otherwise that is estimated only where log times hint at it: smaller ones show in the result. `time_offset` is known
-    from a run before. Stamps of different epochs give way to the log's times.
+    from a run before, empty: there is none. Stamps of different epochs give way to the log's times.
     """
     front_end = request.config.graph_mapper.front_end
     plain, of_epochs = request.reading(), list[RunWarning]()
@@ -126,7 +144,7 @@ def open_as_meant(
             time_offset = as_option(found, deskew=reading.deskew or log.summary.segments > 1)
         warnings = (*warnings, *(warning for _, warning in clock_warnings(found, removed=automatic)))
     if time_offset is not None:
-        reading = replace(reading, time_offset=time_offset)
+        reading = replace(reading, time_offset=time_offset or reading.time_offset)
     return (log if reading == plain else open_log(request.logs, reading)), reading, warnings
 
 
@@ -198,7 +216,7 @@ def offsets_of_mapping(
     if correct and offset is not None and not (offset.is_significant or _is_given(request)):
         of_stamps = offset._replace(seconds=-offset.half_sweep_s)
         if of_stamps.is_certain:
-            raise SweptScans(request, offset.half_sweep_s)
+            raise SweptScans(request, offset.half_sweep_s, history.mean_fitness())
     is_large = any(each.is_certain and abs(each.seconds) >= MAPS_CORRECTED_FROM_S for each in found.values())
     if correct and option is not None and is_large:
         raise LateScans({name: each for name, each in found.items() if each.is_certain}, option)
@@ -209,39 +227,10 @@ def _is_given(request: RunRequest) -> bool:
     return request.read.time_offset is not None or bool(request.reading().offsets_s())
 
 
-@dataclass(frozen=True, slots=True)
-class ClockCorrection:
-    """How a log is replayed once more, if that `is_needed`: what is asked for, and the warnings that say so.
-
-    `offsets` (s) are those that the scans show by themselves, by topic; `option` is the value of `--time-offset`.
-    """
-
-    request: RunRequest
-    offsets: Mapping[str, Offset]
-    option: str | None
-    warnings: tuple[RunWarning, ...]
-    is_needed: bool
-
-    @property
-    def removed(self) -> dict[str, Offset]:
-        """The offsets that are removed."""
-        return {topic: offset for topic, offset in self.offsets.items() if offset.is_certain}
-
-    @classmethod
-    def of(
-        cls, request: RunRequest, reading: ReadOptions, evidence: ClockEvidence, *, deskewed: bool
-    ) -> ClockCorrection:
-        """Of the `evidence` in a localiser's result with the log as it was read; its scans were `deskewed` or not."""
-        found, option = clock_offsets(request, reading, deskew=deskewed)
-        warnings = tuple(warning for _, warning in clock_warnings(found, removed=True))
-        swept = None if option is not None or deskewed else _swept_scans(request, evidence, found)
-        if swept is not None:
-            request, warnings = swept.request, (*warnings, swept.warning)
-        return cls(request, found, option, warnings, option is not None or swept is not None)
-
-
-def _swept_scans(request: RunRequest, evidence: ClockEvidence, found: Mapping[str, Offset]) -> SweptScans | None:
-    """Whether the result of a localiser shows that its scans have to be deskewed.
+def swept_scans(
+    request: RunRequest, evidence: ClockEvidence, found: Mapping[str, Offset], fitness: float
+) -> SweptScans | None:
+    """Whether the result of a localiser, with that mean `fitness`, shows that its scans have to be deskewed.
 
     A scan shows the robot in the middle of its sweep. Where that is the whole offset of the matches, and the clocks
     have none by themselves (`found`), the header's `time_increment` is right, and poses are wrong by what the robot
@@ -254,7 +243,7 @@ def _swept_scans(request: RunRequest, evidence: ClockEvidence, found: Mapping[st
     half = float(np.mean(halves))
     if not evidence.offset.is_significant or evidence.offset.seconds * half >= 0.0:
         return None
-    return SweptScans(request, half)
+    return SweptScans(request, half, fitness)
 
 
 def clock_offsets(request: RunRequest, reading: ReadOptions, *, deskew: bool) -> tuple[dict[str, Offset], str | None]:

@@ -1,4 +1,4 @@
-"""The localiser or the mapper of a run, made as the request asks for."""
+"""The localiser or the mapper of a run, and the events it gets, as the request asks for."""
 
 from __future__ import annotations
 
@@ -11,20 +11,45 @@ from hsloc.config import preset
 from hsloc.errors import ConfigError
 from hsloc.interrupts import interrupts_held_back
 from hsloc.matching.window import Window
+from hsloc.model.events import Heading, Odometry
 from hsloc.model.pose2 import IDENTITY
+from hsloc.preprocessing.odometry import OdometryWatch
+from hsloc.preprocessing.scans import without_isolated
 from hsloc.replay.map_and_start import load_grid, resumed
+from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.point_mapper import PointMapper
 from hsloc.slam.stated_loops import StatedLoops
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from hsloc.localisation.localiser import Localiser
+    from hsloc.log import Log
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
+    from hsloc.model.events import Event
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.model.pose2 import Pose2
     from hsloc.request import RunRequest
     from hsloc.slam.map_state import MapState
+
+
+def events_of(request: RunRequest, log: Log, lidar_only: bool, localise: bool) -> Iterable[Event]:
+    """The events of the log; its odometry watched, or left out, or replaced for a localiser by that of the scans.
+
+    Headings stay, unless the scans alone are asked for.
+    """
+    if not lidar_only:
+        # The point mapper cannot do without odometry, whatever that is like.
+        events = log.events() if request.config.mapper == "point" and not localise else OdometryWatch(log.events())
+        return events if localise else without_isolated(events)
+    unused = (Odometry, Heading) if request.no_odometry else (Odometry,)
+    events = (event for event in log.events() if not isinstance(event, unused))
+    if localise:
+        rng = np.random.default_rng((request.seed, 1))
+        return with_laser_odometry(events, request.config.graph_mapper.front_end, rng)
+    return without_isolated(events)
 
 
 def make_mapper(request: RunRequest, state: MapState | None, lidar_only: bool) -> Mapper | PointMapper:

@@ -23,3 +23,9 @@ def is_lost(status: Sequence[str]) -> bool:
     """Whether most scans that were to be matched found no match; those the motion gate passed over were not to be."""
     tried = len(status) - status.count(Status.PREDICTED.value)
     return bool(2 * np.count_nonzero(are_matched(status)) < tried)
+
+
+def mean_fitness(fitness: NDArray[np.float64]) -> float:
+    """Of the scans that were matched, NaN being none; 0 without any."""
+    known = fitness[np.isfinite(fitness)]
+    return float(known.mean()) if len(known) else 0.0

@@ -7,23 +7,22 @@ from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from hsloc.errors import ConfigError
 from hsloc.kernels.cache import compilation_reported
-from hsloc.model.events import Heading, Odometry, Scan
-from hsloc.preprocessing.odometry import ContinuousOdometry, OdometryWatch, UnusableOdometry
-from hsloc.preprocessing.scans import ScanWatch, without_isolated
+from hsloc.model.events import Scan
+from hsloc.preprocessing.odometry import ContinuousOdometry, UnusableOdometry
+from hsloc.preprocessing.scans import ScanWatch
 from hsloc.replay.clock_offset import (
-    ClockCorrection,
     ClockEvidence,
     LateScans,
     SweptScans,
+    clock_offsets,
     offsets_of_mapping,
     open_as_meant,
+    swept_scans,
 )
 from hsloc.replay.engine import rarely_collected, replay
-from hsloc.replay.estimators import make_localiser, make_mapper
+from hsloc.replay.estimators import events_of, make_localiser, make_mapper
 from hsloc.replay.map_and_start import (
     ScaleEvidence,
     find_map,
@@ -33,10 +32,10 @@ from hsloc.replay.map_and_start import (
     require_data,
     require_map,
 )
+from hsloc.replay.matched_scans import mean_fitness
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory, pose_covariances
 from hsloc.request import RunRequest
-from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.point_mapper import PointMapper
 from hsloc.slam.time_offset import clock_warnings
@@ -45,6 +44,7 @@ from hsloc.warnings import RunWarning, WarningCode
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from hsloc.localisation.map_scale import MapScale
@@ -231,27 +231,38 @@ def _run_on(
         warnings = (*result.warnings, *(warning for _, warning in clock_warnings(whole, removed=True)))
         return replace(result, warnings=warnings, corrected_offsets=whole)
     except SweptScans as swept:
-        result = _run_on(swept.request, progress, correction)
-        return replace(result, warnings=(*result.warnings, swept.warning))
+        better = _deskewed(swept, progress, correction)
+        return better or _run_with(request, progress, lidar_only=False, time_offset="", correction=correction)
     is_settled = {WarningCode.CLOCK_OFFSET_APPLIED, WarningCode.CLOCK_SET} & {each.code for each in result.warnings}
     if result.mode != "localise" or result.lidar_only or is_settled:
         return result
     evidence = result.clock_evidence()
     if not evidence.hints:
         return result
-    found = ClockCorrection.of(request, result.reading or request.reading(), evidence, deskewed=result.deskewed)
-    if found.is_needed:
+    offsets, option = clock_offsets(request, result.reading or request.reading(), deskew=result.deskewed)
+    if option is not None:
+        warnings = tuple(warning for _, warning in clock_warnings(offsets, removed=True))
         again = _run_with(
-            found.request,
-            progress,
-            lidar_only=False,
-            warnings=found.warnings,
-            time_offset=found.option,
-            correction=correction,
+            request, progress, lidar_only=False, warnings=warnings, time_offset=option, correction=correction
         )
         if again.clock_evidence().is_better(evidence):
-            return replace(again, seconds=_sum(result.seconds, again.seconds), corrected_offsets=found.removed)
-    return replace(result, clock_offsets=found.offsets)
+            certain = {topic: offset for topic, offset in offsets.items() if offset.is_certain}
+            return replace(again, seconds=_sum(result.seconds, again.seconds), corrected_offsets=certain)
+    elif not result.deskewed:
+        shown = swept_scans(request, evidence, offsets, mean_fitness(result.diagnostics.fitness))
+        if shown is not None and (better := _deskewed(shown, progress, correction)) is not None:
+            return better
+    return replace(result, clock_offsets=offsets)
+
+
+def _deskewed(
+    swept: SweptScans, progress: Callable[[Progress], None] | None, correction: tuple[MapScale, Pose2] | None
+) -> Result | None:
+    def attempt(request: RunRequest, warning: RunWarning) -> Result:
+        result = _run_on(request, progress, correction)
+        return replace(result, warnings=(*result.warnings, warning))
+
+    return swept.best(attempt, lambda result: mean_fitness(result.diagnostics.fitness))
 
 
 def _run_with(
@@ -300,7 +311,7 @@ def _run_with(
     first = None if lidar_only else first_odometry(log.events())
     prepared = time.perf_counter()
     history = RunHistory(request.config.localiser.smoothing_model() if localise else None)
-    events = ContinuousOdometry(_events(request, log, lidar_only, localise), log.summary.odom_topic)
+    events = ContinuousOdometry(events_of(request, log, lidar_only, localise), log.summary.odom_topic)
     watch = ScanWatch(events, log.summary.scan_topic)
     watched = events if lidar_only else watch
     # Turns that were joined of segments are known beam by beam; a whole turn is deskewed if the user asks for it.
@@ -361,23 +372,6 @@ def _run_with(
         reading=reading,
         log=None if log.is_unpacked else log,
     )
-
-
-def _events(request: RunRequest, log: Log, lidar_only: bool, localise: bool) -> Iterable[Event]:
-    """The events of the log; its odometry watched, or left out, or replaced for a localiser by that of the scans.
-
-    Headings stay, unless the scans alone are asked for.
-    """
-    if not lidar_only:
-        # The point mapper cannot do without odometry, whatever that is like.
-        events = log.events() if request.config.mapper == "point" and not localise else OdometryWatch(log.events())
-        return events if localise else without_isolated(events)
-    unused = (Odometry, Heading) if request.no_odometry else (Odometry,)
-    events = (event for event in log.events() if not isinstance(event, unused))
-    if localise:
-        rng = np.random.default_rng((request.seed, 1))
-        return with_laser_odometry(events, request.config.graph_mapper.front_end, rng)
-    return without_isolated(events)
 
 
 def _share(progress: Callable[[Progress], None] | None, total: float, scans: int) -> Callable[[float], None] | None:

@@ -23,7 +23,7 @@ from hsloc.model.estimate import ScanDiagnostics, State, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
 from hsloc.model.pose2 import Pose2, compose_poses
 from hsloc.model.trajectory import Trajectory
-from hsloc.replay.matched_scans import are_matched, is_lost
+from hsloc.replay.matched_scans import are_matched, is_lost, mean_fitness
 from hsloc.slam.time_offset import (
     LEAST_AGREEMENT,
     NANOSECONDS,
@@ -201,6 +201,10 @@ class RunHistory:
             return None
         drift_s = find_drift(scans, odometry, found.seconds)
         return found._replace(drift_s=drift_s, half_sweep_s=half_ns / NANOSECONDS)
+
+    def mean_fitness(self) -> float:
+        """Of the scans that were matched; 0 without any."""
+        return mean_fitness(np.array(self._fitness))
 
     def reference(self) -> Trajectory | None:
         """The truth of the log, if it has any."""

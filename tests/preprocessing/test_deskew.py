@@ -11,11 +11,13 @@ import pytest
 from hsloc.errors import ConfigError
 from hsloc.evaluation import evaluate
 from hsloc.log import LogWriter, ReadOptions, open_log
+from hsloc.maps import save_map
 from hsloc.model import Odometry, Pose2, Scan
 from hsloc.model.events import PairedScan
 from hsloc.preprocessing.scans import pair
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
+from hsloc.simulation.built_in import built_in
 from hsloc.simulation.presets import preset
 from hsloc.simulation.recorder import record
 from hsloc.warnings import WarningCode
@@ -134,3 +136,30 @@ def test_scans_of_a_turning_lidar_are_deskewed_where_the_result_shows_the_need(t
     assert [each.code for each in built.warnings] == [WarningCode.SCANS_DESKEWED]
     assert built.reference is not None
     assert evaluate(built.trajectory, built.reference, alignment="se2").ape.trans_part.rmse < 0.005
+
+
+def test_beams_that_are_listed_against_their_time_are_found_out(tmp_path: Path) -> None:
+    scenario = preset("office")
+    scenario = replace(scenario, seed=8, duration_s=25.0, sensor=replace(scenario.sensor, motion_distortion=True))  # type: ignore[arg-type]
+    record(scenario, tmp_path / "skew.mcap")
+    log = open_log(tmp_path / "skew.mcap")
+    truth, map_path = tmp_path / "skew.mcap", save_map(built_in("office").occupancy_grid(0.05), tmp_path)
+    with LogWriter(tmp_path / "clockwise.mcap") as out:
+        out.transforms(SECOND, [("base_link", "laser", log.summary.T_base_laser)], static=True)
+        for event in log.events():
+            if isinstance(event, Scan):
+                last = event.angle_min + (len(event.ranges) - 1) * event.angle_increment
+                turned = replace(
+                    event, angle_min=last, angle_increment=-event.angle_increment, ranges=event.ranges[::-1]
+                )
+                out.scan(turned)
+            elif isinstance(event, Odometry):
+                out.odometry(event.stamp_ns, event.T_odom_base)
+    for mode in ("localise", "slam"):
+        given: dict[str, Any] = {"map": map_path} if mode == "localise" else {}
+        found = run(tmp_path / "clockwise.mcap", mode=mode, reference=truth, **given)
+        (warning,) = (each for each in found.warnings if each.code == WarningCode.SCANS_DESKEWED)
+        assert "the last beam was measured first" in warning.text
+        assert found.request.read.scan_fix == "time_increment=reverse"
+        assert found.reference is not None
+        assert evaluate(found.trajectory, found.reference, alignment="se2").ape.trans_part.rmse < 0.01

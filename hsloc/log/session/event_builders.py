@@ -96,7 +96,9 @@ class ScanFeed:
         stamp = self._clock.stamp(message.stamp_ns, log_time_ns)
         if stamp is None:
             return ()
+        before_ns = message.stamp_ns
         message = self._fixes.apply(message, self._survey.interval_s)
+        stamp += message.stamp_ns - before_ns
         if self._turns is None:
             return self._scan(message, stamp)
         turns = self._turns.add(message._replace(stamp_ns=stamp))

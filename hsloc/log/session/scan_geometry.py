@@ -73,9 +73,9 @@ class ScanFixes:
 
     `increment` is an angle in radians, or `angles` (from angle_min, angle_max and the number of beams) or `negate`;
     `degrees` says that all angles are in degrees, `negate` that all have the wrong sign; `time_increment` is a time in
-    seconds, or `interval` (from the time between scans); `range_min` and `range_max` are in metres; `millimetres` and
-    `centimetres` say that ranges are, and their limits, too, if no lidar measures as far; `strongest` takes of each
-    beam the strongest echo, not the first.
+    seconds, or `interval` (from the time between scans), or `reverse` (the last beam was measured first, in the same
+    time); `range_min` and `range_max` are in metres; `millimetres` and `centimetres` say that ranges are, and their
+    limits, too, if no lidar measures as far; `strongest` takes of each beam the strongest echo, not the first.
     """
 
     increment: float | str | None = None
@@ -93,7 +93,7 @@ class ScanFixes:
         """From `name=value` items with commas between. Raises ConfigError naming the item."""
         items = [item.strip() for item in text.split(",")] if text else []
         values: dict[str, float | str | bool] = {}
-        words = {"increment": ("angles", "negate"), "time_increment": ("interval",), **_ONLY}
+        words = {"increment": ("angles", "negate"), "time_increment": ("interval", "reverse"), **_ONLY}
         for item in items:
             name, _, text = item.partition("=")
             if name not in (*_NUMBERS, *_ONLY):
@@ -124,8 +124,11 @@ class ScanFixes:
             increment = -increment
         elif isinstance(self.increment, float):
             increment = self.increment
-        step = message.time_increment
-        if self.time_increment == "interval":
+        step, stamp_ns = message.time_increment, message.stamp_ns
+        if self.time_increment == "reverse" and isfinite(step):
+            stamp_ns += round(max(len(message.ranges) - 1, 0) * step * 1e9)
+            step = -step
+        elif self.time_increment == "interval":
             step = abs(increment) / _TURN * interval_s if interval_s is not None else step
         elif isinstance(self.time_increment, float):
             step = self.time_increment
@@ -139,6 +142,7 @@ class ScanFixes:
             if farthest > _FARTHEST_M:
                 nearest, farthest = unit * nearest, unit * farthest
         return message._replace(
+            stamp_ns=stamp_ns,
             angle_min=low,
             angle_increment=increment,
             angle_max=high,

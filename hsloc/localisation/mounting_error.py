@@ -117,7 +117,7 @@ def mounting_error(anchors: Sequence[Anchor]) -> MountingError | None:
 
 
 def without_each_part(information: NDArray[Any], vectors: NDArray[Any], parts: int) -> NDArray[Any]:
-    """Solutions (parts, p) of normal equations without each of so many parts of their rows in turn (jackknife).
+    """Solutions (parts, p) of normal equations without each of `parts` parts of their rows in turn (jackknife).
 
     `information` (n, p, p) and `vectors` (n, p), real or complex, are those of each row.
     """

@@ -17,7 +17,7 @@ from hsloc.errors import LogError, MapError
 from hsloc.maps import read_map, read_metadata
 from hsloc.model.events import Odometry
 from hsloc.model.pose2 import Pose2
-from hsloc.replay.matched_scans import are_matched, is_lost
+from hsloc.replay.matched_scans import are_matched, is_lost, mean_fitness
 from hsloc.slam.map_state import STATE_FILE, fingerprint, read_state
 from hsloc.slam.parameters import Resume
 from hsloc.warnings import RunWarning, WarningCode
@@ -276,7 +276,7 @@ class ScaleEvidence:
     ) -> ScaleEvidence:
         """Of a localiser's result with one pose for each message of the odometry."""
         matched = are_matched(scans.status)
-        fitness = float(scans.fitness[matched].mean()) if matched.any() else 0.0
+        fitness = mean_fitness(scans.fitness[matched])
         k = 0
         if matched.any():
             first = np.searchsorted(odometry.stamps_ns, scans.stamps_ns[np.argmax(matched)], side="right")

@@ -116,14 +116,21 @@ def test_the_duration_of_a_scan_stands_in_for_the_time_of_its_beams(tmp_path: Pa
         assert found.time_increment == pytest.approx(expected)
 
 
-def test_scans_of_a_turning_lidar_are_deskewed_where_the_result_shows_the_need(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def skew(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of a lidar that turns while the robot does."""
+    path = tmp_path_factory.mktemp("skew") / "skew.mcap"
     scenario = preset("office")
     scenario = replace(scenario, seed=8, duration_s=25.0, sensor=replace(scenario.sensor, motion_distortion=True))  # type: ignore[arg-type]
-    record(scenario, tmp_path / "skew.mcap")
+    record(scenario, path)
+    return path
+
+
+def test_scans_of_a_turning_lidar_are_deskewed_where_the_result_shows_the_need(skew: Path) -> None:
     as_recorded, deskewed = ReadOptions(time_offset="/scan=0"), ReadOptions(deskew=True)
     errors = []
     for read in (as_recorded, deskewed, ReadOptions()):
-        result = run(RunRequest(logs=(tmp_path / "skew.mcap",), read=read))
+        result = run(RunRequest(logs=(skew,), read=read))
         codes = [warning.code for warning in result.warnings]
         assert codes == ([WarningCode.SCANS_DESKEWED] if read == ReadOptions() else [])
         assert result.deskewed == (read != as_recorded)
@@ -132,18 +139,15 @@ def test_scans_of_a_turning_lidar_are_deskewed_where_the_result_shows_the_need(t
     assert errors[1] < 0.015
     assert errors[0] > 3.0 * errors[1]
     assert errors[2] == errors[1]
-    built = run(RunRequest(logs=(tmp_path / "skew.mcap",), mode="slam"))
+    built = run(RunRequest(logs=(skew,), mode="slam"))
     assert [each.code for each in built.warnings] == [WarningCode.SCANS_DESKEWED]
     assert built.reference is not None
     assert evaluate(built.trajectory, built.reference, alignment="se2").ape.trans_part.rmse < 0.005
 
 
-def test_beams_that_are_listed_against_their_time_are_found_out(tmp_path: Path) -> None:
-    scenario = preset("office")
-    scenario = replace(scenario, seed=8, duration_s=25.0, sensor=replace(scenario.sensor, motion_distortion=True))  # type: ignore[arg-type]
-    record(scenario, tmp_path / "skew.mcap")
-    log = open_log(tmp_path / "skew.mcap")
-    truth, map_path = tmp_path / "skew.mcap", save_map(built_in("office").occupancy_grid(0.05), tmp_path)
+def test_beams_that_are_listed_against_their_time_are_found_out(skew: Path, tmp_path: Path) -> None:
+    log = open_log(skew)
+    map_path = save_map(built_in("office").occupancy_grid(0.05), tmp_path)
     with LogWriter(tmp_path / "clockwise.mcap") as out:
         out.transforms(SECOND, [("base_link", "laser", log.summary.T_base_laser)], static=True)
         for event in log.events():
@@ -157,7 +161,7 @@ def test_beams_that_are_listed_against_their_time_are_found_out(tmp_path: Path) 
                 out.odometry(event.stamp_ns, event.T_odom_base)
     for mode in ("localise", "slam"):
         given: dict[str, Any] = {"map": map_path} if mode == "localise" else {}
-        found = run(tmp_path / "clockwise.mcap", mode=mode, reference=truth, **given)
+        found = run(tmp_path / "clockwise.mcap", mode=mode, reference=skew, **given)
         (warning,) = (each for each in found.warnings if each.code == WarningCode.SCANS_DESKEWED)
         assert "the last beam was measured first" in warning.text
         assert found.request.read.scan_fix == "time_increment=reverse"

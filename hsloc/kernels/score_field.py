@@ -38,17 +38,25 @@ _STEPS = 64
 
 
 @njit(cache=True, nogil=True)
-def column_distances(occupied: B, far: int, distances: Integers) -> None:
+def column_distances(occupied: B, margin: int, far: int, distances: Integers) -> None:
     """Write the distance in cells from each cell of (h, w) to the nearest occupied one of its column.
 
-    It is `far` where the column has none; `far` must be at least h + w, and fit the type of `distances`.
+    `occupied` is (h - 2 margin, w - 2 margin): the `margin` cells on each side are free. The distance is `far` where
+    the column has no occupied cell; `far` must be at least h + w, and fit the type of `distances`.
     """
-    height, width = occupied.shape
+    height, width = distances.shape
+    rows, columns = occupied.shape
     for u in range(width):
-        distances[0, u] = 0 if occupied[0, u] else far
+        distances[0, u] = far
+        if margin == 0 and occupied[0, u]:
+            distances[0, u] = 0
     for v in range(1, height):
+        is_within = margin <= v < rows + margin
         for u in range(width):
-            distances[v, u] = 0 if occupied[v, u] else min(distances[v - 1, u] + 1, far)
+            if is_within and margin <= u < columns + margin and occupied[v - margin, u - margin]:
+                distances[v, u] = 0
+            else:
+                distances[v, u] = min(distances[v - 1, u] + 1, far)
     for v in range(height - 2, -1, -1):
         for u in range(width):
             distances[v, u] = min(distances[v, u], distances[v + 1, u] + 1)

@@ -362,9 +362,12 @@ def _by_phase(tables: NDArray[np.uint8], side: int) -> NDArray[np.uint8]:
     """The tables in the order of `hsloc.kernels.map_search`: entries that are `side` apart lie side by side."""
     count, height, width = tables.shape
     rows, columns = -(-height // side), -(-width // side)
-    padded = np.zeros((count, rows * side, columns * side), dtype=np.uint8)
-    padded[:, :height, :width] = tables
-    return np.ascontiguousarray(padded.reshape(count, rows, side, columns, side).transpose(0, 2, 4, 1, 3))
+    by_phase = np.empty((count, side, side, rows, columns), dtype=np.uint8)
+    padded = np.zeros((rows * side, columns * side), dtype=np.uint8)
+    for table, phases in zip(tables, by_phase, strict=True):
+        padded[:height, :width] = table
+        phases[:] = padded.reshape(rows, side, columns, side).transpose(1, 3, 0, 2)
+    return by_phase
 
 
 def _cluster(points: F64, side: float) -> F64:

@@ -44,9 +44,9 @@ class Icp(Parameters):
     def match(self, points: F64, field: LikelihoodField, window: Window, rng: Generator) -> Match:
         """See `Matcher`; `rng` is not used."""
         half = half_widths_in(field, window)
-        if len(points) == 0 or field.walls is None:
+        tree = _tree(field)
+        if len(points) == 0 or tree.n == 0:
             return Match(window.centre, 0.0, np.diag(half**2 / 3.0), 0, StopReason.NO_POINTS)
-        tree = _tree(field, field.walls)
         pose, stopped, rounds = window.centre, StopReason.BUDGET, 0
         for _ in range(self.iterations):
             rounds += 1
@@ -55,7 +55,7 @@ class Icp(Parameters):
             paired = np.isfinite(distance)
             if paired.sum() < 3:
                 break
-            step = rigid_motion(moved[paired], field.walls[np.asarray(nearest)[paired]])
+            step = rigid_motion(moved[paired], tree.data[np.asarray(nearest)[paired]])
             pose = step @ pose
             if max(abs(step.x), abs(step.y), abs(step.theta)) < self.tolerance:
                 stopped = StopReason.CONVERGED
@@ -75,10 +75,10 @@ def rigid_motion(source: F64, target: F64) -> Pose2:
     return Pose2(float(b[0] - moved[0]), float(b[1] - moved[1]), theta)
 
 
-def _tree(field: LikelihoodField, walls: F64) -> cKDTree:
+def _tree(field: LikelihoodField) -> cKDTree:
     tree = _trees.get(field)
     if tree is None:
         from scipy.spatial import cKDTree
 
-        tree = _trees[field] = cKDTree(walls)
+        tree = _trees[field] = cKDTree(field.wall_points())
     return tree

@@ -33,17 +33,22 @@ _ROWS = 64
 """Rows of a map whose distances are worked out in one go. Internal: bounds the memory."""
 
 
-def distances_to_walls(occupied: NDArray[np.bool_], overlap: int = 0) -> Iterator[tuple[int, F64]]:
-    """Of cells (h, w) the distance in cells to the nearest occupied one, some rows (k, w) at a time.
+def distances_to_walls(occupied: NDArray[np.bool_], margin: int = 0, overlap: int = 0) -> Iterator[tuple[int, F64]]:
+    """Of cells (h, w), with `margin` free ones on each side, the distance in cells to the nearest occupied one.
 
-    Yields the number of the first of these rows, and the distances; `overlap` rows at the end are those that come next.
-    All at once would take more memory than what is made of them.
+    Yields some rows (k, w + 2 margin) at a time: the number of the first, and the distances; `overlap` rows at the end
+    are those that come next. All at once would take more memory than what is made of them.
     """
-    height, width = occupied.shape
+    height, width = occupied.shape[0] + 2 * margin, occupied.shape[1] + 2 * margin
     far = height + width
-    columns = np.empty(occupied.shape, dtype=np.uint16 if far < 1 << 16 else np.int32)
-    column_distances(occupied, far, columns)
-    for row in range(0, height - overlap, _ROWS):
+    columns = np.empty((height, width), dtype=np.uint16 if far < 1 << 16 else np.int32)
+    column_distances(occupied, margin, far, columns)
+    return _distances_in_rows(columns, overlap)
+
+
+def _distances_in_rows(columns: NDArray[np.uint16] | NDArray[np.int32], overlap: int) -> Iterator[tuple[int, F64]]:
+    """The rows of `distances_to_walls`; the cells are not needed any more, and may be freed by then."""
+    for row in range(0, len(columns) - overlap, _ROWS):
         yield row, np.sqrt(squared_distances(columns[row : row + _ROWS + overlap]))
 
 
@@ -61,7 +66,7 @@ class LikelihoodField:
     T_map_field: Pose2
     sigma: float
     walls: F64 | None = None
-    """The points of the map, shape (n, 2) in metres in the map frame, for matchers that pair points (ICP)."""
+    """The points that the field was made of, shape (n, 2) in metres in the map frame; see `wall_points`."""
 
     def __repr__(self) -> str:
         height, width = self.packed.shape[:2]
@@ -94,16 +99,16 @@ class LikelihoodField:
                 f"{cells:.2g} cells; at most {_MOST_CELLS:.0e} fit: "
                 "choose a smaller likelihood_field.margin or a coarser map"
             )
-        walls = grid.centres(occupied)
-        padded = np.pad(occupied, pad)
-        height, width = padded.shape
+        height, width = occupied.shape[0] + 2 * pad, occupied.shape[1] + 2 * pad
+        distances = distances_to_walls(occupied, pad, overlap=1)
+        del occupied  # A byte a cell that is not needed while the field is filled.
         packed = np.empty((height - 1, width - 1, 4), dtype=np.float32)
-        for row, distance in distances_to_walls(padded, overlap=1):
+        for row, distance in distances:
             scores = np.exp(-(distance * grid.resolution) / sigma).astype(np.float32)
             pack(scores, packed[row : row + _ROWS], 0, len(scores) - 1, 0, width - 1)
         corner = (0.5 - pad) * grid.resolution
         T_map_field = grid.origin @ Pose2(corner, corner, 0.0)
-        return LikelihoodField(packed, grid.resolution, T_map_field, sigma, walls)
+        return LikelihoodField(packed, grid.resolution, T_map_field, sigma)
 
     @staticmethod
     def from_points(
@@ -131,6 +136,17 @@ class LikelihoodField:
             scores[row] = np.exp(-distance / sigma)
         T_map_field = Pose2(float(low[0]), float(low[1]), 0.0)
         return LikelihoodField.from_scores(scores, resolution, T_map_field, sigma, points)
+
+    def wall_points(self) -> F64:
+        """The points of the map, shape (n, 2) in metres in the map frame, for matchers that pair points (ICP).
+
+        Where the field was not made of points, the nodes that lie in a wall: those whose score is 1.
+        """
+        if self.walls is not None:
+            return self.walls
+        rows, columns = np.nonzero(self.packed[..., 0] == 1.0)
+        nodes: F64 = np.column_stack((columns, rows)).astype(np.float64) * self.resolution
+        return self.T_map_field @ nodes
 
     def to_cells(self, pose: Pose2) -> F64:
         """A pose in the map as (x, y, theta) in cells of the field, shape (3,)."""

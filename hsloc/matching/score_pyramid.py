@@ -57,20 +57,24 @@ def _entries(packed: NDArray[np.float32], shift: int) -> U8:
     """The nodes' scores in steps of 1 / 255, rounded up; maxima of 2^shift x 2^shift of them."""
     height, width = packed.shape[0] + 1, packed.shape[1] + 1
     step = 1 << shift
-    padded = np.zeros((-(-height // step) * step, -(-width // step) * step), dtype=np.uint8)
-    padded[: height - 1, : width - 1] = _steps(packed[..., 0])
-    padded[: height - 1, width - 1] = _steps(packed[:, -1, :2].sum(axis=1))
-    padded[height - 1, : width - 1] = _steps(packed[-1, :, 0] + packed[-1, :, 2])
-    padded[height - 1, width - 1] = _steps(packed[-1, -1].sum(keepdims=True))[0]
-    entries = padded.reshape(padded.shape[0] // step, step, padded.shape[1] // step, step)
-    return entries.max(axis=(1, 3)) if shift else padded
+    entries = np.empty((-(-height // step), -(-width // step)), dtype=np.uint8)
+    # Some rows at a time: floats and padding of the whole field would take more memory than the tables.
+    part = max((1 << 20) // (width * step), 1)
+    for first in range(0, len(entries), part):
+        last = min(first + part, len(entries))
+        padded = np.zeros(((last - first) * step, entries.shape[1] * step), dtype=np.uint8)
+        squares = packed[first * step : last * step]
+        padded[: len(squares), : width - 1] = _steps(squares[..., 0])
+        padded[: len(squares), width - 1] = _steps(squares[:, -1, :2].sum(axis=1))
+        if last == len(entries):
+            bottom = padded[height - 1 - first * step]
+            bottom[: width - 1] = _steps(packed[-1, :, 0] + packed[-1, :, 2])
+            bottom[width - 1] = _steps(packed[-1, -1].sum())
+        entries[first:last] = padded.reshape(last - first, step, entries.shape[1], step).max(axis=(1, 3))
+    return entries
 
 
-def _steps(scores: NDArray[np.float32]) -> U8:
+def _steps(scores: NDArray[np.float32]) -> NDArray[np.float32]:
     """Rounded up by at least the rounding of the sums, so that no score is above its step."""
-    steps = np.empty(scores.shape, dtype=np.uint8)
-    rows = max((1 << 20) // max(scores[0].size, 1), 1)
-    for row in range(0, len(scores), rows):
-        part = np.ceil(scores[row : row + rows] * np.float32(255.0) + np.float32(1e-4))
-        steps[row : row + rows] = np.clip(part, 0.0, 255.0)
+    steps: NDArray[np.float32] = np.clip(np.ceil(scores * np.float32(255.0) + np.float32(1e-4)), 0.0, 255.0)
     return steps

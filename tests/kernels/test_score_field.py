@@ -28,21 +28,25 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def columns_of(occupied: Any, kind: Any) -> Any:
-    columns = np.empty(occupied.shape, dtype=kind)
-    column_distances(occupied, sum(occupied.shape), columns)
+def columns_of(occupied: Any, kind: Any, margin: int = 0) -> Any:
+    shape = tuple(size + 2 * margin for size in occupied.shape)
+    columns = np.empty(shape, dtype=kind)
+    column_distances(occupied, margin, sum(shape), columns)
     return columns
 
 
 @settings(max_examples=200)
-@given(st.integers(1, 14), st.integers(1, 14), st.integers(0, 2**32 - 1), st.floats(0.01, 0.9))
-def test_distances_are_those_to_the_nearest_occupied_cell(height: Any, width: Any, seed: Any, share: Any) -> None:
+@given(st.integers(1, 14), st.integers(1, 14), st.integers(0, 2**32 - 1), st.floats(0.01, 0.9), st.integers(0, 3))
+def test_distances_are_those_to_the_nearest_occupied_cell(
+    height: Any, width: Any, seed: Any, share: Any, margin: Any
+) -> None:
     rng = np.random.default_rng(seed)
-    occupied = rng.random((height, width)) < share
-    occupied[rng.integers(height), rng.integers(width)] = True
-    found = squared_distances(columns_of(occupied, np.uint16))
-    for row in range(height):
-        for column in range(width):
+    inner = rng.random((height, width)) < share
+    inner[rng.integers(height), rng.integers(width)] = True
+    found = squared_distances(columns_of(inner, np.uint16, margin))
+    occupied = np.pad(inner, margin)
+    for row in range(height + 2 * margin):
+        for column in range(width + 2 * margin):
             expected = naive.distance_to_nearest(occupied, row, column)
             assert found[row, column] == round(expected**2)
 

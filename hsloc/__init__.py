@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     )
     from hsloc.evaluation import evaluate, read_tum, write_tum
     from hsloc.export.results_folder import write_results
-    from hsloc.localisation.localiser import Localiser, LocaliserParameters
+    from hsloc.localisation.localiser import Localiser
+    from hsloc.localisation.parameters import LocaliserParameters
     from hsloc.log import ReadOptions, open_log
     from hsloc.maps import load_map, save_map
     from hsloc.matching import HarmonySearch, Hide, Icp, LikelihoodField, Match, Matcher, Window
@@ -52,7 +53,8 @@ _MODULES = {
     ),
     "hsloc.evaluation": ("evaluate", "read_tum", "write_tum"),
     "hsloc.export.results_folder": ("write_results",),
-    "hsloc.localisation.localiser": ("Localiser", "LocaliserParameters"),
+    "hsloc.localisation.localiser": ("Localiser",),
+    "hsloc.localisation.parameters": ("LocaliserParameters",),
     "hsloc.log": ("ReadOptions", "open_log"),
     "hsloc.maps": ("load_map", "save_map"),
     "hsloc.matching": ("HarmonySearch", "Hide", "Icp", "LikelihoodField", "Match", "Matcher", "Window"),

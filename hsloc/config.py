@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from hsloc.errors import ConfigError
-from hsloc.localisation.localiser import LocaliserParameters
+from hsloc.localisation.parameters import LocaliserParameters
 from hsloc.localisation.place_check import PlaceCheckParameters
 from hsloc.matching.exact import Exact
 from hsloc.matching.harmony_search import HarmonySearch

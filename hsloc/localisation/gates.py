@@ -24,6 +24,12 @@ _AS_USUAL = 0.98
 _REGAINED = 0.05
 """Least gain in fitness of a match in a wide window over one that is not as fit as usual: fitness at the right place
 scatters by 0.02 from scan to scan, so that two of them differ by as much once in thirteen times."""
+_STILL_M, _STILL_RAD = 1e-3, 1e-3
+"""Motion (m, rad) from message to message up to which the odometry stands still: less than wheels that turn."""
+_AS_LAST = 0.97
+"""Ratio to the fitness of the last match, or of one nearby, that scans at rest reach, unless people pass."""
+_MOST_LEFT_OUT = 7
+"""Scans that are left out between two that are searched for, at most, where these found nothing: people pass by."""
 _WEIGHT_OF_NEW = 0.05
 """Weight of a new match in the usual fitness: its memory is about 20 matches."""
 
@@ -40,6 +46,42 @@ class MotionGate:
     def is_open(self, motion: Pose2) -> bool:
         """Whether a motion since the last scan that was used reaches one of the limits."""
         return hypot(motion.x, motion.y) >= self.min_distance or abs(motion.theta) >= self.min_angle
+
+
+class RestGate:
+    """Open where a scan fits worse than the last match although the odometry stands still: the robot may be moved.
+
+    State: the last odometry, and how often the scans of this rest were searched for in vain.
+    """
+
+    def __init__(self) -> None:
+        self.stands = False
+        self._T_odom_base: Pose2 | None = None
+        self._fitness = 0.0
+        self._left_out = self._in_vain = 0
+
+    def follow(self, T_odom_base: Pose2) -> None:
+        """The next odometry message."""
+        if self._T_odom_base is not None:
+            step = self._T_odom_base.between(T_odom_base)
+            self.stands = hypot(step.x, step.y) < _STILL_M and abs(step.theta) < _STILL_RAD
+        self._T_odom_base = T_odom_base
+
+    def is_open(self, fitness: float) -> bool:
+        """Whether a scan of this fitness at the place of the last match is worth a search."""
+        if fitness >= _AS_LAST * self._fitness:
+            return False
+        self._left_out += 1
+        return self._left_out > min(self._in_vain // 2, _MOST_LEFT_OUT)
+
+    def searched(self, is_moved: bool) -> None:
+        """A scan was searched for."""
+        self._left_out = 0
+        self._in_vain = 0 if is_moved else self._in_vain + 1
+
+    def matched(self, fitness: float) -> None:
+        """A match was accepted."""
+        self._fitness, self._left_out, self._in_vain = fitness, 0, 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,6 +136,10 @@ class MatchGate:
     def is_regained(self, worse: float, wide: float) -> bool:
         """Whether a match of fitness `wide` in a wide window takes the place of one that was not as fit as usual."""
         return self.usual is not None and wide >= max(worse + _REGAINED, _AS_USUAL * self.usual)
+
+    def is_elsewhere(self, here: float, elsewhere: float) -> bool:
+        """Whether a match of fitness `elsewhere` is as fit as usual, and one at rest of fitness `here` is not."""
+        return self.fits_as_usual(elsewhere) and here <= _AS_LAST * elsewhere
 
     def trust(self, fitness: float) -> float:
         """Part of the information of an accepted match that counts: all at the usual fitness, little at the least.

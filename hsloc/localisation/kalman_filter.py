@@ -32,6 +32,8 @@ _MAX_SQUARED = 16.3
 of chi squared with 3 degrees of freedom. Beyond it a wheel slipped."""
 _METRES_PER_RADIAN = 0.5
 """Metres that a radian counts for in the share of the motion: about the track width of an indoor robot."""
+_STILL_M = 1e-6
+"""Motion (m) that an odometry message counts for that states none, as where it is frozen and the robot is not."""
 _REMEMBERED = 0.98
 """Weight of an innovation after the next one: about 50 are remembered, the 10 m of a match each 0.2 m."""
 _ASSUMED = 7.5
@@ -86,6 +88,12 @@ def fuse_match(prediction: Pose2, covariance: F64, match: Match, information: F6
     if information is None:
         return fuse(prediction, covariance, match.pose, match.covariance)
     return update_with_information(prediction, covariance, match.pose, information)
+
+
+def is_slip(innovation: F64, covariance: F64, information: F64) -> bool:
+    """Whether an innovation (3,), by covariance of the prediction and information of the match (3, 3), is no noise."""
+    weight = information @ np.linalg.inv(np.eye(3) + covariance @ information)
+    return float(innovation @ weight @ innovation) > _MAX_SQUARED
 
 
 class Innovations:
@@ -225,7 +233,9 @@ def _between(odometry: F64, anchors: Sequence[Anchor]) -> _Between:
     rows = rows[~begins[before[rows] + 1]]
     first, second = before[rows], before[rows] + 1
     steps = np.diff(odometry, axis=0, prepend=odometry[:1])
-    moved = np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) + _METRES_PER_RADIAN * np.abs(wrap_angles(steps[:, 2])))
+    moved = np.cumsum(
+        _STILL_M + np.hypot(steps[:, 0], steps[:, 1]) + _METRES_PER_RADIAN * np.abs(wrap_angles(steps[:, 2]))
+    )
     begin, end = moved[np.maximum(counts[first] - 1, 0)], moved[np.maximum(counts[second] - 1, 0)]
     share = np.clip((moved[rows] - begin) / np.maximum(end - begin, 1e-9), 0.0, 1.0)[:, None]
     return _Between(rows, first, second, share)

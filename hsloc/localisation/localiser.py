@@ -6,20 +6,19 @@ While the pose is unknown the relocaliser decides.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from math import hypot, radians
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate
-from hsloc.localisation.kalman_filter import Innovations, difference, fuse_match, predict_covariance
+from hsloc.kernels.fitness import fitness_many
+from hsloc.localisation.gates import MatchGate, MotionGate, RestGate
+from hsloc.localisation.kalman_filter import Innovations, difference, fuse_match, is_slip, predict_covariance
 from hsloc.localisation.map_scale import MapScale, MapScaleEstimator
-from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, OdometryNoise, OmnidirectionalNoise
-from hsloc.localisation.place_check import PlaceCheck, PlaceCheckParameters
-from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
+from hsloc.localisation.place_check import PlaceCheck
+from hsloc.localisation.relocaliser import Relocaliser
 from hsloc.localisation.track_evidence import TrackMonitor
-from hsloc.matching.certificate import CertificateParameters, certify
+from hsloc.matching.certificate import certify
 from hsloc.matching.covariance import match_information
 from hsloc.matching.exact import heuristic
 from hsloc.matching.local_refinement import refine
@@ -27,7 +26,6 @@ from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Evidence, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY, Pose2, rotated
-from hsloc.parameters import Angle, Count, NonNegative, OneOf, Parameters, Positive, Ratio
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -35,6 +33,7 @@ if TYPE_CHECKING:
 
     from hsloc.localisation.global_search import GlobalSearch, RelocaliserResult
     from hsloc.localisation.motion_models import MotionModel
+    from hsloc.localisation.parameters import LocaliserParameters
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Match, Matcher
     from hsloc.model.occupancy_grid import OccupancyGrid
@@ -42,83 +41,16 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LocaliserParameters(Parameters):
-    """When a scan is matched, in which window, and which match is accepted; where AMCL has it, by AMCL's name."""
-
-    update_min_d: NonNegative = 0.2
-    """Minimum translation between two matched scans [m]; a larger rotation alone is enough, too."""
-    update_min_a: NonNegative = 0.2
-    """Minimum rotation between two matched scans [rad]; a larger translation alone is enough, too."""
-    min_points: Count = 10
-    """Minimum number of hits of a scan that is matched; [P] asks for more than 5."""
-    window_sigmas: Positive = 3.0
-    """Half-width of the search window in standard deviations of the prediction."""
-    window_min: Positive = 0.15
-    """Minimum half-width of the search window in x and y [m]."""
-    window_min_angle: Angle = radians(5.0)
-    """Minimum half-width of the search window in heading [rad]."""
-    min_fitness: Ratio = 0.3
-    """Minimum fitness of an accepted match."""
-    min_fitness_ratio: Ratio = 0.7
-    """Minimum ratio of an accepted match's fitness to the usual fitness, the running mean of accepted matches."""
-    recovery_fitness_ratio: Ratio = 0.9
-    """Minimum ratio to the usual fitness of a match in the wide window that is searched after a refused match."""
-    wide_window: Positive = 0.5
-    """Half-width of the window that is searched after a refused match [m]; wheels may slip by as much."""
-    wide_window_angle: Angle = radians(20.0)
-    """Half-width in heading of the window that is searched after a refused match [rad]."""
-    max_consecutive_rejections: Count = 5
-    """Number of refused matches in a row after which the pose counts as lost and the whole map is searched."""
-    refine_first: bool = True
-    """Whether the optimum next to the prediction is taken where it fits as well as usual; otherwise always a search."""
-    fuse: bool = True
-    """Whether match and prediction are weighted by their covariances (EKF); otherwise the match is taken, as in [P]."""
-    smooth: bool = True
-    """Whether the poses of the trajectory also use the scans after them, as an offline run can."""
-    initial_sigma: Positive = 0.5
-    """Standard deviation of a given initial pose in x and y [m]."""
-    initial_sigma_angle: Positive = radians(15.0)
-    """Standard deviation of a given initial pose in heading [rad]."""
-    correct_map_scale: bool = True
-    """Whether a map whose resolution is wrong, as lidar and odometry agree, is corrected and the log replayed again."""
-    certify: bool = False
-    """Whether each match is followed by a proof that no pose of its window is fitter."""
-    certificate: CertificateParameters = field(default_factory=CertificateParameters)
-    motion_model: Annotated[str, OneOf(MOTION_MODELS)] = "differential"
-    """How the base moves, which chooses its odometry noise: differential drive, car-like, or in any direction."""
-    odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
-    ackermann_noise: AckermannNoise = field(default_factory=AckermannNoise)
-    omnidirectional_noise: OmnidirectionalNoise = field(default_factory=OmnidirectionalNoise)
-    relocaliser: RelocaliserParameters = field(default_factory=RelocaliserParameters)
-    place_check: PlaceCheckParameters = field(default_factory=PlaceCheckParameters)
-    lost_probability: Ratio = 0.99
-    """Probability of having gone astray from which the whole map is searched, where another place fits as well."""
-
-    def noise(self) -> MotionModel:
-        """The noise of the motion model that is chosen."""
-        models: dict[str, MotionModel] = {
-            "differential": self.odometry_noise,
-            "ackermann": self.ackermann_noise,
-            "omnidirectional": self.omnidirectional_noise,
-        }
-        return models[self.motion_model]
-
-    def smoothing_model(self) -> MotionModel | None:
-        """The noise for smoothing backwards; None where the poses are not smoothed."""
-        return self.noise() if self.smooth else None
-
-    def match_limits(self) -> MatchLimits:
-        """The limits of the match gate."""
-        return MatchLimits(
-            min_fitness=self.min_fitness,
-            min_fitness_ratio=self.min_fitness_ratio,
-            recovery_fitness_ratio=self.recovery_fitness_ratio,
-        )
-
-
 _AS_USUAL = 0.98
 """Ratio to the usual fitness from which the optimum next to the prediction is taken without a search."""
+_MOVED_M, _MOVED_RAD = 0.1, radians(3.0)
+"""How far a robot whose odometry stands still is found from there if it was moved: less makes no pose wrong, and people
+shift the optimum by some centimetres."""
+_MOVED_WINDOW = 2.0
+"""Half-width of the window in which it is searched for, by the wide one: two scans of a robot at 2 m/s."""
+_MOST_ASTRAY = 0.2
+"""Share of beams that end behind walls or where nothing is mapped, at most, while people hide the map around a robot
+that stands; noise of 2.5 % of the range makes 0.15 of them. Assumed."""
 
 
 class Localiser:
@@ -157,6 +89,7 @@ class Localiser:
             (parameters.initial_sigma**2, parameters.initial_sigma**2, parameters.initial_sigma_angle**2)
         )
         self._innovations = Innovations()
+        self._rest_gate = RestGate()
         # Where a proof is asked for, the optimum next to the prediction has none.
         proves = parameters.certify or heuristic(matcher) is not matcher
         self._refines = parameters.refine_first and not proves
@@ -209,6 +142,7 @@ class Localiser:
     def _follow(self, odometry: Odometry) -> Estimate:
         """Between matches: compose with the odometry."""
         self._count += 1
+        self._rest_gate.follow(odometry.T_odom_base)
         status = Status.SEARCHING if self._searching else Status.PREDICTED
         return Estimate(odometry.stamp_ns, self._T_map_odom @ odometry.T_odom_base, status)
 
@@ -223,7 +157,9 @@ class Localiser:
         motion = (self._T_odom_match or T_odom_base).between(T_odom_base)
         predicted = self._T_map_match @ motion
         if not self._match_gate.is_fresh and not self._motion_gate.is_open(motion):
-            return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
+            if not (self._rest_gate.stands and self._is_moved(paired, predicted)):
+                return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
+            self._covariance = self._covariance + self._slip_covariance(_MOVED_WINDOW)
         propagated = predict_covariance(self._covariance, self._T_map_match, motion, np.zeros((3, 3)))
         noise = rotated(self._motion_model.covariance(motion), self._T_map_match.theta)
         covariance = propagated + max(self._innovations.noise_scale, 1.0) * noise
@@ -255,6 +191,7 @@ class Localiser:
             self._match_gate.accept_hidden()
         else:
             self._match_gate.accept(match.fitness)
+        self._rest_gate.matched(match.fitness)
         self._take(pose, covariance, T_odom_base)
         evidence = None if self._monitor is None else self._monitor.matched(paired, pose, points)
         if self._map_scale is not None:
@@ -283,6 +220,40 @@ class Localiser:
         if self._monitor is None or match.fitness < self._parameters.min_fitness:
             return False
         return self._monitor.is_hidden(paired, match.pose)
+
+    def _is_moved(self, paired: PairedScan, predicted: Pose2) -> bool:
+        """Whether a scan shows that a robot moves whose odometry stands still: pushed, carried, or with frozen wheels.
+
+        It then fits elsewhere nearby, or nowhere, and beams end behind walls: those that people hide do not.
+        """
+        p, points = self._parameters, paired.points_base()
+        if len(points) < p.min_points:
+            return False
+        found = fitness_many(self._field.packed, self._field.scale(points), self._field.to_cells(predicted)[None])
+        fitness = float(found[0])
+        if not self._rest_gate.is_open(fitness):
+            return False
+        half = _MOVED_WINDOW * p.wide_window
+        window = Window(predicted, half, half, _MOVED_WINDOW * p.wide_window_angle)
+        match = self._matcher.match(points, self._field, window, self._rng)
+        if self._match_gate.is_elsewhere(fitness, match.fitness):
+            off = difference(match.pose, predicted)
+            information = match_information(points, self._field, match.pose, self._wall_variance())
+            is_far = hypot(off[0], off[1]) >= _MOVED_M or abs(off[2]) >= _MOVED_RAD
+            is_moved = is_far and information is not None and is_slip(off, self._covariance, information)
+        else:
+            is_moved = bool(self._match_gate.refusal(match.fitness)) and self._is_astray(paired, match.pose)
+        self._rest_gate.searched(is_moved)
+        return is_moved
+
+    def _is_astray(self, paired: PairedScan, pose: Pose2) -> bool:
+        """Whether more beams end behind walls or where nothing is mapped than with people around the robot."""
+        return self._monitor is not None and self._monitor.astray(paired, pose) > _MOST_ASTRAY
+
+    def _slip_covariance(self, times: float = 1.0) -> F64:
+        """What a slip adds to the covariance: the window for it, `times` as wide, is three standard deviations."""
+        p = self._parameters
+        return np.diag((p.wide_window, p.wide_window, p.wide_window_angle)) ** 2 * (times / 3.0) ** 2
 
     def _wall_variance(self) -> float | None:
         """What the scans so far show of how walls are drawn (m^2)."""
@@ -337,9 +308,7 @@ class Localiser:
     ) -> Estimate:
         """The prediction stands; after too many refusals the pose is lost."""
         refusals = self._match_gate.refuse()
-        p = self._parameters
-        # The window for slip is taken for three standard deviations of a slip.
-        covariance = covariance + np.diag((p.wide_window**2, p.wide_window**2, p.wide_window_angle**2)) / 9.0
+        covariance = covariance + self._slip_covariance()
         self._take(predicted, covariance, paired.T_odom_base)
         status = Status.REJECTED
         if refusals >= self._parameters.max_consecutive_rejections:
@@ -360,6 +329,7 @@ class Localiser:
         if result.is_sure:
             self._searching = False
             self._match_gate.restart(result.fitness)
+            self._rest_gate.matched(result.fitness or 0.0)
             if self._monitor is not None:
                 self._monitor.begin()
             status = Status.RELOCALISED

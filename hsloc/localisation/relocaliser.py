@@ -31,7 +31,8 @@ from hsloc.localisation.hypotheses import (
     quick_matcher,
 )
 from hsloc.localisation.kalman_filter import fuse_match, predict_covariance
-from hsloc.localisation.track_evidence import MOST_FROM_RIVAL, USUAL_EXPLAINED, place_evidence, rival_evidence
+from hsloc.localisation.place_check import USUAL_EXPLAINED, PlaceCheck
+from hsloc.localisation.track_evidence import MOST_FROM_RIVAL, place_evidence, rival_evidence
 from hsloc.localisation.whole_map_search import join_scans
 from hsloc.matching.covariance import match_information
 from hsloc.matching.window import Window
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.localisation.motion_models import MotionModel
-    from hsloc.localisation.place_check import PlaceCheck
     from hsloc.localisation.whole_map_search import WholeMapSearch
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.place_check import MIRRORED_NEEDED, Comparison
+from hsloc.localisation.place_check import MIRRORED_NEEDED, USUAL_EXPLAINED, Comparison
 from hsloc.model.estimate import Evidence, Status
 
 if TYPE_CHECKING:
@@ -77,8 +77,6 @@ _MOST_FROM_FIT, _MOST_FROM_MISFIT = 1.0, 3.0
 """Log of the odds that a metre of good or of bad fit changes, at most."""
 _REFUSED = -1.0
 """Log of the odds that a refused scan changes."""
-USUAL_EXPLAINED = 0.93
-"""Explained fitness at right places of a good map; the usual one of a run is not taken for higher."""
 _LEAST_USUAL = 0.75
 """Nor for lower: wrong places reach it."""
 _SEVERAL, _LEAST_USUAL_OF_SEVERAL = 3, 0.65
@@ -330,6 +328,11 @@ class TrackMonitor:
     def is_hidden(self, paired: PairedScan, pose: Pose2) -> bool:
         """See `PlaceCheck.is_hidden`."""
         return self._check.is_hidden(paired, pose, self.usual_explained)
+
+    def astray(self, paired: PairedScan, pose: Pose2) -> float:
+        """The share of beams of a scan that end behind walls or where nothing is mapped."""
+        found = self._check.explain(paired, pose)
+        return found.through + found.unmapped
 
     def refused(self) -> Evidence:
         """The match of a scan was refused."""

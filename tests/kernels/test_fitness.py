@@ -8,7 +8,7 @@ import naive
 import numpy as np
 import pytest
 
-from hsloc.kernels.fitness import fitness_many, normal_equations, pack, point_scores, score_sum
+from hsloc.kernels.fitness import fitness_many, normal_equations, pack, point_scores, score_sum, score_with_noise
 from hsloc.kernels.levenberg_marquardt import polish, solve_damped
 
 if TYPE_CHECKING:
@@ -122,3 +122,26 @@ def test_polish_climbs_and_stays_in_the_box(
         assert (pose >= low).all()
         assert (pose <= high).all()
         assert 1 <= evaluations <= 16
+
+
+@pytest.mark.parametrize(("noise", "part"), [(0.0, 0.0), (0.05, 0.0), (0.0, 0.025)])
+def test_what_noise_leaves_of_the_scores_shows_in_the_scan_itself(noise: float, part: float) -> None:
+    rng = np.random.default_rng(5)
+    angles = np.radians(np.arange(360.0))
+    with np.errstate(divide="ignore"):  # a room of 8 x 6 m, from its middle
+        true = np.minimum(4.0 / np.abs(np.cos(angles)), 3.0 / np.abs(np.sin(angles)))
+    across = np.where(true * np.abs(np.cos(angles)) > 3.999, np.abs(np.cos(angles)), np.abs(np.sin(angles)))
+    off = (noise + part * true) * rng.standard_normal(360)
+    ranges = (true + off).astype(np.float32)
+    ranges[rng.random(360) < 0.2] = np.nan
+    expected = float(np.exp(-np.abs(off) * across / 0.2).mean())
+    found = score_with_noise(ranges, 0.1, 30.0, np.radians(1.0), 0.2)
+    assert found == pytest.approx(expected, abs=0.03)
+    ranges[20:40] *= 0.3  # somebody stands there
+    assert score_with_noise(ranges, 0.1, 30.0, np.radians(1.0), 0.2) == pytest.approx(found, abs=0.02)
+
+
+def test_too_few_returns_do_not_show_the_noise() -> None:
+    ranges = np.full(360, np.inf, dtype=np.float32)
+    ranges[:9] = 2.0
+    assert score_with_noise(ranges, 0.1, 30.0, np.radians(1.0), 0.2) == 1.0

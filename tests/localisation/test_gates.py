@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate
+from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate, RestGate
 from hsloc.model import Pose2
 
 LIMITS = MatchLimits(min_fitness=0.3, min_fitness_ratio=0.7, recovery_fitness_ratio=0.9)
@@ -86,3 +86,29 @@ def test_a_match_that_fits_worse_than_usual_counts_less() -> None:
     assert gate.trust(0.95) == gate.trust(0.9) == 1.0
     assert gate.trust((0.9 + least) / 2.0) == pytest.approx(0.5)
     assert 0.0 < gate.trust(least) < 0.1
+
+
+def test_a_rest_gate_opens_where_scans_change_and_the_odometry_does_not() -> None:
+    gate = RestGate()
+    gate.matched(0.9)
+    stands = []
+    for x in (0.0, 0.1, 0.1, 0.2):
+        gate.follow(Pose2(x, 0.0, 0.0))
+        stands.append(gate.stands)
+    assert stands == [False, False, True, False]
+    assert not gate.is_open(0.89)
+    assert gate.is_open(0.8)
+
+
+def test_a_rest_gate_opens_less_often_where_nothing_is_found() -> None:
+    gate = RestGate()
+    gate.matched(0.9)
+    opened = []
+    for _ in range(40):
+        opened.append(gate.is_open(0.5))
+        if opened[-1]:
+            gate.searched(is_moved=False)
+    assert opened[:5] == [True, True, False, True, False]
+    assert sum(opened[20:]) < sum(opened[:20]) / 2
+    gate.matched(0.8)
+    assert gate.is_open(0.7)

@@ -11,7 +11,7 @@ from rooms import L_SHAPE, grid, seen
 from scripted_matcher import ScriptedMatcher, localiser, odometry, paired
 
 from hsloc.errors import ConfigError
-from hsloc.localisation.localiser import LocaliserParameters
+from hsloc.localisation.parameters import LocaliserParameters
 from hsloc.matching import Hide
 from hsloc.model import Pose2, Status
 
@@ -152,3 +152,29 @@ def test_a_robot_that_was_moved_is_lost_and_found_again() -> None:
     assert Status.RELOCALISED in statuses
     assert estimates[-1].status is Status.MATCHED
     assert estimates[-1].T_map_base.distance(true @ step.inverse()) < 0.05
+
+
+def test_a_robot_that_is_pushed_is_followed_while_its_odometry_stands_still() -> None:
+    subject = localiser(
+        Hide(), start=Pose2(7.5, 1.5, 3.0), grid=grid(L_SHAPE, [(0.0, 0.0, 9.0, 3.0), (0.0, 0.0, 4.0, 7.0)])
+    )
+    for k in range(12):
+        true = Pose2(7.5 - 0.25 * max(k - 2, 0), 1.5, 3.0)
+        subject.update(odometry(0.0, float(k)))
+        estimate = subject.update(seen(L_SHAPE, true, Pose2(), float(k)))
+    assert estimate.T_map_base.distance(true) < 0.1
+
+
+def test_people_around_a_robot_that_stands_do_not_move_it() -> None:
+    subject = localiser(
+        Hide(), start=Pose2(7.5, 1.5, 3.0), grid=grid(L_SHAPE, [(0.0, 0.0, 9.0, 3.0), (0.0, 0.0, 4.0, 7.0)])
+    )
+    for k in range(20):
+        subject.update(odometry(0.0, float(k)))
+        paired = seen(L_SHAPE, Pose2(7.5, 1.5, 3.0), Pose2(), float(k))
+        ranges = paired.scan.ranges.copy()
+        if k > 0:
+            ranges[5 * k : 5 * k + 80] = np.minimum(ranges[5 * k : 5 * k + 80], 0.6)
+        estimate = subject.update(replace(paired, scan=replace(paired.scan, ranges=ranges)))
+    assert estimate.status is Status.PREDICTED
+    assert estimate.T_map_base.distance(Pose2(7.5, 1.5, 3.0)) < 0.05

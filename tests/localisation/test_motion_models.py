@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hsloc.errors import ConfigError
-from hsloc.localisation.localiser import LocaliserParameters
 from hsloc.localisation.motion_models import AckermannNoise, OdometryNoise, OmnidirectionalNoise
+from hsloc.localisation.parameters import LocaliserParameters
 from hsloc.model import Pose2
 
 if TYPE_CHECKING:

@@ -80,6 +80,20 @@ def test_a_crowd_hides_walls_but_does_not_contradict_them() -> None:
     assert not check.is_hidden(hidden, place @ Pose2(0.3, 0.2), clear.fitness)
 
 
+def test_the_noise_of_a_low_cost_lidar_takes_nothing_from_what_the_map_explains() -> None:
+    check = check_of(grid(L_SHAPE, ONE))
+    rng = np.random.default_rng(1)
+
+    def noisy(place: Pose2, at: Pose2) -> float:
+        paired = seen(L_SHAPE, place, Pose2(), 0.0, beams=360)
+        ranges = (paired.scan.ranges * (1.0 + 0.03 * rng.standard_normal(360))).astype(np.float32)
+        return check.explain(replace(paired, scan=replace(paired.scan, ranges=ranges)), at).fitness
+
+    clear = check.explain(seen(L_SHAPE, PLACES[2], Pose2(), 0.0), PLACES[2]).fitness
+    assert noisy(PLACES[2], PLACES[2]) == pytest.approx(clear, abs=0.06)
+    assert noisy(PLACES[0], Pose2(6.0, 1.5, 2.0)) < 0.85 * clear
+
+
 def test_what_stands_still_is_seen_again_and_people_are_not() -> None:
     check = check_of(grid(L_SHAPE, ONE))
     crate = np.vstack((L_SHAPE, walls((0.5, 1.0), (1.5, 1.0), (1.5, 1.8), (0.5, 1.8))))

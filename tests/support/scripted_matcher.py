@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hsloc.localisation.localiser import Localiser, LocaliserParameters
+from hsloc.localisation.localiser import Localiser
+from hsloc.localisation.parameters import LocaliserParameters
 from hsloc.matching import LikelihoodField, Match, StopReason, Window
 from hsloc.model import IDENTITY, OccupancyGrid, Odometry, PairedScan, Pose2, Scan
 

@@ -246,9 +246,13 @@ def _unplaced(result: Result) -> tuple[tuple[float, float], ...]:
 
 
 def _without_place(result: Result) -> NDArray[np.bool_]:
-    """Which scans found no place; those that fit at several are ambiguous."""
+    """Which scans found no place; those that fit at several are ambiguous, and some have one in hindsight."""
     stamps, fitness = result.diagnostics.stamps_ns, result.diagnostics.fitness
     without: NDArray[np.bool_] = np.isin(result.diagnostics.status, ("searching", "rejected"))
+    if result.states is not None and len(result.trajectory):
+        order = np.argsort(result.trajectory.stamps_ns, kind="stable")
+        after = np.searchsorted(result.trajectory.stamps_ns[order], stamps)
+        without &= ~result.localised[order[np.minimum(after, len(order) - 1)]]
     for each in result.ambiguities:
         within = (stamps >= each.begin_ns) & (stamps <= each.end_ns)
         known = fitness[within & np.isfinite(fitness)]

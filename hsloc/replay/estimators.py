@@ -13,8 +13,8 @@ from hsloc.interrupts import interrupts_held_back
 from hsloc.matching.window import Window
 from hsloc.model.events import Heading, Odometry
 from hsloc.model.pose2 import IDENTITY
+from hsloc.preprocessing.left_out_hits import without_body, without_isolated
 from hsloc.preprocessing.odometry import OdometryWatch
-from hsloc.preprocessing.scans import without_isolated
 from hsloc.replay.map_and_start import load_grid, resumed
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
@@ -43,12 +43,12 @@ def events_of(request: RunRequest, log: Log, lidar_only: bool, localise: bool) -
     if not lidar_only:
         # The point mapper cannot do without odometry, whatever that is like.
         events = log.events() if request.config.mapper == "point" and not localise else OdometryWatch(log.events())
-        return events if localise else without_isolated(events)
+        return without_body(events) if localise else without_isolated(events)
     unused = (Odometry, Heading) if request.no_odometry else (Odometry,)
     events = (event for event in log.events() if not isinstance(event, unused))
     if localise:
         rng = np.random.default_rng((request.seed, 1))
-        return with_laser_odometry(events, request.config.graph_mapper.front_end, rng)
+        return with_laser_odometry(without_body(events), request.config.graph_mapper.front_end, rng)
     return without_isolated(events)
 
 

@@ -39,6 +39,11 @@ def test_a_sound_run_is_good() -> None:
     assert quality_warnings(found) == []
     assert verdict_reasons(found, found.warnings) == ()
     assert not found.clock_evidence().hints  # else all scans of the log are matched once more
+    # A robot that stood for long before it could be found was where it was found: its scans have a place.
+    stood = replace(found.diagnostics, status=("searching",) * len(found.diagnostics))
+    assert quality_warnings(replace(found, diagnostics=stood)) == []
+    guessed = replace(found, diagnostics=stood, localised=np.zeros_like(found.localised))
+    assert [each.code for each in quality_warnings(guessed)] == [WarningCode.SCANS_WITHOUT_PLACE]
 
 
 def test_a_laser_that_is_mounted_upside_down_unstated_is_warned_of(tmp_path: Path) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+from hsloc.garbage_collection import rarely_collected
 from hsloc.log import open_log
 from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.preprocessing.odometry import ContinuousOdometry
 from hsloc.preprocessing.scans import ScanWatch, pair
-from hsloc.replay.engine import rarely_collected
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

@@ -21,6 +21,7 @@ from io import TextIOWrapper
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from hsloc.errors import HslocError
+from hsloc.garbage_collection import rarely_collected
 from hsloc.interrupts import interrupt_again
 from hsloc.version import __version__
 
@@ -188,7 +189,8 @@ def program() -> None:
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     sys.unraisablehook = interrupt_again
     warnings.formatwarning = lambda message, *_, **__: f"hsloc: warning: {message}\n"
-    status = main()
+    with rarely_collected():
+        status = main()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         sys.stdout.flush()

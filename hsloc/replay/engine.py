@@ -6,8 +6,6 @@ clock has no say.
 
 from __future__ import annotations
 
-import gc
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol
 
 from hsloc.model.events import Odometry, PairedScan, Truth
@@ -19,9 +17,6 @@ if TYPE_CHECKING:
     from hsloc.model.estimate import Estimate
     from hsloc.model.events import Event
     from hsloc.model.pose2 import Pose2
-
-_COLLECT_AFTER = 50_000
-"""New objects after which the garbage collector looks at the youngest; Python's own limit is 700."""
 
 
 class Estimator(Protocol):
@@ -38,15 +33,3 @@ def replay(
     """Each event with what the estimator says to it (None for the truth, which it does not see)."""
     for event in merged_scans(pair(events, deskew=deskew, first=first)):
         yield event, None if isinstance(event, Truth) else estimator.update(event)
-
-
-@contextmanager
-def rarely_collected() -> Iterator[None]:
-    """Let the garbage collector run rarely while a log streams by: events are many, and none is part of a cycle."""
-    before = gc.get_threshold()
-    if before[0] > 0:  # 0 is never, as somebody wants it.
-        gc.set_threshold(max(before[0], _COLLECT_AFTER), *before[1:])
-    try:
-        yield
-    finally:
-        gc.set_threshold(*before)

@@ -8,6 +8,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 from hsloc.errors import ConfigError
+from hsloc.garbage_collection import rarely_collected
 from hsloc.kernels.cache import compilation_reported
 from hsloc.model.events import Scan
 from hsloc.preprocessing.odometry import ContinuousOdometry, UnusableOdometry
@@ -21,7 +22,7 @@ from hsloc.replay.clock_offset import (
     open_as_meant,
     swept_scans,
 )
-from hsloc.replay.engine import rarely_collected, replay
+from hsloc.replay.engine import replay
 from hsloc.replay.estimators import events_of, make_localiser, make_mapper
 from hsloc.replay.map_and_start import (
     ScaleEvidence,

@@ -122,7 +122,7 @@ def _map(grid: OccupancyGrid | None) -> tuple[dict[str, Any] | None, bytes | Non
     # Grey and clear, the top row first.
     levels = np.ascontiguousarray(picture.levels[::-1, :, (0, 3)])
     stream = BytesIO()
-    Image.fromarray(levels).save(stream, format="PNG", optimize=True)
+    Image.fromarray(levels).save(stream, format="PNG")
     corner, (height, width) = picture.T_map_corner, levels.shape[:2]
     frame = {"side": picture.side, "width": width, "height": height, "corner": [corner.x, corner.y, corner.theta]}
     return frame, stream.getvalue()

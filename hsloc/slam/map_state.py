@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import zipfile
 from dataclasses import dataclass
+from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 VERSION = 1
 """Version of the format of a saved map."""
 STATE_FILE = "map.npz"
+_COMPRESSION = 1
+"""Level of zlib: 3 % more bytes than with its usual 6, in half the time."""
 _FLAT = {
     "points": "f4", "hit_of_beam": "i4", "ranges": "f4", "point_start": "i8", "beam_start": "i8", "geometry": "f8",
     "stamps_ns": "i8", "poses": "f8", "covariances": "f8", "refused": "b1", "edge_pairs": "i8", "edge_measured": "f8",
@@ -96,8 +99,9 @@ def write_state(state: MapState, path: Path) -> None:
             for name, array in arrays.items():
                 entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
                 entry.compress_type = zipfile.ZIP_DEFLATED
-                with archive.open(entry, "w", force_zip64=True) as stream:
-                    np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)
+                stream = BytesIO()
+                np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)
+                archive.writestr(entry, stream.getbuffer(), compresslevel=_COMPRESSION)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
 

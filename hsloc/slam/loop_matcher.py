@@ -141,11 +141,24 @@ class LoopMatcher:
 
     def search(self, first: int, second: int, centre: Pose2, window: tuple[float, float]) -> Loop:
         """Search the pose of place `second` seen from `first` in `centre` +- `window` (m, rad)."""
+        loop = self._judged(first, second, centre, centre, window)
+        # What is accepted where it was predicted has no rival, and after `_is_best_near` nothing fitter near it: HIDE
+        # would find nothing else.
+        if loop.accepted and self._is_best_near(loop):
+            return loop
+        p = self._parameters
+        half, half_angle = window
+        (start,), _, _ = p.hide.match_boxes(
+            self._cloud(second), self._field(first)[0], [Window(centre, half, half, half_angle)], self._rng
+        )
+        return self._judged(first, second, start, centre, window)
+
+    def _judged(self, first: int, second: int, start: Pose2, centre: Pose2, window: tuple[float, float]) -> Loop:
+        """The loop that is found from the pose `start` on, and whether it is accepted."""
         p = self._parameters
         half, half_angle = window
         likelihood, pooled = self._field(first)
         points = self._cloud(second)
-        (start,), _, _ = p.hide.match_boxes(points, likelihood, [Window(centre, half, half, half_angle)], self._rng)
         prior = np.diag((1.0 / half**2, 1.0 / half**2, 1.0 / half_angle**2)) * p.sigmas**2
         pose, information, paired, conflict = self._registered(first, second, start, centre, prior)
         if start.distance(pose) > p.distinct_distance:
@@ -214,6 +227,32 @@ class LoopMatcher:
             del self._fields[next(iter(self._fields))]
         return found
 
+    def _is_best_near(self, loop: Loop) -> bool:
+        """Whether no pose of the lattice within the distance of a rival is fitter than that of a loop."""
+        p = self._parameters
+        likelihood, pooled = self._field(loop.first)
+        few = self._few(self._cloud(loop.second), likelihood)
+        here = likelihood.to_cells(loop.T_first_second)
+        own, step = self._fitness_at(here, few, pooled), 2.0 * p.resolution / p.scan_range
+        distinct = p.distinct_distance / likelihood.resolution
+        lattice = Lattice(here, np.array((distinct, distinct, p.distinct_angle)), step)
+        around = Excluded(here, np.array((1.0, 1.0, step)))
+        fittest, _ = best_on_lattice(pooled, few, lattice, around, own, _VISITS, np.empty(3))
+        return fittest == own
+
+    def _few(self, points: F64, likelihood: LikelihoodField) -> F32:
+        """Some of the points, in cells."""
+        return likelihood.scale(points[low_discrepancy_order(len(points))][: self._parameters.hide.search_points])
+
+    def _fitness_at(self, here: F64, few: F32, pooled: F32) -> float:
+        """Fitness of the best lattice pose within a step of a pose `here` (3,) in cells."""
+        p = self._parameters
+        step = 2.0 * p.resolution / p.scan_range
+        finer = Lattice(here, np.array((1.0, 1.0, step)), step / 2.0)
+        nowhere = Excluded(here, np.array((-1.0, -1.0, -1.0)))
+        own, _ = best_on_lattice(pooled[:1], few, finer, nowhere, 0.0, _VISITS, np.empty(3))
+        return float(own)
+
     def _rival(
         self,
         points: F64,
@@ -226,19 +265,13 @@ class LoopMatcher:
     ) -> float:
         """The best lattice pose distinct from `pose`, as a part of the best one near it."""
         p = self._parameters
-        few = likelihood.scale(points[low_discrepancy_order(len(points))][: p.hide.search_points])
-        step = 2.0 * p.resolution / p.scan_range
-        cell = likelihood.resolution
-        near = np.array((1.0, 1.0, step))
-        nowhere = np.array((-1.0, -1.0, -1.0))
-        here, found = likelihood.to_cells(pose), np.empty(3)
-        finer = Lattice(here, near, step / 2.0)
-        own, _ = best_on_lattice(pooled[:1], few, finer, Excluded(here, nowhere), 0.0, _VISITS, found)
+        few, here, step = self._few(points, likelihood), likelihood.to_cells(pose), 2.0 * p.resolution / p.scan_range
+        cell, own = likelihood.resolution, self._fitness_at(here, few, pooled)
         if own <= 0.0:
             return float("nan")
         needed = 0.7 * own
         box = np.array((ceil(half / cell), ceil(half / cell), half_angle))
         distinct = np.array((p.distinct_distance / cell, p.distinct_distance / cell, p.distinct_angle))
         lattice = Lattice(likelihood.to_cells(centre), box, step)
-        other, _ = best_on_lattice(pooled, few, lattice, Excluded(here, distinct), needed, _VISITS, found)
+        other, _ = best_on_lattice(pooled, few, lattice, Excluded(here, distinct), needed, _VISITS, np.empty(3))
         return float("nan") if other < 0.0 else float(other / own)

@@ -25,7 +25,7 @@ from hsloc.slam.occupancy_mapper import build_grid
 from hsloc.slam.plan_alignment import find_on_plan
 from hsloc.slam.pose_graph import Edges, PoseGraph, compose_steps, edge_errors
 from hsloc.slam.result import MappingQuality, MappingResult
-from hsloc.slam.slips import compare_with_odometry, held_by_the_rest, without_slips
+from hsloc.slam.slips import compare_with_odometry, held_by_the_rest, known_by_scans, without_slips
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -179,21 +179,21 @@ def _without_slips(
             near_the_end = _near_the_end(parameters)
             refined, more = _refine(refined.poses, scans, edges, near_the_end, _silent, refined)
             passes += more
-        observed = observed_terms(refined)
-        stretches = compare_with_odometry(refined, gathered.steps if known is None else steps, scans, observed)
+        motions = compare_with_odometry(refined, gathered.steps if known is None else steps)
         if known is not None:
             # Odometry without weight contradicts nothing any more.
-            stretches = replace(stretches, normalised=np.maximum(stretches.normalised, known))
-        held = None
-        if repairs_left == 0 or not (stretches.slipped(len(steps)) & ~slipped).any():
+            motions = replace(motions, normalised=np.maximum(motions.normalised, known))
+        settled = repairs_left == 0 or not (motions.slipped(len(steps)) & ~slipped).any()
+        if settled:
+            observed = observed_terms(refined)
+            stretches = known_by_scans(motions, refined, scans, observed)
             held = held_by_the_rest(refined, observed, edges, gathered.steps, stretches)
-            stretches = held.marked(stretches)
-        known, more_slipped = stretches.normalised, slipped | stretches.slipped(len(steps))
-        if held is not None and (repairs_left == 0 or (more_slipped == slipped).all()):
+            motions = stretches = held.marked(stretches)
+        known, more_slipped = motions.normalised, slipped | motions.slipped(len(steps))
+        if settled and (repairs_left == 0 or (more_slipped == slipped).all()):
             break
         slipped = more_slipped
         steps = without_slips(gathered.steps, slipped)
-    assert held is not None  # the last round asks
     return _Repaired(refined, observed, edges, steps, stretches, held, passes)
 
 

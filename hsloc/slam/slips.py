@@ -68,27 +68,16 @@ _SLIPPED = np.diag((0.1**2, 0.1**2, 0.1**2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stretches:
-    """Stretches of the path, and what scans and odometry say of the motion along each.
+class Motions:
+    """Stretches of the path, and the motions along each by scans and by odometry.
 
     `ends` (m, 2) are their first and last keyscans. `difference` (m, 3) is the motion by the scans less that by the
-    odometry, in the frame of the first, `normalised` (m,) its length in standard deviations. `sigma` (m,) is the
-    standard deviation (m) of the scans' motion in its worst direction. `margin` (m,) is by how much more of the points
-    of the scans before and after agree with the motion as found than with any that is displaced in that direction, a
-    ratio; 1 where the scans fix the motion. `axis` (m, 2) is that direction, in the map.
+    odometry, in the frame of the first, `normalised` (m,) its length in standard deviations.
     """
 
     ends: I64
     difference: F64
     normalised: F64
-    sigma: F64
-    margin: F64
-    axis: F64
-
-    @property
-    def hidden(self) -> NDArray[np.bool_]:
-        """Those (m,) whose own scans do not show a slip: no wall fixes the motion, and displaced it fits as well."""
-        return (self.sigma > _HARDLY_M) & (self.margin < _LEAST_MARGIN)
 
     @property
     def contradicted(self) -> NDArray[np.bool_]:
@@ -103,24 +92,47 @@ class Stretches:
         return slipped
 
 
-def compare_with_odometry(refined: Registration, steps: Edges, scans: ScanArrays, observed: PairTerms) -> Stretches:
-    """Hold the scans of each stretch against the odometry's `steps` (n - 1) along it.
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretches(Motions):
+    """The same with what the scans know of the motion along each.
 
-    `observed` are the terms of `marginals.observed_terms`.
+    `sigma` (m,) is the standard deviation (m) of the scans' motion in its worst direction. `margin` (m,) is by how much
+    more of the points of the scans before and after agree with the motion as found than with any that is displaced in
+    that direction, a ratio; 1 where the scans fix the motion. `axis` (m, 2) is that direction, in the map.
     """
+
+    sigma: F64
+    margin: F64
+    axis: F64
+
+    @property
+    def hidden(self) -> NDArray[np.bool_]:
+        """Those (m,) whose own scans do not show a slip: no wall fixes the motion, and displaced it fits as well."""
+        return (self.sigma > _HARDLY_M) & (self.margin < _LEAST_MARGIN)
+
+
+def compare_with_odometry(refined: Registration, steps: Edges) -> Motions:
+    """Hold the scans of each stretch against the odometry's `steps` (n - 1) along it."""
     covariances: F64 = np.asarray(np.linalg.inv(steps.information), dtype=np.float64)
     ends = stretch_ends(steps, covariances)
     seen, driven = np.empty((2, len(ends), 3))
-    seen_covariance, driven_covariance, known_covariance = np.empty((3, len(ends), 3, 3))
+    seen_covariance, driven_covariance = np.empty((2, len(ends), 3, 3))
     of_a_point = information_of_a_point(refined)
-    window_motions(refined.linearised_at, refined.pairs, observed, of_a_point, ends, seen, known_covariance)
     window_motions(refined.linearised_at, refined.pairs, refined.terms, of_a_point, ends, seen, seen_covariance)
     composed_motions(steps.measured, covariances, ends, driven, driven_covariance)
     difference = seen - driven
     difference[:, 2] = wrap_angles(difference[:, 2])
     weighed = np.linalg.solve(seen_covariance + driven_covariance, difference[:, :, None])[:, :, 0]
-    normalised = np.sqrt(np.maximum((difference * weighed).sum(axis=1), 0.0))
-    variances, axes = np.linalg.eigh(known_covariance[:, :2, :2])
+    return Motions(ends, difference, np.sqrt(np.maximum((difference * weighed).sum(axis=1), 0.0)))
+
+
+def known_by_scans(motions: Motions, refined: Registration, scans: ScanArrays, observed: PairTerms) -> Stretches:
+    """The stretches with what the scans know of them; `observed` are the terms of `marginals.observed_terms`."""
+    ends = motions.ends
+    seen, covariance = np.empty((len(ends), 3)), np.empty((len(ends), 3, 3))
+    of_a_point = information_of_a_point(refined)
+    window_motions(refined.linearised_at, refined.pairs, observed, of_a_point, ends, seen, covariance)
+    variances, axes = np.linalg.eigh(covariance[:, :2, :2])
     sigma = np.sqrt(np.maximum(variances[:, -1], 0.0))
     headings = refined.poses[ends[:, 0], 2]
     c, s, weakest = np.cos(headings), np.sin(headings), axes[:, :, -1]
@@ -128,7 +140,7 @@ def compare_with_odometry(refined: Registration, steps: Edges, scans: ScanArrays
     margin = np.ones(len(ends))
     for k in np.flatnonzero(sigma > _HARDLY_M).tolist():
         margin[k] = _margin(refined, scans, ends[k], axis[k])
-    return Stretches(ends, difference, normalised, sigma, margin, axis)
+    return Stretches(ends, motions.difference, motions.normalised, sigma, margin, axis)
 
 
 def stretch_ends(steps: Edges, covariances: F64) -> I64:

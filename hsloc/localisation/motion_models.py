@@ -67,10 +67,14 @@ class OdometryNoise(Parameters):
         var1 = self.alpha1 * turn1**2 + self.alpha2 * trans**2
         var2 = self.alpha1 * turn2**2 + self.alpha2 * trans**2
         var_trans = self.alpha3 * trans**2 + self.alpha4 * (turn1**2 + turn2**2)
+        # J diag(var1, var_trans, var2) J^T with J = ((-s trans, c, 0), (c trans, s, 0), (1, 0, 1)), written out:
+        # this is done several times for each scan, and products of small arrays take ten times as long.
         c, s = cos(rot1), sin(rot1)
-        jacobian = np.array(((-s * trans, c, 0.0), (c * trans, s, 0.0), (1.0, 0.0, 1.0)))
-        covariance: F64 = jacobian @ np.diag((var1, var_trans, var2)) @ jacobian.T
-        return covariance
+        across = trans * trans * var1
+        xy = s * c * (var_trans - across)
+        xt, yt = -s * trans * var1, c * trans * var1
+        xx, yy = s * s * across + c * c * var_trans, c * c * across + s * s * var_trans
+        return np.array(((xx, xy, xt), (xy, yy, yt), (xt, yt, var1 + var2)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

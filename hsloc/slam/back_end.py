@@ -129,7 +129,6 @@ def finish_session(
     return MappingResult(
         odometry_poses=odometry_poses,
         scan_poses=scan_poses,
-        revision=_revision(odometry_poses, track) if parameters.use_odometry else (),
         keyscan_stamps_ns=gathered.stamps_ns,
         keyscan_poses=refined.poses,
         grid=grid,
@@ -304,13 +303,6 @@ def _near_the_end(parameters: GraphMapperParameters) -> GraphMapperParameters:
     return replace(parameters, joint_registration=replace(registration, gates=registration.gates[-1:]))
 
 
-def _revision(odometry_poses: F64, track: EventLog) -> tuple[tuple[int, Pose2], ...]:
-    return tuple(
-        (k, Pose2.from_array(pose) @ Pose2.from_array(odometry).inverse())
-        for k, (pose, odometry) in enumerate(zip(odometry_poses, track.odometry(), strict=True))
-    )
-
-
 def _quality(
     refined: Registration,
     covariances: F64,
@@ -370,7 +362,6 @@ def _empty(track: EventLog) -> MappingResult:
     return MappingResult(
         odometry_poses=odometry_poses,
         scan_poses=scan_poses,
-        revision=(),
         keyscan_stamps_ns=none,
         keyscan_poses=np.zeros((0, 3)),
         keyscan_covariances=np.zeros((0, 3, 3)),

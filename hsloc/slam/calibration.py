@@ -12,14 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.kalman_filter import difference
 from hsloc.model.pose2 import compose_poses, relative_poses, wrap_angles
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from hsloc.localisation.motion_models import OdometryNoise
-    from hsloc.model.pose2 import Pose2
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
@@ -132,14 +128,19 @@ def delayed(index: F64, odometry: F64, delay: float) -> F64:
     return compose_poses(odometry[after - 1], step * fraction[:, None])
 
 
-def odometry_chi(motion: Pose2, found: Pose2, noise: OdometryNoise) -> float:
-    """How far a step of the odometry is off, in standard deviations of the noise that is assumed."""
-    error = difference(found, motion)
-    return float(np.sqrt(error @ np.linalg.solve(noise.covariance(motion) + FLOOR, error)))
+def odometry_chi(motions: F64, found: F64, covariances: F64) -> F64:
+    """How far steps (n, 3) of the odometry are off those `found` (n, 3), in standard deviations, shape (n,).
+
+    `covariances` (n, 3, 3) are those of the noise that is assumed.
+    """
+    errors = found - motions
+    errors[:, 2] = wrap_angles(errors[:, 2])
+    weighed = np.linalg.solve(covariances + FLOOR, errors[:, :, None])[:, :, 0]
+    return np.asarray(np.sqrt((errors * weighed).sum(axis=1)), dtype=np.float64)
 
 
-def odometry_scale(chi: list[float]) -> float:
-    """Factor on the standard deviations of the assumed noise that fits the steps' `chi` of this log (robustly).
+def odometry_scale(chi: F64) -> float:
+    """Factor on the standard deviations of the assumed noise that fits the steps' `chi` (n,) of this log (robustly).
 
     By its 95th percentile, as turns are rare and err most; not below a half, for what slips once in a hundred steps
     is beyond that.

@@ -166,7 +166,8 @@ class FrontEnd:
         self._last_heading: float | None = None
         self._velocity = np.zeros(3)
         self._period = float("inf")
-        self._odometry_chi: list[float] = []
+        self._steps: list[tuple[Pose2, Pose2]] = []
+        self._odometry_chi = np.zeros(0)
         self._odometry_scale, self._weighed_at = 1.0, _WEIGHED_EVERY
         self._tracker: KnownMapTracker | None = None
         self._covariance = np.zeros((3, 3))
@@ -251,7 +252,7 @@ class FrontEnd:
             return None
         step = key.between(found.pose)
         self._weigh_odometry(motion, step)
-        self._covariance = fused_covariance(found, in_map) + FLOOR
+        self._covariance = fused_covariance(found) + FLOOR
         self._way += self._length(step)
         self._T_map_key, self._T_odom_key = found.pose, paired.T_odom_base
         self._match_gate.restart(self._match_gate.usual)
@@ -283,7 +284,7 @@ class FrontEnd:
         # What is measured is the pose in the local map; the step to it also holds what the refused steps may hide.
         after_refusal = self._match_gate.refusals > 0
         self._match_gate.accept(fitness)
-        fused = rotated(fused_covariance(found, in_map), -key.theta) + FLOOR
+        fused = rotated(fused_covariance(found), -key.theta) + FLOOR
         self._weigh_odometry(motion, key.between(found.pose))
         return LocalMatch(
             found.pose,
@@ -301,8 +302,12 @@ class FrontEnd:
         p = self._parameters
         if not self._use_odometry:
             return
-        self._odometry_chi.append(odometry_chi(motion, found, p.odometry_noise))
-        if len(self._odometry_chi) >= self._weighed_at:
+        self._steps.append((motion, found))
+        if len(self._odometry_chi) + len(self._steps) >= self._weighed_at:
+            steps = np.array([[(each.x, each.y, each.theta) for each in pair] for pair in self._steps])
+            covariances = np.array([p.odometry_noise.covariance(step) for step, _ in self._steps])
+            chi = odometry_chi(steps[:, 0], steps[:, 1], covariances)
+            self._odometry_chi, self._steps = np.concatenate((self._odometry_chi, chi)), []
             self._odometry_scale = odometry_scale(self._odometry_chi)
             self._weighed_at = len(self._odometry_chi) + max(_WEIGHED_EVERY, len(self._odometry_chi) // 50)
 

@@ -251,13 +251,9 @@ def _odometry_edges(
     odometry = track.key_odometry()
     steps = relative_poses(odometry[:-1], odometry[1:])
     noise = parameters.front_end.odometry_noise
-    chi = [
-        odometry_chi(Pose2.from_array(step), Pose2.from_array(motion), noise)
-        for step, motion, no in zip(steps, motions[1:], refused[1:] | gaps[1:], strict=True)
-        if not no
-    ]
-    scale = odometry_scale(chi)
-    floored = [scale**2 * noise.covariance(Pose2.from_array(step)) + _ODOMETRY_FLOOR for step in steps]
-    covariances = np.array(floored).reshape(-1, 3, 3)
+    assumed = np.array([noise.covariance(Pose2(*step)) for step in steps.tolist()]).reshape(-1, 3, 3)
+    matched = ~(refused[1:] | gaps[1:])
+    chi = odometry_chi(steps[matched], motions[1:][matched], assumed[matched])
+    covariances = odometry_scale(chi) ** 2 * assumed + _ODOMETRY_FLOOR
     covariances[gaps[1:]] = UNKNOWN_STEP
     return Edges.chain(steps, covariances, refused[1:])

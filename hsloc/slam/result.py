@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.model.occupancy_grid import OccupancyGrid
-    from hsloc.model.pose2 import Pose2
     from hsloc.slam.calibration import OdometryCalibration
     from hsloc.slam.evidence import Evidence
     from hsloc.slam.loop_matcher import Loop
@@ -69,8 +68,7 @@ class MappingResult:
     """The map, and the whole trajectory as it is known at the end.
 
     `odometry_poses` (k, 3) and `scan_poses` (m, 3) are the base in the map at every odometry message and at every
-    scan, in the order of the log. `revision` says the same as pairs (k, T_map_odom), each valid from the k-th odometry
-    message (from 0) on; empty without odometry. `keyscan_poses` (n, 3) are the nodes of `graph`.
+    scan, in the order of the log. `keyscan_poses` (n, 3) are the nodes of `graph`.
 
     Covariances (…, 3, 3) are over (x, y, theta) in the map frame (m^2, m rad, rad^2), relative to the first keyscan's
     pose: marginals of the solved graph at the keyscans (`hsloc.slam.marginals`), interpolated at scans and odometry.
@@ -78,7 +76,6 @@ class MappingResult:
 
     odometry_poses: F64
     scan_poses: F64
-    revision: tuple[tuple[int, Pose2], ...]
     keyscan_stamps_ns: NDArray[np.int64]
     keyscan_poses: F64
     keyscan_covariances: F64

@@ -81,6 +81,8 @@ class ScanRegistration:
     conflict: float
     seen: int
     chi: float
+    prior: F64
+    """Information (3, 3) of the odometry's pose, without a weight."""
 
     @property
     def consistency(self) -> float:
@@ -265,13 +267,14 @@ def register_onto(
         float(counts[1]) / seen,
         int(counts[2]),
         float(chi),
+        prior.information,
     )
 
 
-def fused_covariance(found: ScanRegistration, covariance: F64) -> F64:
+def fused_covariance(found: ScanRegistration) -> F64:
     """Covariance (3, 3) of a registered pose: the pairs, and the odometry with the weight that its chi leaves it."""
     weight = _PRIOR_SCALE**2 / (_PRIOR_SCALE**2 + found.chi**2)
-    fused: F64 = np.linalg.inv(found.information + weight * np.linalg.inv(covariance))
+    fused: F64 = np.linalg.inv(found.information + weight * found.prior)
     return 0.5 * (fused + fused.T)
 
 

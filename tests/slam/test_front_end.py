@@ -32,10 +32,11 @@ def test_the_weight_of_the_odometry_is_what_its_steps_deserve() -> None:
     root = np.linalg.cholesky(noise.covariance(motion) + np.diag((0.005, 0.005, 0.002)) ** 2)
     for factor in (0.7, 1.0, 3.0):
         errors = factor * random.normal(size=(400, 3)) @ root.T
-        chi = [odometry_chi(motion, Pose2.from_array(motion.to_array() + error), noise) for error in errors]
+        motions = np.tile(motion.to_array(), (400, 1))
+        chi = odometry_chi(motions, motions + errors, np.tile(noise.covariance(motion), (400, 1, 1)))
         assert odometry_scale(chi) == pytest.approx(factor, rel=0.15)
-    assert odometry_scale([0.01] * 100) == 0.5
-    assert odometry_scale([9.0]) == 1.0, "one step says nothing"
+    assert odometry_scale(np.full(100, 0.01)) == 0.5
+    assert odometry_scale(np.array([9.0])) == 1.0, "one step says nothing"
 
 
 @pytest.mark.parametrize(

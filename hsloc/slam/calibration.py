@@ -17,6 +17,9 @@ from hsloc.model.pose2 import compose_poses, relative_poses, wrap_angles
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hsloc.localisation.motion_models import OdometryNoise
+    from hsloc.model.pose2 import Pose2
+
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
@@ -54,6 +57,8 @@ _WORST_ODOMETRY = 10.0
 """Factors within which the assumed noise of the odometry is adapted to the log."""
 _FEWEST_WEIGHED = 20
 """Steps without which the assumed noise stays as it is."""
+_WEIGHED_EVERY = 20
+"""Matched keyscans after which the odometry's weight is estimated again; of more than 1000, 2 % of them."""
 
 
 def calibrate(index: F64, odometry: F64, keys: I64, key_poses: F64) -> OdometryCalibration:
@@ -148,3 +153,30 @@ def odometry_scale(chi: F64) -> float:
     if len(chi) < _FEWEST_WEIGHED:
         return 1.0
     return float(np.clip(np.percentile(chi, 95.0) / _HIGH_CHI, _BEST_ODOMETRY, _WORST_ODOMETRY))
+
+
+class WeighedOdometry:
+    """State: how much worse or better than assumed a log's odometry is, by the steps of odometry and scans so far."""
+
+    def __init__(self, noise: OdometryNoise) -> None:
+        self.scale = 1.0
+        """Factor on the standard deviations of `noise`."""
+        self._noise = noise
+        self._steps: list[tuple[Pose2, Pose2]] = []
+        self._chi = np.zeros(0)
+        self._weighed_at = _WEIGHED_EVERY
+
+    def add(self, motion: Pose2, found: Pose2) -> None:
+        """Take a step of the odometry, and the same one as the scans have it."""
+        self._steps.append((motion, found))
+        known = len(self._chi) + len(self._steps)
+        if known < self._weighed_at:
+            return
+        # Many at once: a call of numpy takes longer than three unknowns do.
+        motions = np.array([motion.to_array() for motion, _ in self._steps])
+        by_scans = np.array([found.to_array() for _, found in self._steps])
+        covariances = np.array([self._noise.covariance(step) for step, _ in self._steps])
+        self._chi = np.concatenate((self._chi, odometry_chi(motions, by_scans, covariances)))
+        self._steps = []
+        self.scale = odometry_scale(self._chi)
+        self._weighed_at = known + max(_WEIGHED_EVERY, known // 50)

@@ -23,7 +23,7 @@ from hsloc.matching.window import Window
 from hsloc.model.estimate import Status
 from hsloc.model.pose2 import IDENTITY, Pose2, rotated, wrap_angle
 from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive, Ratio
-from hsloc.slam.calibration import FLOOR, odometry_chi, odometry_scale
+from hsloc.slam.calibration import FLOOR, WeighedOdometry
 from hsloc.slam.known_map import KnownMap, KnownMapTracker
 from hsloc.slam.local_map import LocalMap
 from hsloc.slam.scan_registration import SURPRISE, RecentScans, fused_covariance, moving_scans
@@ -134,8 +134,6 @@ _SLIP = 0.3
 """Standard deviation [m] of a motion that the scans contradict, without saying what it was."""
 _SLIP_ANGLE = 0.3
 """And of its turn [rad]."""
-_WEIGHED_EVERY = 20
-"""Number of matched keyscans after which the odometry's weight is estimated again; of more than 1000, 2 % of them."""
 _BASIN = 0.3
 """Half-width [m] of a window from whose centre the registration finds its way: its first gate."""
 _BASIN_ANGLE = 0.2
@@ -166,9 +164,7 @@ class FrontEnd:
         self._last_heading: float | None = None
         self._velocity = np.zeros(3)
         self._period = float("inf")
-        self._steps: list[tuple[Pose2, Pose2]] = []
-        self._odometry_chi = np.zeros(0)
-        self._odometry_scale, self._weighed_at = 1.0, _WEIGHED_EVERY
+        self._odometry = WeighedOdometry(p.odometry_noise)
         self._tracker: KnownMapTracker | None = None
         self._covariance = np.zeros((3, 3))
 
@@ -221,7 +217,7 @@ class FrontEnd:
         p = self._parameters
         if self._use_odometry and self._T_odom_key is not None:
             motion = self._T_odom_key.between(paired.T_odom_base)
-            return motion, self._odometry_scale**2 * p.odometry_noise.covariance(motion) + FLOOR
+            return motion, self._odometry.scale**2 * p.odometry_noise.covariance(motion) + FLOOR
         stamp, pose = self._last if self._last is not None else (paired.scan.stamp_ns, self._T_map_key)
         seconds = max((paired.scan.stamp_ns - stamp) * 1e-9, 0.0)
         periods = min(seconds / self._period, _LONGEST_PREDICTION)
@@ -251,7 +247,8 @@ class FrontEnd:
                 self._redraw()
             return None
         step = key.between(found.pose)
-        self._weigh_odometry(motion, step)
+        if self._use_odometry:
+            self._odometry.add(motion, step)
         self._covariance = fused_covariance(found) + FLOOR
         self._way += self._length(step)
         self._T_map_key, self._T_odom_key = found.pose, paired.T_odom_base
@@ -285,7 +282,8 @@ class FrontEnd:
         after_refusal = self._match_gate.refusals > 0
         self._match_gate.accept(fitness)
         fused = rotated(fused_covariance(found), -key.theta) + FLOOR
-        self._weigh_odometry(motion, key.between(found.pose))
+        if self._use_odometry:
+            self._odometry.add(motion, key.between(found.pose))
         return LocalMatch(
             found.pose,
             key.between(found.pose),
@@ -296,20 +294,6 @@ class FrontEnd:
             evaluations,
             is_doubtful=found.is_doubtful() or after_refusal,
         )
-
-    def _weigh_odometry(self, motion: Pose2, found: Pose2) -> None:
-        """Estimate how much worse or better than assumed this log's odometry is, from its steps and the scans'."""
-        p = self._parameters
-        if not self._use_odometry:
-            return
-        self._steps.append((motion, found))
-        if len(self._odometry_chi) + len(self._steps) >= self._weighed_at:
-            steps = np.array([[(each.x, each.y, each.theta) for each in pair] for pair in self._steps])
-            covariances = np.array([p.odometry_noise.covariance(step) for step, _ in self._steps])
-            chi = odometry_chi(steps[:, 0], steps[:, 1], covariances)
-            self._odometry_chi, self._steps = np.concatenate((self._odometry_chi, chi)), []
-            self._odometry_scale = odometry_scale(self._odometry_chi)
-            self._weighed_at = len(self._odometry_chi) + max(_WEIGHED_EVERY, len(self._odometry_chi) // 50)
 
     def _search(
         self, points: F64, scans: tuple[MovingScan, ...], predicted: Pose2, covariance: F64
@@ -354,7 +338,7 @@ class FrontEnd:
         overlap most.
         """
         p = self._parameters
-        if found.chi * self._odometry_scale <= SURPRISE:
+        if found.chi * self._odometry.scale <= SURPRISE:
             return True
         offset = np.array((found.pose.x - predicted.x, found.pose.y - predicted.y))
         if np.hypot(*offset) > p.window_min and found.observed(offset) < _OBSERVED:

@@ -274,7 +274,7 @@ def register_onto(
 def fused_covariance(found: ScanRegistration) -> F64:
     """Covariance (3, 3) of a registered pose: the pairs, and the odometry with the weight that its chi leaves it."""
     weight = _PRIOR_SCALE**2 / (_PRIOR_SCALE**2 + found.chi**2)
-    fused: F64 = np.linalg.inv(found.information + weight * found.prior)
+    fused: F64 = np.asarray(np.linalg.inv(found.information + weight * found.prior), dtype=np.float64)
     return 0.5 * (fused + fused.T)
 
 

@@ -238,6 +238,7 @@ class LoopMatcher:
         lattice = Lattice(here, np.array((distinct, distinct, p.distinct_angle)), step)
         around = Excluded(here, np.array((1.0, 1.0, step)))
         fittest, _ = best_on_lattice(pooled, few, lattice, around, own, _VISITS, np.empty(3))
+        # Where nothing is fitter `own` comes back; if it does not to the last bit, HIDE is asked once more.
         return fittest == own
 
     def _few(self, points: F64, likelihood: LikelihoodField) -> F32:

@@ -16,12 +16,12 @@ from hsloc.slam.displaced import mended
 from hsloc.slam.evidence import Recorded, nothing_seen, weigh
 from hsloc.slam.joint_registration import Registration, moved_scans, refine
 from hsloc.slam.loop_closer import TORN, loop_edges
-from hsloc.slam.loop_rounds import close_loops
 from hsloc.slam.map_extension import connect, unconnected
 from hsloc.slam.map_session import LEFT_THE_MAP
 from hsloc.slam.map_state import MapState, fingerprint
 from hsloc.slam.marginals import all_edges, marginal_covariances, observed_terms
 from hsloc.slam.occupancy_mapper import build_grid
+from hsloc.slam.open_joints import close_and_join
 from hsloc.slam.plan_alignment import find_on_plan
 from hsloc.slam.pose_graph import Edges, PoseGraph, compose_steps, edge_errors
 from hsloc.slam.result import MappingQuality, MappingResult
@@ -84,7 +84,7 @@ def solve(gathered: MapSession, parameters: GraphMapperParameters, rng: Generato
     """Close the loops of a session and refine it, so that the log can go on from there: its keyscans as solved."""
     arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
     gathered = mended(gathered, arrays)
-    poses, loops, edges = close_loops(gathered, parameters, rng, _silent)
+    gathered, poses, loops, edges = close_and_join(gathered, parameters, rng, _silent)
     edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), edges])
     refined, _ = _refine(poses, arrays, edges, parameters, _silent)
     return replace(gathered, poses=refined.poses, known=tuple(loops))
@@ -105,7 +105,7 @@ def finish_session(
     """
     arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
     gathered = mended(gathered, arrays)
-    poses, loops, loop_edges = close_loops(gathered, parameters, rng, lambda part: report(0.5 * part))
+    gathered, poses, loops, loop_edges = close_and_join(gathered, parameters, rng, lambda part: report(0.5 * part))
     if extended is not None and not any(loop.accepted and _connects(loop, gathered) for loop in loops):
         raise MapError(unconnected(extended))
     edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), loop_edges])
@@ -207,10 +207,10 @@ def _recorded(
     ends = np.array([(reference[loop.first], reference[loop.second]) for loop in loops], dtype=np.int64).reshape(-1, 2)
     accepted = ends[[loop.accepted and loop.reason != LEFT_THE_MAP for loop in loops]]
     motions, steps = gathered.motions, gathered.steps.measured
-    if gathered.ties:
+    after = np.array([*(tie.second for tie in gathered.ties), *gathered.joints], dtype=np.int64)
+    if len(after):
         # Across a gap nothing was driven that the map could be held against.
         motions, steps = motions.copy(), steps.copy()
-        after = np.array([tie.second for tie in gathered.ties])
         motions[after] = 0.0
         steps[after - 1] = relative_poses(refined.poses[after - 1], refined.poses[after])
         accepted = verified_stretches(accepted, gathered.ties)
@@ -230,6 +230,7 @@ def _recorded(
         counts=refined.counts,
         loops=accepted,
         torn=ends[[loop.reason.startswith(TORN) for loop in loops]][chi > _CONTRADICTED],
+        joints=np.array(gathered.joints, dtype=np.int64),
         no_return_share=float(np.isposinf(ranges).sum()) / measured,
         stretches=repaired.stretches,
         held=repaired.held,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import erfc
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from hsloc.model.pose2 import relative_poses, wrap_angles
 from hsloc.model.verdict import counted, spans_of
 from hsloc.slam.jumps import jumps, tears
 from hsloc.slam.slips import STRETCHES_DEEP, joined
+from hsloc.slam.verdict import Evidence, Reason
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,53 +29,6 @@ if TYPE_CHECKING:
     I64 = NDArray[np.int64]
     Bools = NDArray[np.bool_]
 
-Verdict = Literal["good", "check", "failed"]
-
-
-@dataclass(frozen=True, slots=True)
-class Reason:
-    """Why a map should be looked at: a code for scripts, a sentence, and where and when.
-
-    `places` are positions in the map (m), `times_s` pairs of seconds since the first keyscan. `verdict` is "check" or
-    "failed".
-    """
-
-    code: str
-    text: str
-    verdict: Verdict
-    places: tuple[tuple[float, float], ...] = ()
-    times_s: tuple[tuple[float, float], ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {
-            "code": self.code,
-            "text": self.text,
-            "verdict": self.verdict,
-            "places": [list(place) for place in self.places],
-            "times_s": [list(times) for times in self.times_s],
-        }
-
-
-@dataclass(frozen=True, slots=True)
-class Evidence:
-    """The verdict on a map: the worst of its reasons, "good" without one."""
-
-    verdict: Verdict
-    reasons: tuple[Reason, ...] = ()
-    stray_scans: tuple[tuple[float, float], ...] = ()
-    """Seconds since the first keyscan of single scans beside their place: they spoil what they draw, not the map."""
-
-    @staticmethod
-    def of(reasons: list[Reason], stray_scans: tuple[tuple[float, float], ...] = ()) -> Evidence:
-        """The worst first."""
-        ordered = sorted(reasons, key=lambda reason: reason.verdict != "failed")
-        return Evidence(ordered[0].verdict if ordered else "good", tuple(ordered), stray_scans)
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {"verdict": self.verdict, "reasons": [reason.to_dict() for reason in self.reasons]}
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
@@ -84,8 +38,9 @@ class Recorded:
     had them; `refused` (n,) where it had not the scans' word. `odometry` (n, 3) is as recorded, None without any.
     `pairs` (m, 2) of keyscans that see the same walls, with `counts` (m, 5) as in `kernels.point_to_line.pair_terms`.
     `loops` (k, 2) are pairs of keyscans that accepted loops join, `torn` (j, 2) those of loops that were contradicted
-    by the others, and are by the finished map. `no_return_share` is the part of the beams that met nothing. `stretches`
-    are what the scans alone say of the motion along short parts of the path, `held` what the rest of the map does.
+    by the others, and are by the finished map. `joints` are keyscans at which pieces begin that were found on the map
+    of the others. `no_return_share` is the part of the beams that met nothing. `stretches` are what the scans alone say
+    of the motion along short parts of the path, `held` what the rest of the map does.
     """
 
     stamps_ns: I64
@@ -98,6 +53,7 @@ class Recorded:
     counts: F64
     loops: I64
     torn: I64
+    joints: I64
     no_return_share: float
     stretches: Stretches
     held: Held
@@ -178,6 +134,7 @@ def weigh(recorded: Recorded) -> Evidence:
     bridged = _bridged(recorded)
     found = [
         _open_joints(recorded, bridged),
+        _relocated(recorded),
         _second_visits(recorded),
         _against_odometry(recorded, bridged),
         _slips(recorded),
@@ -207,6 +164,15 @@ def _open_joints(r: Recorded, bridged: Bools) -> Reason | None:
         return None
     text = f"odometry alone holds {counted(len(wrong), 'joint')}: the scans refused it, fewer than two loops span it"
     return _reason(r, "open-joint", text, wrong, failed=False)
+
+
+def _relocated(r: Recorded) -> Reason | None:
+    """Where the path goes on at a place that a search of the whole map found."""
+    if len(r.joints) == 0:
+        return None
+    text = f"neither scans nor odometry say how the robot moved at {counted(len(r.joints), 'place')}, as if it was "
+    text += "carried: where it went on was found by a search of the whole map"
+    return _reason(r, "relocated", text, [(int(joint), int(joint)) for joint in r.joints], failed=False)
 
 
 def _healed(r: Recorded, first: int, last: int) -> bool:

@@ -113,13 +113,20 @@ class LoopCloser:
             if found == 0 and torn == 0:
                 break
 
-    def connections(self, place: int) -> list[Loop]:
-        """What is found between a place of this log and the nearest before `first`, its pose being nearly known."""
-        distance = np.hypot(*(self.poses[: self._first, :2] - self.poses[place, :2]).T)
-        near = [
-            int(old) for old in np.argsort(distance, kind="stable") if distance[old] < self._parameters.search_radius
+    def connections(self, place: int, among: NDArray[np.int64] | None = None) -> list[Loop]:
+        """What is found between a place and the nearest of others, its pose being nearly known.
+
+        The others are `among`, of another piece of the path, or those before `first`.
+        """
+        others = np.arange(self._first) if among is None else among
+        distance = np.hypot(*(self.poses[others, :2] - self.poses[place, :2]).T)
+        order = np.argsort(distance, kind="stable")
+        near = [int(k) for k in others[order[distance[order] < self._parameters.search_radius]]]
+        near = [other for other in near if not self._is_forbidden(min(other, place), max(other, place))]
+        return [
+            self._search(min(other, place), max(other, place), _CONNECTED_PATH_LENGTH)
+            for other in near[: self._parameters.max_candidates]
         ]
-        return [self._search(old, place, _CONNECTED_PATH_LENGTH) for old in near[: self._parameters.max_candidates]]
 
     def edges(self) -> Edges:
         """The accepted loops as edges between the places."""
@@ -223,8 +230,9 @@ class LoopCloser:
 
     def _path_lengths(self, place: int) -> F64:
         """Metres from a submap to each earlier one along the path and over closed loops, shape (place,)."""
-        # Where two logs are connected the path may lead over submaps that are still to be visited.
-        last = place if self._first == 0 else len(self._places) - 1
+        # Where two logs, or pieces, are connected the path may lead over submaps that are still to be visited.
+        is_one = self._places.piece[-1] == self._places.piece[0]
+        last = place if is_one else len(self._places) - 1
         chain = np.maximum(np.diff(self._places.path_length[: last + 1]), 1e-3)
         accepted = self.accepted
         links = np.array([(loop.first, loop.second) for loop in accepted], dtype=np.int64).reshape(-1, 2)

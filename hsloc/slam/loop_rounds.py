@@ -46,7 +46,8 @@ def close_loops(
         found = [] if session.ties or rounds_left == 0 else jumps(session.stamps_ns, poses, odometry)
         torn = tears(found, poses, odometry)
         across = _across(closer.accepted, places.reference, torn)
-        tearing = [pair for pair in across if pair not in session.asserted]
+        believed = {*session.asserted, *((loop.first, loop.second) for loop in session.known)}
+        tearing = [pair for pair in across if pair not in believed]
         if not tearing:
             break
         forbidden = (*forbidden, *tearing)

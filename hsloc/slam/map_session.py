@@ -78,6 +78,8 @@ class MapSession:
     """Where the path has gaps, in the order of the keyscans after them: there the robot was followed on the map."""
     slips: tuple[int, ...] = ()
     """Keyscans before steps in which the wheels slipped, as the scans around them show."""
+    joints: tuple[int, ...] = ()
+    """Keyscans at which a piece of the path begins that was found on the map of the others alone."""
 
     @property
     def slipped(self) -> NDArray[np.bool_]:
@@ -106,6 +108,25 @@ class MapSession:
         places = self.places.on_path(poses, motions, covariances)
         slips = tuple(np.flatnonzero(slipped).tolist())
         return replace(self, poses=poses, motions=motions, covariances=covariances, places=places, slips=slips)
+
+    def with_joints(self, poses: F64, joints: list[int], parameters: GraphMapperParameters) -> MapSession:
+        """The same keyscans at other poses (n, 3), with nothing known of the steps to the `joints`."""
+        gaps = np.zeros(len(poses), dtype=bool)
+        gaps[joints] = True
+        covariances = np.where(gaps[:, None, None], UNKNOWN_STEP, self.covariances)
+        information = np.where(gaps[1:, None, None], np.linalg.inv(UNKNOWN_STEP), self.steps.information)
+        length, turn = parameters.loops.submap_length, parameters.front_end.turn_length
+        places = Submaps.split_by_path_length(
+            poses, self.motions, covariances, length, turn, self.refused, parameters.loops.refused_path_length, gaps
+        )
+        return replace(
+            self,
+            poses=poses,
+            covariances=covariances,
+            steps=replace(self.steps, information=information),
+            places=places,
+            joints=tuple(joints),
+        )
 
     def moved(self, T_map_front: Pose2) -> MapSession:
         """The same in the map's frame."""
@@ -138,8 +159,9 @@ def from_front_end(
         known = solved.known
     else:
         all_scans = KeyScans.from_scans(scans)
+    joints = solved.joints if solved is not None else ()
     gaps = np.zeros(len(poses), dtype=bool)
-    gaps[[tie.second for tie in ties]] = True
+    gaps[[*(tie.second for tie in ties), *joints]] = True
     # Across a gap the chain says nothing.
     covariances[gaps] = UNKNOWN_STEP
     length, turn = parameters.loops.submap_length, parameters.front_end.turn_length
@@ -162,12 +184,13 @@ def from_front_end(
         first_place=first_place,
         ties=ties,
         slips=solved.slips if solved is not None else (),
+        joints=joints,
     )
 
 
 def _tie_loop(tie: Tie, poses: F64, places: Submaps) -> Loop:
     measured = (tie.first, tie.second, tie.T_first_second, tie.covariance)
-    return _between_places(*measured, poses, places, LEFT_THE_MAP)
+    return between_places(*measured, poses, places, LEFT_THE_MAP)
 
 
 def from_map_state(state: MapState, parameters: GraphMapperParameters) -> MapSession:
@@ -221,12 +244,12 @@ def _loops(state: MapState, places: Submaps) -> tuple[Loop, ...]:
     """The saved loops, moved from their keyscans to the references of the submaps that contain those."""
     saved = state.loops
     return tuple(
-        _between_places(i, j, Pose2.from_array(measured), np.linalg.inv(information), state.poses, places)
+        between_places(i, j, Pose2.from_array(measured), np.linalg.inv(information), state.poses, places)
         for (i, j), measured, information in zip(saved.pairs.tolist(), saved.measured, saved.information, strict=True)
     )
 
 
-def _between_places(
+def between_places(
     i: int, j: int, T_i_j: Pose2, covariance: F64, poses: F64, places: Submaps, reason: str = "of the saved map"
 ) -> Loop:
     """What was measured between two keyscans as an accepted loop between the places that contain them."""

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.slam.calibration import OdometryCalibration
-    from hsloc.slam.evidence import Evidence
     from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_state import MapState
     from hsloc.slam.plan_alignment import PlanFit
     from hsloc.slam.pose_graph import PoseGraph
+    from hsloc.slam.verdict import Evidence
 
     F64 = NDArray[np.float64]
 

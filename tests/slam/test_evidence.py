@@ -35,6 +35,7 @@ def lap() -> Recorded:
         counts=np.tile((150.0, 1.0, 180.0, 0.0, 150.0), (100, 1)),
         loops=np.array([(10, 110)]),
         torn=np.zeros((0, 2), dtype=np.int64),
+        joints=np.zeros(0, dtype=np.int64),
         no_return_share=0.1,
         stretches=stretches(np.full(3, 0.01), np.ones(3)),
         held=held(),
@@ -127,6 +128,11 @@ def test_refused_steps_that_no_loop_spans_are_named(lap: Recorded) -> None:
     once = replace(lap, refused=np.roll(refused, -100))
     assert codes(once) == ("check", ["open-joint"]), "a single loop shares out the errors of what it spans"
     assert codes(replace(once, loops=np.array([(10, 110), (20, 120)]))) == ("good", [])
+
+
+def test_a_place_that_a_search_of_the_map_found_is_named(lap: Recorded) -> None:
+    (reason,) = weigh(replace(lap, joints=np.array([150]))).reasons
+    assert (reason.code, reason.verdict, reason.times_s) == ("relocated", "check", ((149.0, 150.0),))
 
 
 @pytest.mark.parametrize(("counts", "expected"), [((90.0, 5.0), []), ((60.0, 60.0), ["open-joint"])])

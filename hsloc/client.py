@@ -123,8 +123,9 @@ class Client:
     def submit(self, log: str | Sequence[str], **request: Any) -> dict[str, Any]:
         """Queue a job on an uploaded log, or on several that are parts of one run; options as in the API.
 
-        Among them `relations`, the id of an upload, and `resume`, the id of a job whose map is extended. Sent again
-        without harm (Idempotency-Key).
+        Among them `relations`, the id of an upload, `resume`, the id of a job whose map is extended, and `map` and
+        `align_to`, `{"yaml": ..., "image": ...}` with the ids of two uploads. Sent again without harm
+        (Idempotency-Key).
         """
         logs = [log] if isinstance(log, str) else list(log)
         return self._post_once("/v1/jobs", {**({"log": logs[0]} if len(logs) == 1 else {"logs": logs}), **request})

@@ -49,6 +49,11 @@ class MapMetadata:
     mode: str = "trinary"
 
 
+def map_file(path: Path) -> Path:
+    """The file meant by --map: in a folder of results its map.yaml."""
+    return path / "map.yaml" if path.is_dir() else path
+
+
 def read_metadata(path: Path) -> MapMetadata:
     """Read map.yaml. Raises MapError naming the file and the key that is missing or wrong."""
     values = load_yaml(path)

@@ -73,6 +73,11 @@ class Option:
         return self.field or self.name
 
     @property
+    def is_map(self) -> bool:
+        """Whether HTTP takes the ids of two uploaded files, the YAML and the image of a map."""
+        return self.name in ("map", "align_to")
+
+    @property
     def is_upload(self) -> bool:
         """Whether HTTP takes the id of one uploaded file."""
         return "http" in self.doors and self.name in ("relations", "reference", "calibration")
@@ -86,8 +91,9 @@ OPTIONS: tuple[Option, ...] = (
         help="Localise on a map, or build one (slam); auto localises if there is a map (default: auto).",
     ),
     Option(
-        name="map", flag="--map", kind="path", metavar="MAP", field="map_path", doors=COMMANDS,
+        name="map", flag="--map", kind="path", metavar="MAP", field="map_path",
         help="Map to localise on: a YAML of nav2, or the folder or map.npz of a mapping run (default: the log's).",
+        http="Ids of the two uploaded files of a map to localise on, its YAML and its image (default: the log's).",
     ),
     Option(
         name="resume", flag="--resume", kind="path", metavar="MAP", doors=ONE_RUN,
@@ -96,9 +102,11 @@ OPTIONS: tuple[Option, ...] = (
         "localise the robot is localised on it.",
     ),
     Option(
-        name="align_to", flag="--align-to", kind="path", metavar="PLAN", doors=frozenset({"replay", "map"}),
+        name="align_to", flag="--align-to", kind="path", metavar="PLAN",
         help="Floor plan, or another map, whose frame a built map is brought into: a YAML of nav2 with its image, or "
         "what --map takes. Its place is searched for on the whole plan.",
+        http="Ids of the two uploaded files of a floor plan, or of another map, its YAML and its image: a map that the "
+        "graph mapper builds is brought into its frame.",
     ),
     Option(
         name="assert_loop", flag="--assert-loop", kind="topics", metavar="T1,T2", doors=ONE_RUN,

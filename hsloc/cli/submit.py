@@ -24,6 +24,7 @@ EXAMPLES = """
   hsloc submit run.mcap --wait
   hsloc submit rosbag2_folder --wait
   hsloc submit run.mcap --map floor.yaml --initial-pose -1,2,0 --out results/run
+  hsloc submit run.mcap --mode slam --align-to plan.yaml
   hsloc submit second.mcap --resume 3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f --mode slam
 
 The token, if the service asks for one, is read from $HSLOC_TOKEN.
@@ -114,11 +115,12 @@ def request_of(given: Mapping[str, Any], upload: Callable[[Path], str]) -> dict[
     request: dict[str, Any] = {}
     for name, value in merged(given).items():
         option = BY_NAME[name]
-        if name == "map":
-            from hsloc.maps import read_metadata
+        if option.is_map:
+            from hsloc.maps import map_file, read_metadata
 
-            image = read_metadata(value).image
-            request["map"] = {"yaml": upload(value), "image": upload(image)}
+            path = map_file(value)
+            image = read_metadata(path).image
+            request[name] = {"yaml": upload(path), "image": upload(image)}
         elif name == "config":
             warnings: list[str] = []
             request["config"] = read_values(value, warnings)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import LogError, MapError
-from hsloc.maps import read_map, read_metadata
+from hsloc.maps import map_file, read_map, read_metadata
 from hsloc.model.events import Odometry
 from hsloc.model.pose2 import Pose2
 from hsloc.replay.matched_scans import are_matched, is_lost, mean_fitness
@@ -49,11 +49,6 @@ _CHORD_M, _SPACING_M = 3.0, 0.5
 """Path length of a chord whose lengths by matches and by odometry are compared, and of two beginnings (m): matches are
 off by 1 to 2 cm."""
 _GIVE_START = "give the start with --initial-pose"
-
-
-def map_file(path: Path) -> Path:
-    """The file meant by --map: in a folder of results its map.yaml."""
-    return path / "map.yaml" if path.is_dir() else path
 
 
 def map_files(path: Path) -> list[Path]:

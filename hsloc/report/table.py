@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from hsloc.evaluation import PoseStatistics, Statistics
     from hsloc.model.verdict import VerdictReason
-    from hsloc.run_metrics import MapMetrics, RunMetrics, ScanCounts
+    from hsloc.run_metrics import MapMetrics, PlanMetrics, RunMetrics, ScanCounts
 
 DASH = "–"
 LENGTHS = ((0.00095, 1e3, "mm"), (0.9995, 1e2, "cm"), (1e3, 1.0, "m"), (np.inf, 1e-3, "km"))
@@ -286,11 +286,8 @@ def _map_rows(found: MapMetrics) -> list[Row]:
     if found.crispness is not None and isfinite(found.crispness.wall_thickness_median):
         values = format_length(found.crispness.wall_thickness_median)
         rows.append(Row("wall thickness", (values,), _THICKNESS, ("map/crispness/wall_thickness_median",)))
-    plan = found.plan
-    if plan is not None and plan.walls_near is not None:
-        values = f"{format_share(plan.walls_near)}, {format_length(plan.mean_distance)}"
-        sources = ("map/plan/walls_near", "map/plan/mean_distance")
-        rows.append(Row("walls within 15 cm of the plan, mean distance", (values,), _PLAN, sources))
+    if found.plan is not None:
+        rows += _plan_rows(found.plan)
     compared = found.comparison
     if compared is not None and isfinite(compared.precision):
         values = f"{format_share(compared.precision)}, {format_share(compared.recall)}"
@@ -299,6 +296,33 @@ def _map_rows(found: MapMetrics) -> list[Row]:
     return rows
 
 
+def _plan_rows(plan: PlanMetrics) -> list[Row]:
+    place, fitness = "nowhere", f"at most {plan.elsewhere:.2f}"
+    if plan.pose is not None:
+        x, y, yaw = plan.pose
+        place = f"x {format_length(x)}, y {format_length(y)}, {format_angle(degrees(yaw))}"
+        place = place if plan.certain else f"not certain; it fits best at {place}"
+        fitness = f"{plan.fitness:.2f}, elsewhere {fitness}"
+    sources = ("map/plan/fitness", "map/plan/elsewhere")
+    rows = [
+        Row("place on the floor plan", (place,), _PLACE),
+        Row("fitness on the floor plan", (fitness,), _FIT, sources),
+    ]
+    if plan.walls_near is not None:
+        values = f"{format_share(plan.walls_near)}, {format_length(plan.mean_distance)}"
+        sources = ("map/plan/walls_near", "map/plan/mean_distance")
+        rows.append(Row("walls within 15 cm of the plan, mean distance", (values,), _PLAN, sources))
+    return rows
+
+
+_PLACE = (
+    "Where the robot's first pose is on the floor plan. Where that is certain, the map and the trajectory are in the "
+    "plan's frame; else in their own."
+)
+_FIT = (
+    "How well the map's walls lie on the plan there, from 0 to 1, and what is proven for all other places. Furniture "
+    "and walls that the plan does not show lower it."
+)
 _PLAN = (
     "Part of the map's walls within 15 cm of a wall of the floor plan, and their mean distance. Furniture, and what "
     "was built since the plan was drawn, lower the one and raise the other."

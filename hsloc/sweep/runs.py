@@ -22,8 +22,9 @@ from hsloc.config import to_dict
 from hsloc.errors import HslocError, no_such
 from hsloc.export.results_folder import write_results
 from hsloc.log import open_log
+from hsloc.maps import map_file
 from hsloc.options import OPTIONS
-from hsloc.replay.map_and_start import map_file, state_file
+from hsloc.replay.map_and_start import state_file
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
 from hsloc.run_metrics import RunMetrics, RunTimings
@@ -232,11 +233,10 @@ def run_key(request: RunRequest, hashes: dict[Path, str] | None = None, remote: 
     """
     hashes = {} if hashes is None else hashes
     values: dict[str, Any] = {"hsloc": __version__, **request_values(request)}
-    if request.map_path is not None:
-        values["map_path"] = [
-            request.map_path.name,
-            *(_digest(part, hashes) for part in _map_files(request.map_path)),
-        ]
+    for name in ("map_path", "align_to"):
+        given: Path | None = getattr(request, name)
+        if given is not None:
+            values[name] = [given.name, *(_digest(part, hashes) for part in _map_files(given))]
     if request.resume is not None:
         values["resume"] = [request.resume.name, _digest(state_file(request.resume), hashes)]
     for name in ("relations", "reference", "calibration"):

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 
 MAP_STATE = "map.npz"
 """The asset of a mapping run that a later run extends."""
+MAPS = tuple(each.name for each in OPTIONS if each.is_map)
+"""Options that name the two uploads of a map."""
 UPLOADS = tuple(each.name for each in OPTIONS if each.is_upload)
 """Options that name an upload."""
 ALWAYS = (
@@ -43,6 +45,6 @@ def logs_of(request: Mapping[str, Any]) -> list[str]:
 
 def files_of(request: Mapping[str, Any]) -> list[str]:
     """Ids of all uploads that the job reads."""
-    chart = request.get("map") or {}
+    maps = [ident for name in MAPS for ident in (request.get(name) or {}).values()]
     more = [request[name] for name in UPLOADS if request.get(name) is not None]
-    return [*logs_of(request), *chart.values(), *more]
+    return [*logs_of(request), *maps, *more]

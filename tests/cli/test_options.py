@@ -67,6 +67,14 @@ def test_submit_sends_the_options(tmp_path: Path) -> None:
         "config": {"harmony_search": {"budget": 400}, "localiser": {"fuse": False}},
         "max_ape": 0.1,
     }
+    yaml = "image: %s\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+    (tmp_path / "map.yaml").write_text(yaml % "walls.png")
+    (tmp_path / "plan.yaml").write_text(yaml % "plan.pgm")
+    given = {"map": tmp_path, "align_to": tmp_path / "plan.yaml"}  # a folder of results has its map.yaml
+    assert request_of(given, lambda path: f"id of {path.name}") == {
+        "map": {"yaml": "id of map.yaml", "image": "id of walls.png"},
+        "align_to": {"yaml": "id of plan.yaml", "image": "id of plan.pgm"},
+    }
     given = {"start_s": 2.0, "reference": "/vicon"}
     assert request_of(given, str) == {"read": {"start_s": 2.0, "truth_topic": "/vicon"}}
 

@@ -9,14 +9,17 @@ import struct
 import subprocess
 import sys
 import time
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from live_service import upload, wait, without_command
 from paths import RECORDINGS
 
 from hsloc.errors import MapError
-from hsloc.maps import read_metadata
+from hsloc.log import open_log
+from hsloc.maps import read_metadata, save_map
+from hsloc.model.pose2 import Pose2
 from hsloc.report.view import MOST_POSES
 from hsloc_service.execution.worker import linked_map
 from hsloc_service.settings import Settings
@@ -38,21 +41,31 @@ REAL = Settings().worker_command
             {"seed": 11, "config": {"hide": {"budget": 250}}, "read": {"end_s": 8.0}},
             ["--seed", "11", "--config", "c.yaml", "--end", "8"],
         ),
-        ({"mode": "slam", "read": {"end_s": 6.0}}, ["--mode", "slam", "--end", "6"]),
+        (
+            {"align_to": {"yaml": "map.yaml", "image": "map.pgm"}, "read": {"end_s": 6.0}},
+            ["--align-to", "map.yaml", "--end", "6"],
+        ),
     ],
 )
 def test_the_result_is_that_of_hsloc_replay_byte_for_byte(
-    make_client: Callable[..., TestClient], tmp_path: Path, request_: dict[str, object], options: list[str]
+    make_client: Callable[..., TestClient], tmp_path: Path, request_: dict[str, Any], options: list[str]
 ) -> None:
     client = make_client(worker_command=REAL, sandbox="none", job_memory_bytes=4 << 30)
     file = upload(client, (RECORDINGS / "office.mcap").read_bytes(), "office.mcap")
-    job = client.post("/v1/jobs", json={"log": file, **request_}).json()["id"]
+    if parts := request_.get("align_to"):
+        grid = open_log(RECORDINGS / "office.mcap").map()
+        assert grid is not None
+        save_map(replace(grid, origin=Pose2(20.0, -5.0, 0.0)), tmp_path)  # as a floor plan, in a frame of its own
+        ids = {part: upload(client, (tmp_path / name).read_bytes(), name) for part, name in parts.items()}
+        request_ = {**request_, "align_to": ids}
     (tmp_path / "c.yaml").write_text("hide: {budget: 250}\n")
     # A job has the name of its log alone; so has a command in the folder of the log.
     shutil.copy(RECORDINGS / "office.mcap", tmp_path)
     command = [sys.executable, "-m", "hsloc.cli.main", "replay", "office.mcap", "-q", *options]
+    # It comes first: a job keeps nothing that it compiles.
     subprocess.run([*command, "--out", str(tmp_path / "out")], check=True, cwd=tmp_path)
-    ended = wait(client, job, 60.0)
+    job = client.post("/v1/jobs", json={"log": file, **request_}).json()["id"]
+    ended = wait(client, job, 120.0)
     assert ended["state"] == "succeeded", ended
     names = {each["name"] for each in client.get(f"/v1/jobs/{job}/results").json()["assets"]}
     theirs = {path.name for path in (tmp_path / "out").iterdir()}
@@ -61,6 +74,9 @@ def test_the_result_is_that_of_hsloc_replay_byte_for_byte(
     for name in theirs - {"timings.json"}:  # wall times
         ours = client.get(f"/v1/jobs/{job}/results/{name}").content
         assert without_command(name, ours) == without_command(name, (tmp_path / "out" / name).read_bytes()), name
+    if parts:
+        plan = client.get(f"/v1/jobs/{job}/results/metrics.json").json()["map"]["plan"]
+        assert (plan["name"], plan["certain"]) == ("map.yaml", True)
     viewer = client.get(f"/v1/jobs/{job}/results/viewer.json").json()
     assert len(viewer["trajectory"]["x"]) == len(viewer["trajectory"]["t"]) <= MOST_POSES + 1
     ape = ended["summary"]["metrics"]["ape"]["trans_part"]
@@ -138,7 +154,7 @@ def map_yaml(folder: Path, image: object) -> None:
 def test_a_map_must_name_an_image(tmp_path: Path, image: object) -> None:
     map_yaml(tmp_path, image)
     with pytest.raises(MapError, match="must name a file"):
-        linked_map(tmp_path, "map.yaml", ".image")
+        linked_map(tmp_path / "map", "map.yaml", ".image")
 
 
 @pytest.mark.parametrize("image", ["/etc/passwd", "../input/log.mcap", "a/b.pgm", "C:\\maps\\b.pgm", "b.pgm"])
@@ -146,7 +162,7 @@ def test_a_map_never_reads_a_file_that_was_not_uploaded(tmp_path: Path, image: s
     """A path is of the user's machine: the uploaded image is meant, whatever this machine has there."""
     map_yaml(tmp_path, image)
     (tmp_path / "map" / ".image").write_bytes(b"uploaded")
-    named = read_metadata(linked_map(tmp_path, "map.yaml", ".image")).image
+    named = read_metadata(linked_map(tmp_path / "map", "map.yaml", ".image")).image
     assert named.parent == tmp_path / "map"
     assert named.read_bytes() == b"uploaded"
 

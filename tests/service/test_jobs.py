@@ -159,11 +159,16 @@ def test_a_large_json_body_is_refused(client: TestClient) -> None:
 
 
 def test_everything_in_one_request(client: TestClient) -> None:
-    files = {"log": ("my run.mcap", b"ok"), "map": ("m.yaml", b"image: m.pgm"), "map_image": ("m.pgm", b"P5")}
+    files = {"log": ("my run.mcap", b"ok")}
+    for name in ("map", "align_to"):
+        files |= {name: (f"{name}.yaml", b"image: m.pgm"), f"{name}_image": (f"{name}.pgm", b"P5")}
     answer = client.post("/v1/run", files=files, data={"request": '{"seed": 9}'})
     assert answer.status_code == 201, answer.text
     job = answer.json()
     assert (job["log"], job["request"]["seed"]) == ("my run.mcap", 9)
+    for name in ("map", "align_to"):
+        parts = [client.get(f"/v1/files/{job['request'][name][part]}").json()["name"] for part in ("yaml", "image")]
+        assert parts == [f"{name}.yaml", f"{name}.pgm"]
     assert wait(client, job["id"])["state"] == "succeeded"
 
 
@@ -172,6 +177,9 @@ def test_a_one_shot_that_cannot_be_queued_leaves_no_file(client: TestClient) -> 
         answer = client.post("/v1/run", files={"log": b"ok"}, data=data)
         assert answer.status_code == 422, answer.text
     assert client.post("/v1/run", files={"map": b"ok"}).status_code == 422
+    half = client.post("/v1/run", files={"log": b"ok", "align_to": b"image: m.pgm"})
+    assert half.status_code == 422
+    assert half.json()["message"] == "a map is two files: `align_to` (YAML) and `align_to_image`"
     broken = client.post("/v1/run", content=b"--x\r\n", headers={"content-type": "multipart/form-data; boundary=x"})
     assert broken.status_code == 400
     assert client.get("/v1/files").json()["files"] == []

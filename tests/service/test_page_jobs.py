@@ -27,7 +27,7 @@ def test_the_form_offers_what_the_server_does(
     with live.client() as client:
         offered = {each["name"] for each in client.get("/v1/options", timeout=60.0).json()["run"]}
     built = set(page.evaluate("() => [...document.querySelectorAll('[data-option]')].map((e) => e.dataset.option)"))
-    assert built == offered - {"relations", "reference", "calibration", "resume"}
+    assert built == offered - {"map", "align_to", "relations", "reference", "calibration", "resume"}
     page.click("summary >> text=Map and options")
     for group in ("reading the log", "algorithms"):
         page.click(f"summary >> text={group}")
@@ -38,11 +38,15 @@ def test_the_form_offers_what_the_server_does(
     page.select_option("[data-option=matcher]", "icp")
     page.fill("[data-option=config]", "icp.iterations=9")
     page.set_input_files("#log", str(RECORDINGS / "slip.mcap"))
+    plan = [{"name": f"plan.{kind}", "mimeType": "application/x-plan", "buffer": b"a plan"} for kind in ("png", "yaml")]
+    page.set_input_files("#align_to", plan)
     page.click("#go")
     page.wait_for_selector("#job-state .state")
     with live.client() as client:
         (job,) = client.get("/v1/jobs").json()["jobs"]
-    request = job["request"]
+        request = job["request"]
+        parts = {part: client.get(f"/v1/files/{ident}").json()["name"] for part, ident in request["align_to"].items()}
+    assert parts == {"yaml": "plan.yaml", "image": "plan.png"}
     assert (request["initial_pose"], request["read"]["start_s"], request["seed"]) == ([-1.0, 2.0, 0.5], 1.5, 7)
     assert (request["matcher"], request["config"]) == ("icp", {"icp": {"iterations": 9}})
 

@@ -194,6 +194,13 @@ def test_what_contradicts_itself_is_refused(client: TestClient) -> None:
     assert "logs" in refused(client, 422, logs=[])
     assert "leave out one" in refused(client, 422, log=log, resume=job, map={"yaml": log, "image": other})
     assert "graph mapper" in refused(client, 422, log=log, resume=job, mapper="point")
+    plan = {"yaml": log, "image": other}
+    for change in ({"resume": job}, {"mode": "localise"}, {"mapper": "point"}, {"config": {"mapper": "point"}}):
+        assert "leave out `align_to`, or" in refused(client, 422, log=log, align_to=plan, **change)
+    again = submit(client, b"ok", align_to=plan)
+    assert client.post(f"/v1/jobs/{again}/rerun", json={"mode": "localise"}).status_code == 422
+    answer = client.post(f"/v1/jobs/{again}/rerun", json={"mode": "localise", "align_to": None})
+    assert "align_to" not in answer.json()["request"]
     again = submit(client, b"ok", resume=job)
     answer = client.post(f"/v1/jobs/{again}/rerun", json={"mapper": "point"})
     assert (answer.status_code, answer.json()["code"]) == (422, "invalid")
@@ -221,6 +228,10 @@ def test_what_belongs_to_others_is_not_there(make_client: Callable[..., TestClie
     assert "there is no job" in refused(client, 404, log=mine, resume=job)
     assert "relations: there is no file" in refused(client, 404, log=mine, relations=theirs)
     assert "log: there is no file" in refused(client, 404, logs=[mine, theirs])
+    for name in ("map", "align_to"):
+        for part in ("yaml", "image"):
+            chart = {"yaml": mine, "image": mine, part: theirs}
+            assert f"{name}.{part}: there is no file" in refused(client, 404, log=mine, **{name: chart})
     assert client.get("/v1/jobs").json()["jobs"] == []
     begun = client.post("/v1/tus", headers={"Tus-Resumable": "1.0.0", "Upload-Length": "9"}).headers["location"]
     assert "not finished" in refused(client, 409, log=mine, relations=begun.rsplit("/", 1)[1])
@@ -241,6 +252,11 @@ def test_what_an_active_job_reads_stays(make_client: Callable[..., TestClient]) 
     assert len(client.get("/v1/files").json()["files"]) == 3
     client.post(f"/v1/jobs/{job}/cancel")
     wait(client, job)
+    charts = {name: {"yaml": upload(client), "image": upload(client)} for name in ("map", "align_to")}
+    on_plan = submit(client, b"slow 30", **charts)
+    for file in (ident for chart in charts.values() for ident in chart.values()):
+        assert client.delete(f"/v1/files/{file}").json()["code"] == "in_use"
+    client.post(f"/v1/jobs/{on_plan}/cancel")
     assert client.delete(f"/v1/jobs/{drawn}").status_code == 204
     assert client.post(f"/v1/jobs/{job}/rerun").status_code == 404  # what it extended is gone
 
@@ -301,7 +317,7 @@ def test_every_example_of_the_api_fits_it(client: TestClient) -> None:
     for example in schema["examples"]:
         JobRequest.model_validate(example)
         named |= set(example)
-    assert {"log", "logs", "relations", "resume"} <= named
+    assert {"log", "logs", "relations", "resume", "align_to"} <= named
 
 
 def test_what_has_not_changed_is_304_and_the_rest_is_compressed(make_live: Callable[..., Live]) -> None:

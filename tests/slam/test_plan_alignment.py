@@ -15,6 +15,7 @@ from hsloc.maps import save_map
 from hsloc.model import OccupancyGrid, Pose2
 from hsloc.model.pose2 import compose_poses
 from hsloc.replay.run import run
+from hsloc.report.table import table_rows
 from hsloc.request import RunRequest
 from hsloc.slam.plan_alignment import find_on_plan
 
@@ -96,11 +97,16 @@ def test_a_run_is_in_the_frame_of_the_plan(tmp_path: Path) -> None:
     metrics = analyse(found).metrics.to_json()
     assert metrics["map"]["plan"]["certain"]
     assert metrics["map"]["plan"]["walls_near"] > 0.99
+    rows = {row.label: row.values for row in table_rows(analyse(found).metrics)}
+    x, y, yaw = metrics["map"]["plan"]["pose"]
+    assert rows["place on the floor plan"] == (f"x {x:.2f} m, y {y:.2f} m, {np.degrees(yaw):.0f}°",)
     other = run(log, align_to=tmp_path / "hall" / "map.yaml", end_s=12.0)
     metrics = analyse(other).metrics.to_json()
     assert [reason["code"] for reason in metrics["verdict_reasons"]] == ["plan_not_found"]
     assert np.abs(other.trajectory.poses[0]).max() < 1e-6, "in its own frame, with the first pose as origin"
     assert metrics["map"]["plan"]["walls_near"] is None
+    (place,) = (row.values for row in table_rows(analyse(other).metrics) if row.label == "place on the floor plan")
+    assert place[0].startswith("not certain; it fits best at x ")
 
 
 @pytest.mark.parametrize("other", [{"resume": "before"}, {"mode": "localise"}, {"mapper": "point"}])

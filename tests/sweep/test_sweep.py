@@ -101,16 +101,19 @@ def test_whatever_decides_a_run_is_in_its_key(changes: dict[str, Any]) -> None:
 
 
 def test_the_bytes_of_all_files_are_in_the_key(tmp_path: Path) -> None:
-    log, image, yaml = tmp_path / "run.mcap", tmp_path / "map.pgm", tmp_path / "map.yaml"
+    log = tmp_path / "run.mcap"
+    charts: dict[str, Any] = {name: tmp_path / f"{name}.yaml" for name in ("map", "align_to")}
     log.write_bytes(b"one")
-    image.write_bytes(b"P5")
-    yaml.write_text("image: map.pgm\n")
+    images = [path.with_suffix(".pgm") for path in charts.values()]
+    for image, yaml in zip(images, charts.values(), strict=True):
+        image.write_bytes(b"P5")
+        yaml.write_text(f"image: {image.name}\n")
     others: dict[str, Any] = {name: tmp_path / name for name in ("relations", "reference", "calibration")}
     for path in others.values():
         path.write_text("lidars: {/scan: {x: 0.1}}\n")
-    (item,) = plan([log], DEFAULT, map=yaml, **others)
+    (item,) = plan([log], DEFAULT, **charts, **others)
     keys = [run_key(item.request)]
-    files = (log, image, yaml, *others.values())
+    files = (log, *images, *charts.values(), *others.values())
     for path in files:
         path.write_bytes(path.read_bytes() + b"\n")
         keys.append(run_key(item.request))

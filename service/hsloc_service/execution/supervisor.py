@@ -19,7 +19,7 @@ from hsloc_service.execution.retry import Interrupted, Retry
 from hsloc_service.logs import log
 from hsloc_service.results.store import BLOCK, collect, transfer_timeout_s
 from hsloc_service.storage import safe_name, write_hashed
-from hsloc_service.stored_request import MAP_STATE, UPLOADS, logs_of
+from hsloc_service.stored_request import MAP_STATE, MAPS, UPLOADS, logs_of
 
 if TYPE_CHECKING:
     import threading
@@ -97,8 +97,7 @@ def prepare(
     job that is extended belongs beside `job.json`: see `download`. `files` are the uploads by their ids.
     """
     storage.remove_work(folder)
-    for name in ("map", "tmp"):
-        (folder / name).mkdir(parents=True, mode=0o700)
+    (folder / "tmp").mkdir(parents=True, mode=0o700)
     request = claim.request
 
     def link(place: str, file_id: str, default: str) -> str:
@@ -120,11 +119,12 @@ def prepare(
             "open_files": settings.job_open_files,
         },
     }
-    if request.get("map") is not None:
-        job["map"] = link("map", request["map"]["yaml"], "map.yaml")
-        # A name that no YAML can ask for; the worker links the name that this YAML does ask for.
-        (folder / "map" / ".image").symlink_to(files[request["map"]["image"]].absolute())
-        job["map_image"] = ".image"
+    for name in MAPS:
+        if (chart := request.get(name)) is not None:
+            job[name] = link(name, chart["yaml"], "map.yaml")
+            # A name that no YAML can ask for; the worker links the name that this YAML does ask for.
+            (folder / name / ".image").symlink_to(files[chart["image"]].absolute())
+            job[f"{name}_image"] = ".image"
     job |= {name: link(name, request[name], name) for name in UPLOADS if request.get(name) is not None}
     if claim.source is not None:
         job["resume"] = MAP_STATE

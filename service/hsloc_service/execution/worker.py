@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.options import BY_NAME
 from hsloc_service.execution import limits
+from hsloc_service.stored_request import MAPS, UPLOADS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -210,24 +211,23 @@ def make_request(job: Mapping[str, Any], folder: Path) -> RunRequest:
     from hsloc.request import RunRequest
 
     wanted = job["request"]
-    values = {name: wanted.get(name) for name in BY_NAME if name not in ("map", "resume")} | (wanted.get("read") or {})
-    values |= {name: folder / name / job[name] for name in BY_NAME if BY_NAME[name].is_upload and job.get(name)}
-    if job.get("map") is not None:
-        values["map"] = linked_map(folder, job["map"], job["map_image"])
+    values = {name: wanted.get(name) for name in BY_NAME if name not in (*MAPS, "resume")} | (wanted.get("read") or {})
+    values |= {name: folder / name / job[name] for name in UPLOADS if job.get(name)}
+    values |= {name: linked_map(folder / name, job[name], job[f"{name}_image"]) for name in MAPS if job.get(name)}
     if job.get("resume") is not None:
         values["map" if wanted.get("mode") == "localise" else "resume"] = folder / job["resume"]
     return RunRequest.from_values([folder / place for place in job["logs"]], {**values, "bare_names": True})
 
 
 def linked_map(folder: Path, name: str, image: str) -> Path:
-    """The map's YAML, with its image under the name that it asks for.
+    """The map's YAML in a folder, with its image under the name that it asks for.
 
     Of a path the last name counts: a YAML that says `image: /etc/passwd` must not have us read what was not uploaded.
     """
     from hsloc.errors import MapError
     from hsloc.maps import load_yaml
 
-    path = folder / "map" / name
+    path = folder / name
     values = load_yaml(path)
     wanted = values.get("image")
     plain = wanted.replace("\\", "/").rpartition("/")[2] if isinstance(wanted, str) else ""
@@ -241,9 +241,9 @@ def linked_map(folder: Path, name: str, image: str) -> Path:
         path.unlink()
         with path.open("w", encoding="utf-8") as file:
             YAML(typ="safe", pure=True).dump(values, file)
-    target = folder / "map" / plain
+    target = folder / plain
     if not target.exists():
-        target.symlink_to(folder / "map" / image)
+        target.symlink_to(folder / image)
     return path
 
 
@@ -268,7 +268,7 @@ def explain(error: Exception) -> dict[str, Any]:
 
 def plain_names(text: str) -> str:
     """A message with the files' own names: the folder is the server's business, and differs from run to run."""
-    folders = "|".join((r"input(?:-\d+)?", "map", "output", *(name for name in BY_NAME if BY_NAME[name].is_upload)))
+    folders = "|".join((r"input(?:-\d+)?", "output", *MAPS, *UPLOADS))
     return re.sub(rf"{re.escape(str(Path.cwd()))}/(?:(?:{folders})/)?", "", text)
 
 

@@ -14,9 +14,9 @@ from hsloc.options import BY_NAME
 from hsloc_service import config_schema as options
 from hsloc_service.errors import ServiceError
 from hsloc_service.http.context import Context, Ctx, Writer, problems
-from hsloc_service.http.schemas import MAX_LOGS, JobRequest, JobView, RunRequest, checked
+from hsloc_service.http.schemas import ALIGNED, MAX_LOGS, JobRequest, JobView, RunRequest, checked
 from hsloc_service.http.views import job_view
-from hsloc_service.stored_request import UPLOADS, plain
+from hsloc_service.stored_request import MAPS, UPLOADS, plain
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from hsloc_service.db.tables import FileRow
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
-FILES = ("log", "map", "map_image", *UPLOADS)
+IMAGES = {name: f"{name}_image" for name in MAPS}
+"""By the field of a map's YAML that of its image."""
+FILES = ("log", *IMAGES, *IMAGES.values(), *UPLOADS)
 FIELD_BYTES = 64 << 10
 HEADER_BYTES = 8 << 10
 _FILE = {"type": "string", "contentMediaType": "application/octet-stream"}
@@ -41,11 +43,17 @@ _BODY = {
                         "log": {**_FILE, "description": "the log; given several times, the parts of one run"},
                         "map": {**_FILE, "description": "the map's YAML"},
                         "map_image": {**_FILE, "description": "the map's image"},
+                        "align_to": {**_FILE, "description": "the YAML of a floor plan, or of another map"},
+                        "align_to_image": {**_FILE, "description": "the plan's image"},
                         **{name: {**_FILE, "description": BY_NAME[name].http} for name in UPLOADS},
                         "request": {"$ref": "#/components/schemas/RunRequest"},
                     },
                     "additionalProperties": False,
-                    "dependentRequired": {"map": ["map_image"], "map_image": ["map"]},
+                    "dependentRequired": {
+                        one: [other] for pair in IMAGES.items() for one, other in (pair, reversed(pair))
+                    },
+                    "if": {"required": ["align_to"]},
+                    "then": {"properties": {"request": {"properties": ALIGNED}}},
                 }
             }
         },
@@ -92,16 +100,18 @@ async def _receive(ctx: Context, who: Principal, row: FileRow, parts: _Parts) ->
 def _request(text: bytes, files: dict[str, list[str]]) -> JobRequest:
     if "log" not in files:
         raise ServiceError(422, "invalid", "the field `log` is missing")
-    if ("map" in files) != ("map_image" in files):
-        raise ServiceError(422, "invalid", "a map is two files: `map` (YAML) and `map_image`")
+    for name, image in IMAGES.items():
+        if (name in files) != (image in files):
+            raise ServiceError(422, "invalid", f"a map is two files: `{name}` (YAML) and `{image}`")
     try:
         found = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ServiceError(422, "invalid", "`request` is not JSON") from error
     values, logs = checked(RunRequest, found).model_dump(exclude_unset=True), files["log"]
     values |= {"log": logs[0]} if len(logs) == 1 else {"logs": logs}
-    if "map" in files:
-        values["map"] = {"yaml": files["map"][0], "image": files["map_image"][0]}
+    values |= {
+        name: {"yaml": files[name][0], "image": files[image][0]} for name, image in IMAGES.items() if name in files
+    }
     values |= {name: files[name][0] for name in UPLOADS if name in files}
     return checked(JobRequest, values)
 

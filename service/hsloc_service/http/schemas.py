@@ -94,6 +94,8 @@ def _type(option: Option) -> Any:
             return bool
         case _ if option.name == "config":
             return Config
+        case _ if option.is_map:
+            return MapFiles
         case _:
             return Ident if option.kind == "path" or option.is_upload else Label
 
@@ -120,7 +122,7 @@ ReadRequest = Model(
 _Run = Model(
     "RunOptions",
     __base__=Strict,
-    **_fields(option for option in _HTTP if option.place != "read" and not option.is_upload),
+    **_fields(option for option in _HTTP if option.place != "read" and not (option.is_upload or option.is_map)),
 )
 
 
@@ -145,7 +147,18 @@ class RunRequest(_Run, _Common):  # type: ignore[misc, valid-type]
     """How to run: the options of `hsloc replay`."""
 
 
-_Job = Model("JobOptions", __base__=RunRequest, **_fields(option for option in _HTTP if option.is_upload))
+_Job = Model(
+    "JobOptions", __base__=RunRequest, **_fields(option for option in _HTTP if option.is_upload or option.is_map)
+)
+
+
+ALIGNED: dict[str, Any] = {
+    "mode": {"enum": ["auto", "slam"]},
+    "mapper": {"enum": ["graph", None]},
+    "config": {"properties": {"mapper": {"enum": ["graph"]}}},
+    "resume": {"type": "null"},
+}
+"""What other fields may be beside `align_to`, as JSON Schema."""
 
 
 class JobRequest(_Job):  # type: ignore[misc, valid-type]
@@ -161,8 +174,13 @@ class JobRequest(_Job):  # type: ignore[misc, valid-type]
             "then": {
                 "properties": {
                     "map": {"type": "null"},
+                    "align_to": {"type": "null"},
                     "mapper": {"enum": ["graph", None]},
                 }
+            },
+            "else": {
+                "if": {"required": ["align_to"], "properties": {"align_to": {"type": "object"}}},
+                "then": {"properties": ALIGNED},
             },
             "examples": [
                 {"log": "3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f", "seed": 7},
@@ -172,6 +190,13 @@ class JobRequest(_Job):  # type: ignore[misc, valid-type]
                     "resume": "c7a1d3e5-6f80-4912-b3c4-d5e6f7a8b9c0",
                     "mode": "slam",
                 },
+                {
+                    "log": "3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f",
+                    "align_to": {
+                        "yaml": "5d2e8b90-1c3f-4b6a-9d77-e4f5a6b7c8d9",
+                        "image": "9b1f2c8e-4a0d-4f7e-8a55-2c7d9e0f1a2b",
+                    },
+                },
             ],
         }
     )
@@ -180,7 +205,6 @@ class JobRequest(_Job):  # type: ignore[misc, valid-type]
     logs: Annotated[list[Ident], Field(min_length=1, max_length=MAX_LOGS, json_schema_extra=UNIQUE)] | None = Field(
         default=None, description="ids of several uploaded logs that are parts of one run, as `hsloc replay a b`"
     )
-    map: MapFiles | None = Field(default=None, description="map; default: the one in the log")
 
     @model_validator(mode="after")
     def _one_way(self) -> JobRequest:
@@ -195,6 +219,15 @@ class JobRequest(_Job):  # type: ignore[misc, valid-type]
             )
         if self.resume is not None and self.mapper == "point":
             raise PydanticCustomError("resume", "a map is extended by the graph mapper; leave out `resume` or `mapper`")
+        if self.align_to is None:
+            return self
+        point = "point" in (self.mapper, (self.config or {}).get("mapper"))
+        if point or self.resume is not None or self.mode == "localise":
+            raise PydanticCustomError(
+                "align_to",
+                "a map that the graph mapper builds is aligned to a plan; leave out `align_to`, or `resume`, mode "
+                "`localise` and mapper `point`",
+            )
         return self
 
 
@@ -205,8 +238,6 @@ _Rerun = Model(
 
 class RerunRequest(_Rerun, _Common):  # type: ignore[misc, valid-type]
     """What to change in a job that is run again; its logs, and all that is left out, stay, in `read` as well."""
-
-    map: MapFiles | None = Field(default=None, description="map; null for the one in the log")
 
 
 Verdict = Literal["good", "check", "failed"]
@@ -332,38 +363,6 @@ class SecretView(BaseModel):
     """The key of the webhooks' HMAC-SHA256."""
 
     secret: str
-
-
-class Info(BaseModel):
-    """About this server, for whoever asks."""
-
-    version: str
-    tenant: str
-    scopes: list[str]
-    slots: int
-    busy: int
-    queued: int
-    max_upload_bytes: int
-    free_bytes: int
-    upload_bytes: int = Field(description="what your uploads take")
-    result_bytes: int = Field(description="what the results of your jobs take")
-    quota_bytes: int = Field(description="what both may take together")
-
-
-class Options(BaseModel):
-    """The options of a job, and the parameters that it may set in `config`."""
-
-    run: list[dict[str, Any]] = Field(
-        description="the options of a run: name, kind, group, help, choices, default, for a form"
-    )
-    config_schema: dict[str, Any] = Field(description="JSON Schema of `config`")
-    presets: dict[str, Any] = Field(description="the effective configuration of each preset")
-
-
-class Health(BaseModel):
-    """Alive, or ready to work."""
-
-    status: Literal["ok"]
 
 
 Request = TypeVar("Request", bound=RunRequest)

@@ -22,11 +22,8 @@ from hsloc_service.http import metrics
 from hsloc_service.http.context import Admin, Context, Ctx, Reader, problems
 from hsloc_service.http.schemas import (
     UUID_PATTERN,
-    Health,
     Ident,
-    Info,
     LabelList,
-    Options,
     Problem,
     SecretView,
     known_moment,
@@ -42,6 +39,38 @@ if TYPE_CHECKING:
 
 router = APIRouter(tags=["system"])
 MAX_COMPARED = 100
+
+
+class Info(BaseModel):
+    """About this server, for whoever asks."""
+
+    version: str
+    tenant: str
+    scopes: list[str]
+    slots: int
+    busy: int
+    queued: int
+    max_upload_bytes: int
+    free_bytes: int
+    upload_bytes: int = Field(description="what your uploads take")
+    result_bytes: int = Field(description="what the results of your jobs take")
+    quota_bytes: int = Field(description="what both may take together")
+
+
+class Options(BaseModel):
+    """The options of a job, and the parameters that it may set in `config`."""
+
+    run: list[dict[str, Any]] = Field(
+        description="the options of a run: name, kind, group, help, choices, default, for a form"
+    )
+    config_schema: dict[str, Any] = Field(description="JSON Schema of `config`")
+    presets: dict[str, Any] = Field(description="the effective configuration of each preset")
+
+
+class Health(BaseModel):
+    """Alive, or ready to work."""
+
+    status: Literal["ok"]
 
 
 class SeedTable(BaseModel):

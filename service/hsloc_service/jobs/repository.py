@@ -26,7 +26,7 @@ from hsloc_service.db.tables import (
 from hsloc_service.errors import ServiceError, busy, conflict, not_found
 from hsloc_service.jobs.events import record
 from hsloc_service.results.deletion_queue import removal_of
-from hsloc_service.stored_request import MAP_STATE, UPLOADS, logs_of
+from hsloc_service.stored_request import MAP_STATE, MAPS, UPLOADS, logs_of
 from hsloc_service.uploads.repository import need_quota
 from hsloc_service.webhooks import queue_webhook
 
@@ -236,9 +236,9 @@ class Jobs:
     ) -> JobRow:
         """Queue a job in the caller's transaction, which holds the tenant's lock. Raises ServiceError."""
         logs = [_complete_file(session, who, ident, "log") for ident in logs_of(request)]
-        if request.get("map") is not None:
-            _complete_file(session, who, request["map"]["yaml"], "map.yaml")
-            _complete_file(session, who, request["map"]["image"], "map.image")
+        for name in MAPS:
+            for part, ident in (request.get(name) or {}).items():
+                _complete_file(session, who, ident, f"{name}.{part}")
         for name in UPLOADS:
             if request.get(name) is not None:
                 _complete_file(session, who, request[name], name)

@@ -17,7 +17,7 @@ import * as sweeps from "./sweeps.js";
 const EVERY_MS = 3000;
 const ID = /^[0-9a-f-]{36}$/; // of a job: what is in the address becomes part of a request's path
 const SECRET = /^hss_[\w-]{43}$/; // of a link
-const OF_FILES = ["log", "map", "reference", "relations", "calibration", "resume", "webhook"]; // ids that say nothing to people
+const OF_FILES = ["log", "map", "align_to", "reference", "relations", "calibration", "resume", "webhook"]; // ids that say nothing to people
 let comparison = null;
 
 // --- token -----------------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import * as parameters from "./parameters.js";
 import * as sweeps from "./sweeps.js";
 import { upload } from "./upload.js";
 
+const MAPS = { map: "map", align_to: "floor plan" }; // options of two files, and what they are called
 let uploading = null;
 const sent = new WeakMap(); // files that were uploaded, with their ids: the same choice is not sent twice
 
@@ -79,14 +80,16 @@ async function requests() {
     }
     return sent.get(file);
   };
-  const map = [...$("map").files];
-  if (map.length) {
-    const yaml = map.find((file) => /\.ya?ml$/i.test(file.name)), image = map.find((file) => file !== yaml);
-    if (!yaml || !image || map.length !== 2) throw new SyntaxError("a map is two files: its YAML and its image");
-    wanted.map = { yaml: await send(yaml), image: await send(image) };
-  } else if ($("stored-map").value) {
-    const [yaml, image] = $("stored-map").value.split(" ");
-    wanted.map = { yaml, image };
+  for (const [name, what] of Object.entries(MAPS)) {
+    const chosen = [...$(name).files];
+    if (chosen.length) {
+      const yaml = chosen.find((file) => /\.ya?ml$/i.test(file.name)), image = chosen.find((file) => file !== yaml);
+      if (!yaml || !image || chosen.length !== 2) throw new SyntaxError(`a ${what} is two files: its YAML and its image`);
+      wanted[name] = { yaml: await send(yaml), image: await send(image) };
+    } else if ($(`stored-${name}`).value) {
+      const [yaml, image] = $(`stored-${name}`).value.split(" ");
+      wanted[name] = { yaml, image };
+    }
   }
   const others = ["relations", "reference", "calibration"].filter((name) => $(name).files.length);
   for (const name of others) wanted[name] = await send($(name).files[0]);
@@ -128,7 +131,7 @@ async function submit() {
 // An upload may have been deleted: the next attempt sends all of them again.
 function forget(error) {
   if (!error.status) return;
-  for (const name of ["log", "map", "relations", "reference", "calibration"]) for (const file of $(name).files) sent.delete(file);
+  for (const name of ["log", ...Object.keys(MAPS), "relations", "reference", "calibration"]) for (const file of $(name).files) sent.delete(file);
 }
 
 async function inspect() {
@@ -158,7 +161,7 @@ async function reusable() {
   const { jobs } = await get("/v1/jobs?limit=200&state=succeeded&brief=true");
   const built = jobs.filter((job) => job.summary?.mode === "slam" && job.request.mapper !== "point" && job.request.config?.mapper !== "point");
   fill($("stored"), "none", logs);
-  fill($("stored-map"), "none", maps);
+  for (const name of Object.keys(MAPS)) fill($(`stored-${name}`), "none", maps);
   fill($("resume"), "none", built.map((job) => [job.id, `${job.log}, ${when(job.created)}`]));
 }
 

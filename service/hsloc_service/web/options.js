@@ -2,7 +2,7 @@
 
 import { config, finder } from "./parameters.js";
 
-const FILES = ["relations", "reference", "calibration", "resume"]; // chosen elsewhere on the page
+const FILES = ["map", "align_to", "relations", "reference", "calibration", "resume"]; // chosen elsewhere on the page
 
 function control(option) {
   let made;

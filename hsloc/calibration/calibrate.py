@@ -20,13 +20,12 @@ from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.options import AUTO
 from hsloc.preprocessing.odometry import ContinuousOdometry
-from hsloc.preprocessing.scans import pair
+from hsloc.preprocessing.scans import half_sweep_ns, pair
 from hsloc.replay.clock_offset import open_as_meant
 from hsloc.replay.engine import replay
 from hsloc.replay.map_and_start import find_start, load_grid
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.slam.mapper import Mapper
-from hsloc.slam.time_offset import half_sweep_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

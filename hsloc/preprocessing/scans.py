@@ -43,6 +43,8 @@ _WAITING_SWEEPS = 16
 """Maximum number of scans that wait for odometry; then the odometry until now is used. Internal: bounds the memory."""
 _LONGEST_SWEEP_NS = 2_000_000_000
 """Maximum duration of a sweep. Internal: no lidar turns more slowly, a longer one is an error of the log."""
+_LONGEST_HALF_S = 0.5
+"""Half of a sweep that is longer (s) is an error of time_increment, not a lidar that turns so slowly."""
 
 _JITTER = 0.1
 """Tolerance for jitter of stamps as a ratio to the period.
@@ -168,6 +170,12 @@ def _sweep_ns(scan: Scan) -> int:
     """Time from the first beam to the last; negative where the last one was first."""
     sweep = (len(scan.ranges) - 1) * scan.time_increment * 1e9
     return round(sweep) if abs(sweep) <= _LONGEST_SWEEP_NS else 0
+
+
+def half_sweep_ns(scan: Scan) -> int:
+    """From the first beam to the middle of a scan: a lidar that turns shows the heading of then (ns)."""
+    half = 0.5 * max(len(scan.ranges) - 1, 0) * scan.time_increment
+    return round(half * 1e9) if abs(half) <= _LONGEST_HALF_S else 0
 
 
 def _is_covered(scan: Scan, latest: Odometry) -> bool:

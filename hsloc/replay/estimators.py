@@ -13,6 +13,7 @@ from hsloc.interrupts import interrupts_held_back
 from hsloc.matching.window import Window
 from hsloc.model.events import Heading, Odometry
 from hsloc.model.pose2 import IDENTITY
+from hsloc.preprocessing.body_returns import without_beams
 from hsloc.preprocessing.left_out_hits import without_body, without_isolated
 from hsloc.preprocessing.odometry import OdometryWatch
 from hsloc.replay.map_and_start import load_grid, resumed
@@ -22,7 +23,9 @@ from hsloc.slam.point_mapper import PointMapper
 from hsloc.slam.stated_loops import StatedLoops
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
+
+    from numpy.typing import NDArray
 
     from hsloc.localisation.localiser import Localiser
     from hsloc.log import Log
@@ -35,17 +38,20 @@ if TYPE_CHECKING:
     from hsloc.slam.map_state import MapState
 
 
-def events_of(request: RunRequest, log: Log, lidar_only: bool, localise: bool) -> Iterable[Event]:
+def events_of(
+    request: RunRequest, log: Log, lidar_only: bool, localise: bool, own: Mapping[str, NDArray[np.bool_]]
+) -> Iterable[Event]:
     """The events of the log; its odometry watched, or left out, or replaced for a localiser by that of the scans.
 
-    Headings stay, unless the scans alone are asked for.
+    Headings stay, unless the scans alone are asked for. `own` are the beams that are left out.
     """
+    recorded = without_beams(log.events(), own) if own else log.events()
     if not lidar_only:
         # The point mapper cannot do without odometry, whatever that is like.
-        events = log.events() if request.config.mapper == "point" and not localise else OdometryWatch(log.events())
+        events = recorded if request.config.mapper == "point" and not localise else OdometryWatch(recorded)
         return without_body(events) if localise else without_isolated(events)
     unused = (Odometry, Heading) if request.no_odometry else (Odometry,)
-    events = (event for event in log.events() if not isinstance(event, unused))
+    events = (event for event in recorded if not isinstance(event, unused))
     if localise:
         rng = np.random.default_rng((request.seed, 1))
         return with_laser_odometry(without_body(events), request.config.graph_mapper.front_end, rng)

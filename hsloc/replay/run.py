@@ -11,6 +11,7 @@ from hsloc.errors import ConfigError
 from hsloc.garbage_collection import rarely_collected
 from hsloc.kernels.cache import compilation_reported
 from hsloc.model.events import Scan
+from hsloc.preprocessing.body_returns import body_beams, body_warnings
 from hsloc.preprocessing.odometry import ContinuousOdometry, UnusableOdometry
 from hsloc.preprocessing.scans import ScanWatch
 from hsloc.replay.clock_offset import (
@@ -310,9 +311,12 @@ def _run_with(
     else:
         localiser, likelihood, estimator = None, None, make_mapper(request, state, lidar_only)
     first = None if lidar_only else first_odometry(log.events())
+    # A localiser leaves them out as it goes.
+    own = {} if localise else body_beams(log.events())
+    warnings = (*warnings, *body_warnings(own))
     prepared = time.perf_counter()
     history = RunHistory(request.config.localiser.smoothing_model() if localise else None)
-    events = ContinuousOdometry(events_of(request, log, lidar_only, localise), log.summary.odom_topic)
+    events = ContinuousOdometry(events_of(request, log, lidar_only, localise, own), log.summary.odom_topic)
     watch = ScanWatch(events, log.summary.scan_topic)
     watched = events if lidar_only else watch
     # Turns that were joined of segments are known beam by beam; a whole turn is deskewed if the user asks for it.

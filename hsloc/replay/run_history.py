@@ -23,6 +23,7 @@ from hsloc.model.estimate import ScanDiagnostics, State, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
 from hsloc.model.pose2 import Pose2, compose_poses
 from hsloc.model.trajectory import Trajectory
+from hsloc.preprocessing.scans import half_sweep_ns
 from hsloc.replay.matched_scans import are_matched, is_lost, mean_fitness
 from hsloc.slam.time_offset import (
     LEAST_AGREEMENT,
@@ -32,7 +33,6 @@ from hsloc.slam.time_offset import (
     agreement,
     find_drift,
     find_offset,
-    half_sweep_ns,
     thinned,
 )
 

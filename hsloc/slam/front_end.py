@@ -134,6 +134,9 @@ _SLIP = 0.3
 """Standard deviation [m] of a motion that the scans contradict, without saying what it was."""
 _SLIP_ANGLE = 0.3
 """And of its turn [rad]."""
+_LONGEST_SLIP_M = 5.0
+"""Way [m] that wheels may slip in a step, at most. Scans may be 2.8 m apart in logs of which only some were kept (ACES,
+every fourth scan: with 2.5 m its map is lost); over gaps of 10 m and more look-alikes were taken for the same place."""
 _BASIN = 0.3
 """Half-width [m] of a window from whose centre the registration finds its way: its first gate."""
 _BASIN_ANGLE = 0.2
@@ -311,14 +314,10 @@ class FrontEnd:
             return best, evaluations
         local = self._maps[0][0].field
         fitness = local.fitness(points, best.pose)
-        # Wheels may have slipped all the way.
-        slip = p.wide_window + self._T_map_key.distance(predicted)
-        wide = Window(
-            predicted,
-            max(window.half_x, slip),
-            max(window.half_y, slip),
-            max(window.half_theta, p.wide_window_angle),
-        )
+        # Wheels may have slipped all the way. Farther away are other places, which may look alike after a gap.
+        slip = max(p.wide_window, p.no_odometry_window) + min(self._T_map_key.distance(predicted), _LONGEST_SLIP_M)
+        window = replace(window, half_x=min(window.half_x, slip), half_y=min(window.half_y, slip))
+        wide = Window(predicted, slip, slip, max(window.half_theta, p.wide_window_angle))
         for hide, box in ((p.hide, window), (p.hide_wide, wide)):
             (start,), _, spent = hide.match_boxes(points, local, [box], self._rng)
             evaluations += spent

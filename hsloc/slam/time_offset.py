@@ -18,6 +18,7 @@ import numpy as np
 from hsloc.log import LONGEST_OFFSET_S, open_log
 from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.options import AUTO
+from hsloc.preprocessing.scans import half_sweep_ns
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -44,8 +45,6 @@ _NEAR_S = 0.5
 """Half-width of the search where nothing is known of the clocks but that the run did not get lost (s)."""
 _LEAST_TURNED = 1.0
 """Sum of rotation (rad) without which the offset is not determined."""
-_LONGEST_HALF_S = 0.5
-"""Half of a sweep that is longer (s) is an error of time_increment, not a lidar that turns so slowly."""
 _MIN_STEPS = 20
 _SPARSE_S = 0.25
 """Time (s) between messages beyond which the odometry is not interpolated: half-way it would miss 8 mrad of a turn that
@@ -55,6 +54,8 @@ _HUBER = 1.345
 LEAST_AGREEMENT = 0.8
 """Correlation of the rotations of scans and odometry from which on an offset is believed: what is left explains a third
 of the rotation at most. Offsets of scans whose angles are wrong reach less."""
+_GAP = 5.0
+"""Ratio of the time between scans to the usual one from which on it is a gap: matches say little across it."""
 _CORRELATED_S = 0.5
 """Time (s) over which rotations are correlated: longer than the noise of a scan, shorter than a turn."""
 SIGNIFICANT = 4.0
@@ -189,7 +190,6 @@ def estimate_offset(
     The whole range of `RANGE_S` is searched; where two offsets fit nearly alike, the smaller one counts.
     """
     odometry: list[tuple[int, float]] = []
-
     middles: dict[int, int] = {}
     halves: list[int] = []
 
@@ -214,7 +214,7 @@ def estimate_offset(
     if not scans or not odometry:
         return UNKNOWN
     turns, odometry_turns = _headings(scans), _headings(odometry)
-    found = _best_offset(turns, odometry_turns)
+    found = best_offset(turns, odometry_turns)
     if agreement(turns, odometry_turns, found.seconds) >= LEAST_AGREEMENT:
         half = float(np.median(halves)) / NANOSECONDS
         return found._replace(drift_s=find_drift(turns, odometry_turns, found.seconds), half_sweep_s=half)
@@ -225,17 +225,20 @@ def estimate_offset(
     return UNKNOWN
 
 
-def _best_offset(turns: Headings, odometry: Headings) -> Offset:
+def best_offset(turns: Headings, odometry: Headings) -> Offset:
+    """The offset over the whole range of `RANGE_S`; a small one, unless it explains the rotation much worse."""
     # By steps of half a second and more the rotation stands out of the noise of single scans.
     steps = turns if _is_sparse(odometry, turns) else thinned(turns)
     near = find_offset(steps, odometry)
+    # Turns in a building are alike: what scans got wrong at one of them is no reason to look for the next one.
+    is_near = isfinite(near.sigma) and abs(near.seconds) < _NEAR_S
+    if is_near and agreement(turns, odometry, near.seconds) >= LEAST_AGREEMENT:
+        return near
     whole = find_offset(steps, odometry, near_s=RANGE_S)
     if not isfinite(whole.sigma):
         return near
     limit = 1.2 * _misfit(turns, odometry, whole.seconds)
-    if isfinite(near.sigma) and _misfit(turns, odometry, near.seconds) <= limit:
-        return near
-    return whole
+    return near if isfinite(near.sigma) and _misfit(turns, odometry, near.seconds) <= limit else whole
 
 
 def find_drift(scans: Headings, odometry: Headings, offset_s: float) -> float:
@@ -259,12 +262,6 @@ def agreement(scans: Headings, odometry: Headings, offset_s: float) -> float:
     if len(seen) < 2:
         return 0.0
     return float(np.sum(seen * turned) / max(sqrt(float(np.sum(seen**2) * np.sum(turned**2))), 1e-12))
-
-
-def half_sweep_ns(scan: Scan) -> int:
-    """From the first beam to the middle of a scan: a lidar that turns shows the heading of then (ns)."""
-    half = 0.5 * max(len(scan.ranges) - 1, 0) * scan.time_increment
-    return round(half * NANOSECONDS) if abs(half) <= _LONGEST_HALF_S else 0
 
 
 def _headings(pairs: list[tuple[int, float]]) -> Headings:
@@ -297,11 +294,13 @@ def _misfit(scans: Headings, odometry: Headings, offset_s: float) -> float:
 
 
 def _rotations(scans: Headings, odometry: Headings, offset_s: float) -> tuple[F64, F64]:
-    """Turns (rad) from scan to scan, by the scans and by the odometry, within its time; an offset is removed."""
+    """Turns (rad) from scan to scan but over gaps, by scans and odometry, within its time; an offset is removed."""
     at = scans.stamps_ns - round(offset_s * NANOSECONDS)
     inside = (at >= odometry.stamps_ns[0]) & (at <= odometry.stamps_ns[-1])
     turned = np.interp(at[inside].astype(np.float64), odometry.stamps_ns.astype(np.float64), odometry.theta)
-    return np.diff(scans.theta[inside]), np.diff(turned)
+    times = np.diff(at[inside])
+    near = times <= _GAP * np.median(times) if len(times) else np.zeros(0, dtype=np.bool_)
+    return np.diff(scans.theta[inside])[near], np.diff(turned)[near]
 
 
 def offsets_of_log(paths: Sequence[Path], options: ReadOptions, parameters: FrontEndParameters) -> dict[str, Offset]:

@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from drives import ape_rmse, drive
+from room_scans import room_scan
 
 from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.model import Odometry, PairedScan, Pose2
+from hsloc.model.pose2 import relative_poses
 from hsloc.simulation.odometer import Slip
 from hsloc.simulation.presets import preset
 from hsloc.slam.calibration import odometry_chi, odometry_scale
@@ -62,3 +64,18 @@ def test_a_lidar_that_sees_four_metres_does_not_shorten_corridors() -> None:
     events, truth = drive("corridor-loop", duration_s=30.0, seed=2, sensor=sensor)
     result = mapped(events)
     assert ape_rmse(events, result.scan_poses, truth) < 0.15
+
+
+def test_after_a_gap_in_the_scans_another_room_is_not_taken_for_the_last_one() -> None:
+    """The window that was searched grew with the step, so that a map was 6 m off where corridors look alike."""
+    mapper = Mapper(GraphMapperParameters(), np.random.default_rng(0))
+    # Equal rooms, the second one entered with a turn; between them the lidar pauses, and the odometry goes on.
+    there = [Pose2(x, 1.5, 0.0) for x in np.arange(2.0, 4.0, 0.2).tolist()]
+    back = [Pose2(x, 2.5, np.pi) for x in np.arange(4.0, 2.0, -0.2).tolist()]
+    moved = Pose2(-5.0, 8.0, 0.0)
+    for k, in_room in enumerate((*there, *back)):
+        scan = replace(room_scan(in_room, noise=0.01, seed=k), stamp_ns=k * 200_000_000)
+        mapper.update(PairedScan(scan, in_room if k < len(there) else moved @ in_room))
+    poses = mapper.finish().scan_poses
+    step = relative_poses(poses[:1], poses[-1:])[0]
+    assert step[:2] == pytest.approx((-5.0 + back[-1].x - there[0].x, 8.0 + 1.0), abs=0.1)

@@ -24,6 +24,7 @@ from hsloc.slam.time_offset import (
     Headings,
     Offset,
     as_option,
+    best_offset,
     clock_warnings,
     estimate_offset,
     find_drift,
@@ -92,6 +93,19 @@ def test_a_robot_that_does_not_turn_does_not_determine_it() -> None:
 def test_clocks_that_are_seconds_apart_are_found_over_the_whole_range() -> None:
     for offset in (-20.0, 3.2, 30.0):
         assert find_offset(*headings(2, offset, 0.002), near_s=40.0).seconds == pytest.approx(offset, abs=0.02)
+
+
+def test_a_turn_that_the_scans_missed_is_not_taken_for_the_next_one() -> None:
+    """Where a lidar paused in a turn, the stamps of a right log were moved by 34.7 s, from corner to corner."""
+    t = np.arange(0.0, 64.0, 0.02)
+    theta = 0.5 * np.pi * np.clip(t[:, None] - np.arange(8.0, 60.0, 16.0), 0.0, 1.0).sum(axis=1)
+    odometry = Headings.of(np.round(t * 1e9).astype(np.int64), theta)
+    random = np.random.default_rng(0)
+    seen = np.concatenate((np.arange(0.0, 24.1, 0.1), np.arange(34.0, 64.0, 0.1)))
+    missed = np.interp(seen, t, theta) - 0.5 * np.pi * (seen > 30.0) + random.normal(0.0, 0.002, len(seen))
+    for late in (0.0, 0.2):
+        found = best_offset(Headings.of(np.round((seen + late) * 1e9).astype(np.int64), missed), odometry)
+        assert found.seconds == pytest.approx(late, abs=0.02)
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.3, -0.5])

@@ -17,7 +17,7 @@ from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
 from hsloc.matching.hide import Hide
 from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.model.events import PairedScan
-from hsloc.model.pose2 import IDENTITY, Pose2, compose_poses, relative_poses
+from hsloc.model.pose2 import IDENTITY, Pose2, compose_poses, relative_poses, wrap_angles
 from hsloc.slam.keyscans import KeyScans
 from hsloc.slam.loop_closer import LoopCloser
 from hsloc.slam.loop_rounds import close_loops
@@ -52,10 +52,14 @@ _LOOKED = 60
 """Keyscans looked at from each of them, at most."""
 _AROUND = 2
 """Places compared before and after the one that was found."""
-_AGREE = 2
-"""Minimum number of places that a loop connects."""
+_AGREE = 3
+"""Minimum number of places that a loop connects: 9 m. Two ends of corridors looked alike over two places."""
 _SLIP_M = 1.0
 """Motion [m] that wheels slip by at most."""
+_CARRIED_M_S = 2.0
+"""Speed [m/s] at which a robot is carried or pushed at most: that of somebody who walks fast."""
+_SAME_M, _SAME_RAD = 0.5, 0.2
+"""Difference of two places [m, rad] that loops put right by themselves."""
 _PAIRED_M, _CONFLICT_M = 0.3, 0.5
 """Distances [m] from the walls of the other pieces up to which a hit is on one, and from which on it is on none."""
 _SEEN = 30
@@ -86,13 +90,23 @@ def close_and_join(
 def _is_likelier(joined: MapSession, poses: F64, before: F64, parameters: GraphMapperParameters) -> bool:
     """Whether poses (n, 3) with the pieces joined are likelier than those before: nothing speaks against them.
 
-    Robots slip more often than they are carried, and buildings have corridors that look alike: a place that is
-    farther from the odometry's than a slip takes the odometry's to be wrong.
+    Robots slip more often than they are carried, and buildings have corridors that look alike. A place that is farther
+    from the odometry's than a slip takes the time to carry the robot there, and the odometry's to be wrong.
     """
     joints = np.array(joined.joints)
-    there, by_odometry = relative_poses(poses[joints - 1], poses[joints]), joined.steps.measured[joints - 1]
-    is_far = bool((np.hypot(*(there - by_odometry)[:, :2].T) > _SLIP_M).any())
-    if is_far and not _is_contradicted(joined, before, parameters):
+    # Until it is put down scans are refused.
+    fitting = np.append(np.flatnonzero(~joined.refused), len(poses) - 1)
+    down = fitting[np.searchsorted(fitting, joints)]
+    there, then = relative_poses(poses[joints - 1], poses[down]), relative_poses(before[joints - 1], before[down])
+    moved = there - then
+    if (np.hypot(moved[:, 0], moved[:, 1]) < _SAME_M).all() and (np.abs(wrap_angles(moved[:, 2])) < _SAME_RAD).all():
+        return False
+    by_odometry = relative_poses(poses[joints - 1], poses[joints]) - joined.steps.measured[joints - 1]
+    far = np.hypot(by_odometry[:, 0], by_odometry[:, 1]) > _SLIP_M
+    seconds = (joined.stamps_ns[down] - joined.stamps_ns[joints - 1]) * 1e-9
+    if (far & (np.hypot(there[:, 0], there[:, 1]) > _SLIP_M + _CARRIED_M_S * seconds)).any():
+        return False
+    if far.any() and not _is_contradicted(joined, before, parameters):
         return False
     return not _is_contradicted(joined, poses, parameters)
 

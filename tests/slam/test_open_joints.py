@@ -33,9 +33,13 @@ def line(begin: tuple[float, float], end: tuple[float, float]) -> NDArray[np.flo
 
 
 def session(
-    true: NDArray[np.float64], cut: int, odometry_at_cut: tuple[float, float, float], walls: object
+    true: NDArray[np.float64],
+    cut: int,
+    odometry_at_cut: tuple[float, float, float],
+    walls: object,
+    seconds: float = 30.0,
 ) -> MapSession:
-    """A drive whose step to keyscan `cut` the scans refuse, and of which odometry says `odometry_at_cut`."""
+    """A drive whose step to keyscan `cut` the scans refuse: it takes `seconds`, and odometry says `odometry_at_cut`."""
     n = len(true)
     scans = [KeyScan.of(seen(np.asarray(walls), Pose2.from_array(pose), Pose2(), 0.0).scan) for pose in true]
     motions = np.concatenate((np.zeros((1, 3)), relative_poses(true[:-1], true[1:])))
@@ -48,6 +52,7 @@ def session(
     places = Submaps.split_by_path_length(poses, motions, covariances, 3.0, 0.3, refused, 5.0)
     steps = Edges.chain(motions[1:], covariances[1:], refused[1:])
     stamps = np.arange(n) * 200_000_000
+    stamps[cut:] += round(seconds * 1e9)
     return MapSession(KeyScans.from_scans(scans), stamps, poses, motions, covariances, refused, steps, places)
 
 
@@ -86,3 +91,9 @@ def test_a_room_like_the_first_stays_where_odometry_has_it() -> None:
     found, poses, loops = joined(session(true, len(FIRST), at_cut, beside(WALLS, 30.0)))
     assert (found.joints, loops) == ((), 0)
     assert np.hypot(*(poses - true)[:, :2].T).max() < 0.1
+
+
+def test_nobody_carries_a_robot_12_m_in_a_second() -> None:
+    true = np.concatenate((FIRST, line((4.0, 12.5), (4.0, 3.0)), line((4.0, 3.0), (10.0, 3.0))))
+    found, _, loops = joined(session(true, len(FIRST), (0.0, 0.0, 0.0), WALLS, seconds=1.0))
+    assert (found.joints, loops) == ((), 0)

@@ -14,7 +14,7 @@ from hsloc.matching.window import Window
 from hsloc.model.events import Heading, Odometry
 from hsloc.model.pose2 import IDENTITY
 from hsloc.preprocessing.body_returns import without_beams
-from hsloc.preprocessing.left_out_hits import without_body, without_isolated
+from hsloc.preprocessing.left_out_hits import without_isolated
 from hsloc.preprocessing.odometry import OdometryWatch
 from hsloc.replay.map_and_start import load_grid, resumed
 from hsloc.slam.laser_odometry import with_laser_odometry
@@ -49,12 +49,12 @@ def events_of(
     if not lidar_only:
         # The point mapper cannot do without odometry, whatever that is like.
         events = recorded if request.config.mapper == "point" and not localise else OdometryWatch(recorded)
-        return without_body(events) if localise else without_isolated(events)
+        return events if localise else without_isolated(events)
     unused = (Odometry, Heading) if request.no_odometry else (Odometry,)
     events = (event for event in recorded if not isinstance(event, unused))
     if localise:
         rng = np.random.default_rng((request.seed, 1))
-        return with_laser_odometry(without_body(events), request.config.graph_mapper.front_end, rng)
+        return with_laser_odometry(events, request.config.graph_mapper.front_end, rng)
     return without_isolated(events)
 
 

@@ -311,8 +311,7 @@ def _run_with(
     else:
         localiser, likelihood, estimator = None, None, make_mapper(request, state, lidar_only)
     first = None if lidar_only else first_odometry(log.events())
-    # A localiser leaves them out as it goes.
-    own = {} if localise else body_beams(log.events())
+    own = body_beams(log.events())
     warnings = (*warnings, *body_warnings(own))
     prepared = time.perf_counter()
     history = RunHistory(request.config.localiser.smoothing_model() if localise else None)

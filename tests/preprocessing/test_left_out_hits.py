@@ -1,4 +1,4 @@
-"""Hits at the body of the robot are left out of scans, and lone ones where they are many, as in rain or dust."""
+"""Lone hits are left out of scans where they are many, as in rain or dust."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hsloc.model import Odometry, Pose2, Scan
-from hsloc.preprocessing.left_out_hits import without_body, without_isolated
+from hsloc.preprocessing.left_out_hits import without_isolated
 
 ROOM = (3.0 / np.maximum(*np.abs([np.cos(np.radians(np.arange(360))), np.sin(np.radians(np.arange(360)))]))).astype(
     "f4"
@@ -49,28 +49,3 @@ def test_a_robot_that_waits_among_thin_things_keeps_them() -> None:
     (clean, _), (thin, _) = scan_with(9), scan_with(60)
     scans = [*[clean] * 200, *[thin] * 150]
     assert all(kept is scan for kept, scan in zip(without_isolated(scans), scans, strict=True))
-
-
-def with_body(beams: slice, at: float, scale: float = 1.0) -> Scan:
-    """The room, `scale` times as large, with some beams that end at a body."""
-    ranges = (scale * ROOM).astype(np.float32)
-    ranges[beams] = at
-    return Scan(0, ranges, 0.0, np.radians(1.0), 0.1, 10.0)
-
-
-def test_the_body_is_left_out_as_long_as_it_stays_where_it_is() -> None:
-    body = slice(100, 200)
-    scans = [with_body(body, 0.25), with_body(body, 0.26, 0.9), with_body(body, 0.4, 0.9), with_body(body, 0.25, 0.8)]
-    first, second, gone, back = without_body(scans)
-    for found, scan in ((first, scans[0]), (second, scans[1])):
-        assert isinstance(found, Scan)
-        assert np.isnan(found.ranges[body]).all()
-        assert np.array_equal(np.delete(found.ranges, np.arange(100, 200)), np.delete(scan.ranges, np.arange(100, 200)))
-    assert gone is scans[2], "no body moves"
-    assert back is scans[3]
-
-
-@pytest.mark.parametrize(("beams", "at"), [(slice(0, 250), 0.3), (slice(0, 90), 0.6)])
-def test_what_is_all_around_or_farther_away_is_no_body(beams: slice, at: float) -> None:
-    scan = with_body(beams, at)
-    assert all(found is scan for found in without_body([scan, scan]))

@@ -226,6 +226,8 @@ def _of_the_map(mapping: MappingResult, result: Result) -> list[VerdictReason]:
 def _map_remedy(code: str, result: Result) -> str:
     if code in {"blind", "no-returns"}:
         return _RANGES_REMEDY
+    if code == "relocated":
+        return "look at the places on the map; where it is wrong, --forbid-loop T1,T2, or cut the log (--start, --end)"
     without_odometry = "" if result.lidar_only else " --no-odom,"
     return f"look at the places on the map; try another --seed,{without_odometry} or a cut of the log (--start, --end)"
 

@@ -119,12 +119,27 @@ class MapSession:
         places = Submaps.split_by_path_length(
             poses, self.motions, covariances, length, turn, self.refused, parameters.loops.refused_path_length, gaps
         )
+        reference = self.places.reference
+        known = tuple(
+            between_places(
+                int(reference[loop.first]), int(reference[loop.second]), loop.T_first_second, loop.covariance, poses,
+                places, loop.reason,
+            )
+            for loop in self.known
+        )  # fmt: skip
+        asserted, forbidden = (
+            tuple((places.place_of(int(reference[i])), places.place_of(int(reference[j]))) for i, j in pairs)
+            for pairs in (self.asserted, self.forbidden)
+        )
         return replace(
             self,
             poses=poses,
             covariances=covariances,
             steps=replace(self.steps, information=information),
             places=places,
+            known=known,
+            asserted=asserted,
+            forbidden=forbidden,
             joints=tuple(joints),
         )
 

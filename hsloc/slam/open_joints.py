@@ -117,6 +117,8 @@ def _is_contradicted(session: MapSession, poses: F64, parameters: GraphMapperPar
     for begin, end in pairwise(ends):
         others = np.concatenate((np.arange(begin), np.arange(end, len(poses))))
         grid = _grid_of(session, poses, others, parameters)
+        if not grid.occupied().any():
+            continue
         field, open_ground = LikelihoodField.from_grid(grid), grid.free()
         inconsistent = 0.0
         for k in range(begin, end):

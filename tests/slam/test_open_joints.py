@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -91,6 +92,16 @@ def test_a_room_like_the_first_stays_where_odometry_has_it() -> None:
     found, poses, loops = joined(session(true, len(FIRST), at_cut, beside(WALLS, 30.0)))
     assert (found.joints, loops) == ((), 0)
     assert np.hypot(*(poses - true)[:, :2].T).max() < 0.1
+
+
+def test_a_piece_is_not_found_where_the_user_says_that_it_is_elsewhere() -> None:
+    """The places of stated loops are numbered anew as pieces become places of their own."""
+    second = np.concatenate((line((4.0, 12.5), (4.0, 3.0)), line((4.0, 3.0), (10.0, 3.0))))
+    log = session(np.concatenate((FIRST, second)), len(FIRST), (0.0, 0.0, 0.0), WALLS)
+    cut = log.places.place_of(len(FIRST))
+    pairs = tuple((i, j) for i in range(cut + 1) for j in range(cut, len(log.places)))
+    found, _, loops = joined(replace(log, forbidden=pairs))
+    assert (found.joints, loops) == ((), 0)
 
 
 def test_nobody_carries_a_robot_12_m_in_a_second() -> None:

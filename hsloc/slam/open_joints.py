@@ -44,12 +44,14 @@ _LOOPS = 2
 """Loops that hold a step which the scans refused; a single one shares out the errors of what it spans."""
 _LEAST_M = 9.0
 """Length of a piece [m] that is searched for: three places."""
-_MOST_PIECES = 20
+_MOST_PIECES = 4
 """Pieces that are searched for, the longest. Internal: time, where the scans of a whole log refuse its steps."""
-_ATTEMPTS = 10
+_ATTEMPTS = 4
 """Places of a piece, evenly chosen, from which the map is searched: it may begin outside of what was drawn."""
-_LOOKED = 60
+_LOOKED = 30
 """Keyscans looked at from each of them, at most."""
+_MOST_BOXES = 1_000_000
+"""Boxes of poses in a search of the map, about a tenth of a second: what takes more fits badly everywhere."""
 _AROUND = 2
 """Places compared before and after the one that was found."""
 _AGREE = 3
@@ -242,7 +244,7 @@ def _next_piece(
         return []
     noise = parameters.front_end.odometry_noise
     field = LikelihoodField.from_grid(grid)
-    relocaliser = Relocaliser(grid, field, Hide(), RelocaliserParameters(), noise, rng)
+    relocaliser = Relocaliser(grid, field, Hide(), RelocaliserParameters(search_boxes=_MOST_BOXES), noise, rng)
     for k in sorted(left, key=lambda k: -len(pieces.of[k])):
         piece = pieces.of[k]
         for T_map_piece, scan in _relocalised(session, poses, piece, relocaliser):

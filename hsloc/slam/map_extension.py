@@ -18,11 +18,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.random import Generator
+    from numpy.typing import NDArray
 
+    from hsloc.slam.keyscans import KeyScans
     from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_session import MapSession
     from hsloc.slam.map_state import MapState
     from hsloc.slam.parameters import GraphMapperParameters, Resume
+
+    F64 = NDArray[np.float64]
 
 _ATTEMPTS = 10
 """Places of the log, evenly chosen, from which the map is searched: it may begin outside of what was drawn."""
@@ -66,11 +70,24 @@ def _relocalised(
     noise = parameters.front_end.odometry_noise
     relocaliser = Relocaliser(resume.state.grid, resume.field, resume.matcher, resume.relocaliser, noise, rng)
     starts = log.places.start[:-1]
-    for begin in starts[np.unique(np.linspace(0, len(starts) - 1, _ATTEMPTS).astype(np.int64))]:
+    begins = starts[np.unique(np.linspace(0, len(starts) - 1, _ATTEMPTS).astype(np.int64))]
+    return places_on_map(
+        log.scans, log.poses, [range(k, min(k + _LOOKED, len(log.poses))) for k in begins.tolist()], relocaliser
+    )
+
+
+def places_on_map(
+    scans: KeyScans, poses: F64, tried: list[range], relocaliser: Relocaliser
+) -> Iterator[tuple[Pose2, int]]:
+    """T_map_front, for each run of keyscans that is `tried`, and the keyscan at which the relocaliser was sure.
+
+    `poses` (n, 3) are those of the keyscans in their own frame.
+    """
+    for run in tried:
         relocaliser.start()
-        for scan in range(int(begin), min(int(begin) + _LOOKED, len(log.poses))):
-            T_front_base = Pose2.from_array(log.poses[scan])
-            verdict = relocaliser.update(PairedScan(log.scans.scan(scan), T_front_base), 0)
+        for scan in run:
+            T_front_base = Pose2.from_array(poses[scan])
+            verdict = relocaliser.update(PairedScan(scans.scan(scan), T_front_base), 0)
             if verdict.is_sure and verdict.pose is not None:
                 yield verdict.pose @ T_front_base.inverse(), scan
                 break

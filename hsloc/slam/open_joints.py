@@ -16,16 +16,16 @@ import numpy as np
 from hsloc.localisation.relocaliser import Relocaliser, RelocaliserParameters
 from hsloc.matching.hide import Hide
 from hsloc.matching.likelihood_field import LikelihoodField
-from hsloc.model.events import PairedScan
 from hsloc.model.pose2 import IDENTITY, Pose2, compose_poses, relative_poses, wrap_angles
 from hsloc.slam.keyscans import KeyScans
 from hsloc.slam.loop_closer import LoopCloser
 from hsloc.slam.loop_rounds import close_loops
+from hsloc.slam.map_extension import places_on_map
 from hsloc.slam.map_session import between_places
 from hsloc.slam.occupancy_mapper import build_grid
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from numpy.random import Generator
     from numpy.typing import NDArray
@@ -247,29 +247,17 @@ def _next_piece(
     relocaliser = Relocaliser(grid, field, Hide(), RelocaliserParameters(search_boxes=_MOST_BOXES), noise, rng)
     for k in sorted(left, key=lambda k: -len(pieces.of[k])):
         piece = pieces.of[k]
-        for T_map_piece, scan in _relocalised(session, poses, piece, relocaliser):
+        starts = session.places.start
+        starts = starts[(starts >= piece.start) & (starts < piece.stop)]
+        begins = starts[np.unique(np.linspace(0, len(starts) - 1, _ATTEMPTS).astype(np.int64))]
+        tried = [range(begin, min(begin + _LOOKED, piece.stop)) for begin in begins.tolist()]
+        for T_map_piece, scan in places_on_map(session.scans, poses, tried, relocaliser):
             at[piece.start : piece.stop] = compose_poses(T_map_piece.to_array(), poses[piece.start : piece.stop])
             loops = _verified(session, at, members, piece, scan, parameters, rng)
             if loops:
                 pieces.T_map_piece[k] = T_map_piece
                 return loops
     return []
-
-
-def _relocalised(
-    session: MapSession, poses: F64, piece: range, relocaliser: Relocaliser
-) -> Iterator[tuple[Pose2, int]]:
-    """T_map_piece, and the keyscan at which it was sure."""
-    start = session.places.start
-    starts = start[(start >= piece.start) & (start < piece.stop)]
-    for begin in starts[np.unique(np.linspace(0, len(starts) - 1, _ATTEMPTS).astype(np.int64))].tolist():
-        relocaliser.start()
-        for scan in range(begin, min(begin + _LOOKED, piece.stop)):
-            T_piece_base = Pose2.from_array(poses[scan])
-            verdict = relocaliser.update(PairedScan(session.scans.scan(scan), T_piece_base), 0)
-            if verdict.is_sure and verdict.pose is not None:
-                yield verdict.pose @ T_piece_base.inverse(), scan
-                break
 
 
 def _verified(

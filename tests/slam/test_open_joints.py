@@ -95,7 +95,7 @@ def test_a_room_like_the_first_stays_where_odometry_has_it() -> None:
 
 
 def test_a_piece_is_not_found_where_the_user_says_that_it_is_elsewhere() -> None:
-    """The places of stated loops are numbered anew as pieces become places of their own."""
+    """The places of stated loops get other numbers as pieces become places of their own."""
     second = np.concatenate((line((4.0, 12.5), (4.0, 3.0)), line((4.0, 3.0), (10.0, 3.0))))
     log = session(np.concatenate((FIRST, second)), len(FIRST), (0.0, 0.0, 0.0), WALLS)
     cut = log.places.place_of(len(FIRST))

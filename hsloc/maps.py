@@ -50,8 +50,21 @@ class MapMetadata:
 
 
 def map_file(path: Path) -> Path:
-    """The file meant by --map: in a folder of results its map.yaml."""
-    return path / "map.yaml" if path.is_dir() else path
+    """The file meant by --map: in a folder of results its map.yaml, of an image the YAML beside it.
+
+    Raises MapError where there is none.
+    """
+    if path.is_dir():
+        inside = path / "map.yaml"
+        if not inside.exists():
+            raise MapError(f"{path}: a folder without a map.yaml; name a map, or the folder of a mapping run")
+        return inside
+    if path.suffix.lower() in IMAGES:
+        beside = path.with_suffix(".yaml")
+        if not beside.exists():
+            raise MapError(f"{path}: is the image of a map; its resolution and origin should be in {beside}")
+        return beside
+    return path
 
 
 def read_metadata(path: Path) -> MapMetadata:
@@ -165,16 +178,9 @@ def load_map(path: Path | str) -> OccupancyGrid:
 def read_map(path: Path | str) -> LoadedMap:
     """Read map.yaml and its image (PGM plain or raw, PNG, BMP), as nav2's map_io does.
 
-    An image may be named too, if its YAML stands beside it. Raises MapError.
+    A folder or an image may be named too, as for `map_file`. Raises MapError.
     """
-    path = Path(path)
-    if path.suffix.lower() in IMAGES:
-        beside = path.with_suffix(".yaml")
-        if not beside.exists():
-            raise MapError(f"{path}: is the image of a map; its resolution and origin should be in {beside}")
-        path = beside
-    if path.is_dir():
-        raise MapError(f"{path}: is a folder; name the map's .yaml file")
+    path = map_file(Path(path))
     metadata = read_metadata(path)
     pixels = _read_image(path, metadata)
     cells = _cells(metadata, pixels.shade, pixels.opaque)

@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser, door: Door = "replay") -> Non
     )
     output.add_argument("--overwrite", action="store_true", help="Replace the folder if it exists.")
     output.add_argument("--json", action="store_true", help="Print the metrics as JSON on stdout.")
-    output.add_argument("-q", "--quiet", action="store_true", help="Print errors only.")
+    output.add_argument("-q", "--quiet", action="store_true", help="Print losses and errors only.")
     output.add_argument("-v", "--verbose", action="store_true", help="Print what was found in the log, too.")
     add_no_progress(output)
     add_options(parser, door)
@@ -98,13 +98,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _warn(result: Result, warnings: tuple[RunWarning, ...], arguments: argparse.Namespace) -> None:
-    """Warnings and losses, on stderr."""
-    if arguments.quiet:
+    """Warnings and losses, on stderr; with --quiet losses only, which an exit code stands for."""
+    if arguments.quiet and not result.losses.data_lost:
         return
-    print_warnings(warnings)
     candidates = result.summary.reference_candidates
-    if result.reference is None and candidates:
-        print(f"hsloc: the log has poses to compare with: --truth-topic {' or '.join(candidates)}", file=sys.stderr)
+    if not arguments.quiet:
+        print_warnings(warnings)
+        if result.reference is None and candidates:
+            print(f"hsloc: the log has poses to compare with: --truth-topic {' or '.join(candidates)}", file=sys.stderr)
     lines = result.losses.lines()
     for line in lines:
         print(f"hsloc: log: {line}", file=sys.stderr)

@@ -11,7 +11,7 @@ from zipfile import ZipFile
 from hsloc.cli.arguments import add_no_progress, add_options, add_service, service_client, values
 from hsloc.cli.output import print_job
 from hsloc.cli.progress import ProgressLine
-from hsloc.errors import LogError
+from hsloc.errors import LogError, MapError
 from hsloc.options import BY_NAME, MATCHER_ALIASES, merged
 
 if TYPE_CHECKING:
@@ -119,6 +119,8 @@ def request_of(given: Mapping[str, Any], upload: Callable[[Path], str]) -> dict[
             from hsloc.maps import map_file, read_metadata
 
             path = map_file(value)
+            if path.suffix == ".npz":
+                raise MapError(f"{path}: a service takes a map as YAML and image; name the map.yaml beside it")
             image = read_metadata(path).image
             request[name] = {"yaml": upload(path), "image": upload(image)}
         elif name == "config":

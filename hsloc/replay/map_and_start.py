@@ -54,11 +54,7 @@ _GIVE_START = "give the start with --initial-pose"
 def map_files(path: Path) -> list[Path]:
     """The files that a map consists of: its YAML and its picture, or its map.npz."""
     file = map_file(path)
-    if file.suffix == ".npz":
-        return [file]
-    beside = file.with_suffix(".yaml")
-    # As read_map has it: an image may be named, too, with its YAML beside it.
-    return [file, read_metadata(file).image] if file.suffix in (".yaml", ".yml") else [beside, file]
+    return [file] if file.suffix == ".npz" else [file, read_metadata(file).image]
 
 
 def state_file(path: Path) -> Path:
@@ -94,8 +90,6 @@ def load_grid(path: Path) -> tuple[OccupancyGrid, tuple[RunWarning, ...]]:
     file = map_file(path)
     if file.suffix == ".npz":
         return read_state(file).grid, ()
-    if path.is_dir() and not file.exists():
-        raise MapError(f"{path}: a folder without a map.yaml; name a map, or the folder of a mapping run")
     loaded = read_map(file)
     return loaded.grid, loaded.warnings
 

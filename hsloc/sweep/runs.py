@@ -22,9 +22,8 @@ from hsloc.config import to_dict
 from hsloc.errors import HslocError, no_such
 from hsloc.export.results_folder import write_results
 from hsloc.log import open_log
-from hsloc.maps import map_file
 from hsloc.options import OPTIONS
-from hsloc.replay.map_and_start import state_file
+from hsloc.replay.map_and_start import map_files, state_file
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
 from hsloc.run_metrics import RunMetrics, RunTimings
@@ -236,7 +235,7 @@ def run_key(request: RunRequest, hashes: dict[Path, str] | None = None, remote: 
     for name in ("map_path", "align_to"):
         given: Path | None = getattr(request, name)
         if given is not None:
-            values[name] = [given.name, *(_digest(part, hashes) for part in _map_files(given))]
+            values[name] = [given.name, *(_digest(part, hashes) for part in map_files(given))]
     if request.resume is not None:
         values["resume"] = [request.resume.name, _digest(state_file(request.resume), hashes)]
     for name in ("relations", "reference", "calibration"):
@@ -262,17 +261,6 @@ def request_values(request: RunRequest) -> dict[str, Any]:
             else:
                 values[item.name] = value.name if isinstance(value, Path) else to_dict(value)
     return values
-
-
-def _map_files(path: Path) -> list[Path]:
-    """The YAML, and the images beside it that it may mean."""
-    path = map_file(path)
-    images = [part for part in path.parent.glob("*") if part.suffix.lower() in (".pgm", ".png", ".bmp")]
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        text = ""
-    return [path, *sorted(part for part in images if part.name in text)]
 
 
 def _digest(path: Path, hashes: dict[Path, str]) -> str:

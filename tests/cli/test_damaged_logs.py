@@ -117,8 +117,11 @@ def test_of_a_damaged_log_what_is_whole_is_used_and_the_loss_is_named(
         # The start is at the end of the file. Without it the scans give the right pose, less precisely.
         assert metrics["ape"]["trans_part"]["rmse"] < 0.05
         start = f"2.6,8.1,{math.pi / 2}"
-        code, out, _ = run(capsys, "replay", path, "--json", "--out", tmp_path / "given", "--initial-pose", start)
+        given = ("--out", tmp_path / "given", "--initial-pose", start)
+        code, out, err = run(capsys, "replay", path, "--json", "-q", *given)
         assert code == 3
+        assert words in err  # Quiet, but not about a loss.
+        assert "warning" not in err
         metrics = json.loads(out)
     assert metrics["ape"]["trans_part"]["rmse"] < 0.02
 

@@ -13,7 +13,7 @@ from paths import RECORDINGS
 
 from hsloc.cli.main import COMMANDS, build_parser, main
 from hsloc.cli.submit import packed, request_of
-from hsloc.errors import LogError
+from hsloc.errors import LogError, MapError
 from hsloc.options import BY_NAME, OPTIONS, offered
 
 if TYPE_CHECKING:
@@ -70,11 +70,14 @@ def test_submit_sends_the_options(tmp_path: Path) -> None:
     yaml = "image: %s\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
     (tmp_path / "map.yaml").write_text(yaml % "walls.png")
     (tmp_path / "plan.yaml").write_text(yaml % "plan.pgm")
-    given = {"map": tmp_path, "align_to": tmp_path / "plan.yaml"}  # a folder of results has its map.yaml
+    # A folder of results has its map.yaml, an image its YAML beside it.
+    given = {"map": tmp_path, "align_to": tmp_path / "plan.pgm"}
     assert request_of(given, lambda path: f"id of {path.name}") == {
         "map": {"yaml": "id of map.yaml", "image": "id of walls.png"},
         "align_to": {"yaml": "id of plan.yaml", "image": "id of plan.pgm"},
     }
+    with pytest.raises(MapError, match=r"a service takes a map as YAML and image"):
+        request_of({"map": tmp_path / "map.npz"}, str)
     given = {"start_s": 2.0, "reference": "/vicon"}
     assert request_of(given, str) == {"read": {"start_s": 2.0, "truth_topic": "/vicon"}}
 

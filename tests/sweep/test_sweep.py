@@ -107,7 +107,8 @@ def test_the_bytes_of_all_files_are_in_the_key(tmp_path: Path) -> None:
     images = [path.with_suffix(".pgm") for path in charts.values()]
     for image, yaml in zip(images, charts.values(), strict=True):
         image.write_bytes(b"P5")
-        yaml.write_text(f"image: {image.name}\n")
+        numbers = "resolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+        yaml.write_text(f"image: {image.name}\n{numbers}")
     others: dict[str, Any] = {name: tmp_path / name for name in ("relations", "reference", "calibration")}
     for path in others.values():
         path.write_text("lidars: {/scan: {x: 0.1}}\n")

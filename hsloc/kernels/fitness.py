@@ -139,7 +139,8 @@ def score_with_noise(ranges: F32, range_min: float, range_max: float, increment:
         count += 1
     if count < _FEWEST_TRIPLES:
         return 1.0
-    part = np.median(off[:count] / away[:count]) / _NORMAL_QUARTILE
+    ratios = np.sort(off[:count] / away[:count])
+    part = 0.5 * (ratios[(count - 1) // 2] + ratios[count // 2]) / _NORMAL_QUARTILE  # `np.median` brings SciPy with it.
     total, kept = 0.0, 0
     for i in range(count):
         if off[i] < _EDGE * max(part * away[i], _LEAST_NOISE_M):

@@ -80,6 +80,26 @@ def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(
     assert found == [1, 20]
 
 
+def test_kernels_from_the_cache_are_loaded_without_the_compiler() -> None:
+    """A search, which allocates and draws random numbers, imports neither numba's declarations nor SciPy's."""
+    code = (
+        "import sys, numpy as np\n"
+        "from hsloc.matching import Hide, LikelihoodField, Window\n"
+        "from hsloc.model import OccupancyGrid, Pose2\n"
+        "cells = np.zeros((40, 40), dtype=np.int8)\n"
+        "cells[5, 5:30] = cells[5:30, 5] = 100\n"
+        "points, window = np.argwhere(cells) * 0.05, Window(Pose2(), 0.1, 0.1, 0.1)\n"
+        "field = LikelihoodField.from_grid(OccupancyGrid(cells, 0.05))\n"
+        "match = Hide().match(points, field, window, np.random.default_rng(0))\n"
+        "print(f'{match.fitness:.9f}', 'scipy.linalg' in sys.modules)\n"
+    )
+    first, second = (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+        for _ in range(2)
+    )
+    assert second == [first[0], "False"]
+
+
 def test_compilation_is_reported_and_cached_kernels_are_not() -> None:
     counts: list[int] = []
     kernel = numba.njit(lambda x: x + 1)

@@ -8,6 +8,7 @@ stand inside `run`, so that `hsloc --help` answers at once.
 from __future__ import annotations
 
 import argparse
+import atexit
 import difflib
 import errno
 import importlib
@@ -16,7 +17,9 @@ import os
 import re
 import signal
 import sys
+import threading
 import warnings
+from contextlib import suppress
 from io import TextIOWrapper
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -196,7 +199,18 @@ def program() -> None:
         sys.stdout.flush()
     except OSError:  # Reported already; Python itself would report what is left again, with another exit code.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    sys.exit(status)
+    _leave(status)
+
+
+def _leave(status: int) -> NoReturn:
+    """End the process without freeing each object before, which takes a quarter of a second of what numba holds."""
+    if threading.active_count() > 1:
+        sys.exit(status)  # It waits for them.
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, AttributeError):  # A stream that was closed from the start is None.
+            stream.flush()
+    os._exit(status)
 
 
 if __name__ == "__main__":

@@ -41,6 +41,7 @@ _SETTLED = 5
 _NAMED = 3
 """Places that are named where several fit."""
 _CONTRADICTED = "scans fit, but by the odometry other stretches of the run are elsewhere"
+_OTHER_MAP = "scans fit, but not for long: the map may be of another place"
 _MIRRORED = "the scans fit the map better when they are mirrored"
 USABLE_SHARE = 0.5
 """Least share of localised poses of a result that is usable as a whole."""
@@ -165,8 +166,7 @@ class StateLog:
     def join_tracks(self, odometry: F64, model: MotionModel, grid: OccupancyGrid) -> None:
         """Weigh the tracks of the run against each other by the odometry (n, 3) between them and the map."""
         rows, owners = self._tracks()
-        count = sum(row.begins for row in rows)
-        if len(odometry) == 0 or count == 0 or (count == 1 and self._estimates[-1].status is not Status.SEARCHING):
+        if len(odometry) == 0 or not rows:
             return
         self._begins = joined_begins((self._estimates, self._counts, owners), rows, odometry, model, grid)
 
@@ -219,7 +219,8 @@ class StateLog:
             probability[k] = probabilities[owner, 0] * kept
             state, reason = _judge(probabilities[owner], sigma[k], usual, rows[: owner + 1])
             if probability[k] < CONFIDENCE <= own[owner, 0]:
-                state, reason = State.LOST, _MIRRORED if mirrored > 1.0 - CONFIDENCE else _CONTRADICTED
+                contradicted = _OTHER_MAP if self._begins is not None and len(self._begins) == 1 else _CONTRADICTED
+                state, reason = State.LOST, _MIRRORED if mirrored > 1.0 - CONFIDENCE else contradicted
             states.append(state)
             reasons.append(reason or estimate.reason)
         fitness = np.array([np.nan if e.fitness is None else e.fitness for e in self._estimates])

@@ -143,14 +143,15 @@ class Track:
     def on_another_map(self, way: Way, went_on: float) -> float:
         """The same on a map of another building: there other places often fit as well, and soon the scans do not.
 
-        `went_on` is how far the robot drove on mapped ground after it (m).
+        `went_on` is how far the robot drove on mapped ground after it (m). A track may be astray from its beginning
+        there, above all from a start that is given.
         """
         rivalled = sum(each.rival > NOT_UNIQUE for each in self.said)
         unique = sum(rival_evidence(each.rival) > 0.99 * MOST_FROM_RIVAL for each in self.said)
         of_rivals = min(max(_RIVALLED**rivalled * _UNRIVALLED**unique, 1.0 / _MOST_RIVALLED), _MOST_RIVALLED)
         metres = float(np.diff(way.metres(np.array((self.enters, self.leaves))))[0])
         lasts = max(exp(-metres / _ALIKE_M), _LEAST_LASTS)
-        return self.look_alike() * of_rivals * lasts * (_ENDS if went_on > _OVER_M else 1.0)
+        return self.look_alike() * of_rivals * lasts * (_ENDS if went_on > _OVER_M else 1.0) + self.astray
 
 
 class MappedGround:

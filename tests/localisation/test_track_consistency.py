@@ -13,7 +13,7 @@ from hsloc.localisation import track_consistency
 from hsloc.localisation.kalman_filter import predict_covariance
 from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.localisation.odometry_errors import Errors, Way
-from hsloc.localisation.states import StateLog
+from hsloc.localisation.states import StateLog, StateRows
 from hsloc.localisation.track_consistency import MappedGround, Track, right_tracks
 from hsloc.localisation.track_evidence import PRIOR
 from hsloc.model import Estimate, Evidence, OccupancyGrid, Pose2, State, Status
@@ -126,18 +126,40 @@ def test_beams_behind_walls_and_places_that_fit_as_well_are_those_of_look_alikes
 
 
 def test_on_another_map_other_places_fit_and_tracks_end() -> None:
-    way, track = Way.of(along(), OdometryNoise()), a_track(0, 9, said=said())
+    way, track = Way.of(along(), OdometryNoise()), a_track(0, 9, said=said(), astray=0.0)
     lasted = exp(-9 * STEP / 20.0)
     assert track.on_another_map(way, 0.0) == pytest.approx(lasted * track.look_alike())
     for rival, ratio in ((1.0, 9.0), (0.85, 0.04), (0.92, 1.0)):
         compared = replace(track, said=said(rival=rival) * 2)
         assert compared.on_another_map(way, 0.0) == pytest.approx(ratio * track.on_another_map(way, 0.0))
     assert track.on_another_map(way, 4.0) == pytest.approx(10.0 * track.on_another_map(way, 2.0))
+    # A start that is given is not on it: the scans do not fit from the beginning.
+    assert replace(track, astray=5.0).on_another_map(way, 0.0) == pytest.approx(5.0 + track.on_another_map(way, 0.0))
     gone_astray = replace(a_track(0, 29), leaves=9, exit=track.exit)
     for over in (gone_astray, replace(track, lost=np.arange(10, 30))):
         for known, metres in ((1.0, 20 * STEP), (0.3, 6 * STEP)):
             pairs = track_consistency._Pairs.of([track, over], way, MappedGround(hall(known)))
             np.testing.assert_allclose(pairs.went_on, (0.0, metres), atol=1e-9)
+
+
+def test_one_track_that_ends_on_mapped_ground_may_be_on_another_map() -> None:
+    odometry = along()
+
+    def states(ends: int, misfit: float) -> StateRows:
+        found = StateLog()
+        for k, row in enumerate(odometry):
+            explained, rival = 0.93 if k < ends else 0.75, 1.0 if k in (10, 16) else float("nan")
+            evidence = Evidence(STEP, explained, misfit, rival=rival)
+            status = Status.RELOCALISED if k == 0 else Status.MATCHED
+            found.add(Estimate(k, Pose2.from_array(row), status, 1e-4 * np.eye(3), 0.9, evidence=evidence), k + 1)
+        found.join_tracks(odometry, OdometryNoise(), hall())
+        return found.at_scans()
+
+    assert states(61, 0.0).is_localised().all()
+    right, wrong = states(25, 0.0), states(25, 0.25)
+    assert right.is_localised()[:16].all()
+    assert not wrong.is_localised().any()
+    assert "another place" in wrong.reason[0]
 
 
 def test_evidence_that_is_overwhelming_stays_a_number() -> None:

@@ -150,6 +150,46 @@ def score_with_noise(ranges: F32, range_min: float, range_max: float, increment:
 
 
 @njit(cache=True, nogil=True)
+def range_noise(ranges: F32, range_min: float, range_max: float, increment: float, noise: F64) -> None:
+    """Write the standard deviation of each range (m), as those around it show it, to `noise` (n,); 0 where unknown.
+
+    Inverse ranges of a straight wall are a sinusoid of the bearing, so that `u[i-1] - 2 cos(increment) u[i] + u[i+1]`
+    is zero but for the noise. Edges are left aside.
+    """
+    n = len(ranges)
+    middle = 2.0 * cos(increment)
+    off = np.zeros(n)
+    parts = np.empty(n)
+    count = 0
+    for i in range(1, n - 1):
+        before, here, after = np.float64(ranges[i - 1]), np.float64(ranges[i]), np.float64(ranges[i + 1])
+        low, high = min(before, here, after), max(before, here, after)
+        if low >= range_min and high <= range_max and low > 0.0 and before + here + after < np.inf:
+            bent = 1.0 / before - middle / here + 1.0 / after
+            off[i] = max(abs(bent) * here * here / sqrt(2.0 + middle * middle), 1e-9)
+            parts[count] = off[i] / here
+            count += 1
+    noise[:] = 0.0
+    if count < _FEWEST_TRIPLES:
+        return
+    part = np.median(parts[:count]) / _NORMAL_QUARTILE
+    for i in range(n):
+        if off[i] >= _EDGE * max(part * np.float64(ranges[i]), _LEAST_NOISE_M):
+            off[i] = 0.0
+    beside = min(max(int(_SLOPE / max(abs(increment), 1e-9)), 2), _MOST_BESIDE)
+    squares, known = 0.0, 0
+    for i in range(-beside, n):
+        if i + beside < n and off[i + beside] > 0.0:
+            squares += off[i + beside] ** 2
+            known += 1
+        if i - beside > 0 and off[i - beside - 1] > 0.0:
+            squares -= off[i - beside - 1] ** 2
+            known -= 1
+        if i >= 0 and known >= _FEWEST_BESIDE:
+            noise[i] = sqrt(max(squares, 0.0) / known)
+
+
+@njit(cache=True, nogil=True)
 def normal_equations(
     packed: F32, points: F32, x: float, y: float, theta: float, information: F64, gradient: F64
 ) -> float:

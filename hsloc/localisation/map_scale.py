@@ -52,7 +52,7 @@ _REACH_M, _LEAST_STEP_M = 0.3, 0.05
 _ON_WALL = 0.6
 """Score that a point reaches where it is moved onto a wall, at least."""
 _ROBUST_M = 0.1
-"""Distance from the wall at which a point counts by half (m): Cauchy's weight."""
+"""Distance from the wall, or noise of the range, at which a point counts by half (m): Cauchy's weight."""
 _LARGEST_PRIOR = 0.1
 """Standard deviation of the scale before anything is known; larger ones are not followed by the localiser."""
 _MOST_CELLS_OFF = 1.5
@@ -169,11 +169,13 @@ class MapScaleEstimator:
         beams, ranges = beams[on_walls], ranges[on_walls]
         distance, found = self._distances(scaled, normals, pose)
         step = np.hypot(*np.diff(scaled, axis=0, prepend=scaled[:1]).T)
-        weight = np.minimum(step / self._field.resolution, 1.0) * found / (1.0 + (distance / _ROBUST_M) ** 2)
+        squares = distance**2 + paired.noise()[on_walls] ** 2
+        weight = np.minimum(step / self._field.resolution, 1.0) * found / (1.0 + squares / _ROBUST_M**2)
         self._add_walls(scaled, normals, np.where(found, distance, np.inf), pose)
         across = (normals * beams).sum(axis=1)
         turned = normals[:, 1] * scaled[:, 0] - normals[:, 0] * scaled[:, 1]
-        by = np.column_stack((normals, turned, across, across / ranges))
+        # The range by the map: the noise of the measured one is in the distance, too, and would pass for a scale.
+        by = np.column_stack((normals, turned, across + np.where(found, distance, 0.0), across / ranges))
         full, right = by.T @ (weight[:, None] * by), by.T @ (weight * distance)
         # The pose is eliminated; directions that no wall holds say nothing of the scale.
         gain = np.linalg.solve(full[:3, :3] + 1e-3 * np.eye(3), full[:3, 3:])

@@ -108,6 +108,16 @@ class Scan:
         c, s = np.cos(theta), np.sin(theta)
         return np.column_stack((x + c * points[:, 0] - s * points[:, 1], y + s * points[:, 0] + c * points[:, 1]))
 
+    def noise(self) -> NDArray[np.float64]:
+        """The standard deviation of the range of each point of `points_base` (m), shape (m,); 0 where not known."""
+        from hsloc.kernels.fitness import range_noise
+
+        found = np.empty(len(self.ranges))
+        limits = float(self.range_min), float(self.range_max)
+        range_noise(np.ascontiguousarray(self.ranges), *limits, float(self.angle_increment), found)
+        known: NDArray[np.float64] = found[self.hits()]
+        return known
+
 
 @lru_cache(maxsize=16)
 def _directions(beams: int, angle_min: float, increment: float) -> NDArray[np.float64]:
@@ -139,6 +149,10 @@ class PairedScan:
         if not self.companions:
             return points
         return np.concatenate((points, *(self.to(other) @ other.scan.points_base() for other in self.companions)))
+
+    def noise(self) -> NDArray[np.float64]:
+        """The standard deviation of the range of each point of `points_base` (m), shape (m,); 0 where not known."""
+        return np.concatenate([each.scan.noise() for each in (self, *self.companions)])
 
     def to(self, other: PairedScan) -> Pose2:
         """How the base moved from this scan to another, by odometry."""

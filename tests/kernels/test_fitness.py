@@ -8,7 +8,15 @@ import naive
 import numpy as np
 import pytest
 
-from hsloc.kernels.fitness import fitness_many, normal_equations, pack, point_scores, score_sum, score_with_noise
+from hsloc.kernels.fitness import (
+    fitness_many,
+    normal_equations,
+    pack,
+    point_scores,
+    range_noise,
+    score_sum,
+    score_with_noise,
+)
 from hsloc.kernels.levenberg_marquardt import polish, solve_damped
 
 if TYPE_CHECKING:
@@ -141,7 +149,29 @@ def test_what_noise_leaves_of_the_scores_shows_in_the_scan_itself(noise: float, 
     assert score_with_noise(ranges, 0.1, 30.0, np.radians(1.0), 0.2) == pytest.approx(found, abs=0.02)
 
 
+@pytest.mark.parametrize(("noise", "part"), [(0.01, 0.0), (0.0, 0.025)])
+def test_each_range_shows_its_noise_by_those_around_it(noise: float, part: float) -> None:
+    rng = np.random.default_rng(5)
+    angles = np.radians(np.arange(0.0, 360.0, 0.5))
+    with np.errstate(divide="ignore"):  # a hall of 18 x 6 m, from its middle
+        true = np.minimum(9.0 / np.abs(np.cos(angles)), 3.0 / np.abs(np.sin(angles)))
+    clear, found = np.empty(720), np.empty((12, 720))
+    range_noise(true.astype(np.float32), 0.1, 30.0, np.radians(0.5), clear)
+    assert np.median(clear) < 1e-5  # straight walls have none, at any angle
+    assert clear.max() < 0.005  # and corners hardly any
+    for row in found:
+        ranges = (true + (noise + part * true) * rng.standard_normal(720)).astype(np.float32)
+        ranges[rng.random(720) < 0.1] = np.nan
+        range_noise(ranges, 0.1, 30.0, np.radians(0.5), row)
+    near, far = found[:, true < 3.2], found[:, np.abs(np.cos(angles)) > 0.98]
+    assert near.mean() == pytest.approx(noise + 3.1 * part, rel=0.1)
+    assert far.mean() == pytest.approx(noise + 9.1 * part, rel=0.1)
+
+
 def test_too_few_returns_do_not_show_the_noise() -> None:
     ranges = np.full(360, np.inf, dtype=np.float32)
     ranges[:9] = 2.0
     assert score_with_noise(ranges, 0.1, 30.0, np.radians(1.0), 0.2) == 1.0
+    noise = np.ones(360)
+    range_noise(ranges, 0.1, 30.0, np.radians(1.0), noise)
+    assert not noise.any()

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from room_scans import DEGREE, room_scan
+from rooms import seen, walls
 
 from hsloc.localisation.map_scale import MapScale, MapScaleEstimator
 from hsloc.matching import LikelihoodField
@@ -42,6 +43,26 @@ def test_the_scale_is_found(scale: float) -> None:
     assert found.value == pytest.approx(scale, abs=0.004)
     assert found.is_significant == (scale != 1.0)
     assert found.sigma < 0.01
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.02])
+def test_the_noise_of_a_low_cost_lidar_is_no_scale(scale: float) -> None:
+    # In a corridor all walls are about as far away, and the noise of the ranges differs more than these do.
+    corners = [(0.0, 0.0), (24.0, 0.0), (24.0, 2.0), (13.0, 2.0), (13.0, 2.4), (12.0, 2.4), (12.0, 2.0), (0.0, 2.0)]
+    segments = walls(*corners)
+    rng, grid = np.random.default_rng(7), World("corridor", segments, np.zeros((2, 2))).occupancy_grid(0.05)
+    found = MapScaleEstimator(LikelihoodField.from_grid(replace(grid, resolution=scale * 0.05)), (0.0, 0.0))
+    for k in range(60):
+        place = Pose2(1.5 + 21.0 * rng.random(), 1.0 + 0.2 * np.sin(k), 0.9 * k)
+        paired = seen(segments, place, place, 0.0, beams=360)
+        ranges = (paired.scan.ranges * (1.0 + 0.025 * rng.standard_normal(360))).astype(np.float32)
+        found.move(3.0)
+        x, y = scale * (np.array((place.x, place.y)) - grid.origin.to_array()[:2]) + grid.origin.to_array()[:2]
+        found.matched(replace(paired, scan=replace(paired.scan, ranges=ranges)), Pose2(x, y, place.theta))
+    estimate = found.estimate()
+    assert estimate is not None
+    assert estimate.value == pytest.approx(scale, abs=0.004)
+    assert abs(estimate.value - scale) < 2.0 * estimate.sigma
 
 
 def test_walls_that_are_drawn_where_they_are_become_surer() -> None:

@@ -20,12 +20,12 @@ Kind = Literal["choice", "number", "whole", "pose", "switch", "text", "topics", 
 or with commas), a file or folder, or KEY=VALUE (repeatable)."""
 Place = Literal["run", "read", "config", "check"]
 """What an option belongs to: the request itself, its `read`, its `config`, or the limits that a result must keep."""
-Door = Literal["replay", "map", "sweep", "submit", "http"]
+Interface = Literal["replay", "map", "sweep", "submit", "http"]
 """What offers an option."""
 
-COMMANDS: frozenset[Door] = frozenset({"replay", "map", "sweep", "submit"})
-EVERYWHERE: frozenset[Door] = COMMANDS | {"http"}
-ONE_RUN: frozenset[Door] = EVERYWHERE - {"sweep"}
+COMMANDS: frozenset[Interface] = frozenset({"replay", "map", "sweep", "submit"})
+EVERYWHERE: frozenset[Interface] = COMMANDS | {"http"}
+ONE_RUN: frozenset[Interface] = EVERYWHERE - {"sweep"}
 
 MODES = ("auto", "localise", "slam")
 MATCHERS = ("hide", "harmony_search", "icp", "exact")
@@ -56,7 +56,7 @@ class Option:
     help: str
     place: Place = "run"
     group: str = ""
-    doors: frozenset[Door] = EVERYWHERE
+    interfaces: frozenset[Interface] = EVERYWHERE
     default: Any = None
     metavar: str | None = None
     choices: tuple[str, ...] = ()
@@ -80,7 +80,7 @@ class Option:
     @property
     def is_upload(self) -> bool:
         """Whether HTTP takes the id of one uploaded file."""
-        return "http" in self.doors and self.name in ("relations", "reference", "calibration")
+        return "http" in self.interfaces and self.name in ("relations", "reference", "calibration")
 
 
 _READING, _ALGORITHMS, _LIMITS = "reading the log", "algorithms", "limits for unattended use (exit code 4)"
@@ -96,7 +96,7 @@ OPTIONS: tuple[Option, ...] = (
         http="Ids of the two uploaded files of a map to localise on, its YAML and its image (default: the log's).",
     ),
     Option(
-        name="resume", flag="--resume", kind="path", metavar="MAP", doors=ONE_RUN,
+        name="resume", flag="--resume", kind="path", metavar="MAP", interfaces=ONE_RUN,
         help="Earlier mapping run whose map is extended: its folder or map.npz; with submit the id of its job.",
         http="Id of a job of yours that built a map, which is extended: the new one is in its frame. With mode "
         "localise the robot is localised on it.",
@@ -109,13 +109,13 @@ OPTIONS: tuple[Option, ...] = (
         "graph mapper builds is brought into its frame.",
     ),
     Option(
-        name="assert_loop", flag="--assert-loop", kind="topics", metavar="T1,T2", doors=ONE_RUN,
+        name="assert_loop", flag="--assert-loop", kind="topics", metavar="T1,T2", interfaces=ONE_RUN,
         help="When mapping: the robot was at one place at these two times [s after the beginning of the log] "
         "(repeatable).",
         http="Times of one place when mapping, `t1,t2` in seconds after the beginning of the log; several with commas.",
     ),
     Option(
-        name="forbid_loop", flag="--forbid-loop", kind="topics", metavar="T1,T2", doors=ONE_RUN,
+        name="forbid_loop", flag="--forbid-loop", kind="topics", metavar="T1,T2", interfaces=ONE_RUN,
         help="When mapping: the robot was at two places at these two times, however alike they look (repeatable).",
         http="Times of two places that look alike, `t1,t2` in seconds after the beginning of the log; several with "
         "commas.",
@@ -210,7 +210,7 @@ OPTIONS: tuple[Option, ...] = (
     ),
     Option(
         name="duration_s", flag="--duration", kind="number", metavar="S", place="read", group=_READING,
-        doors=COMMANDS, instead_of="end",
+        interfaces=COMMANDS, instead_of="end",
         help="End this many seconds after --start [s].",
     ),
     Option(
@@ -237,11 +237,11 @@ OPTIONS: tuple[Option, ...] = (
     ),
     Option(
         name="set", flag="--set", kind="settings", metavar="KEY=VALUE", place="config", group=_ALGORITHMS,
-        doors=COMMANDS,
+        interfaces=COMMANDS,
         help="Set one parameter, such as hide.budget=400; matcher.budget is that of the chosen matcher; repeatable.",
     ),
     Option(
-        name="seed", flag="--seed", kind="whole", default=0, metavar="N", group=_ALGORITHMS, doors=ONE_RUN,
+        name="seed", flag="--seed", kind="whole", default=0, metavar="N", group=_ALGORITHMS, interfaces=ONE_RUN,
         most=2**53 - 1, help="Seed of all random numbers, a whole number up to 2^53 - 1 (default: 0).",
     ),
     Option(
@@ -265,9 +265,9 @@ OPTIONS: tuple[Option, ...] = (
 BY_NAME: dict[str, Option] = {option.name: option for option in OPTIONS}
 
 
-def offered(door: Door) -> Iterator[Option]:
-    """The options that a door offers."""
-    return (option for option in OPTIONS if door in option.doors)
+def offered(interface: Interface) -> Iterator[Option]:
+    """The options that an interface offers."""
+    return (option for option in OPTIONS if interface in option.interfaces)
 
 
 def describe() -> list[dict[str, Any]]:

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from hsloc.client import Client
     from hsloc.log import ReadOptions
     from hsloc.model.pose2 import Pose2
-    from hsloc.options import Door, Option
+    from hsloc.options import Interface, Option
     from hsloc.request import RunRequest
 
 
-def add_options(parser: argparse.ArgumentParser, door: Door, names: Iterable[str] | None = None) -> None:
-    """The options that `door` offers, or those of them in `names`, in their groups."""
+def add_options(parser: argparse.ArgumentParser, interface: Interface, names: Iterable[str] | None = None) -> None:
+    """The options that `interface` offers, or those of them in `names`, in their groups."""
     groups: dict[str, Any] = {"": parser}
-    chosen = [option for option in offered(door) if names is None or option.name in names]
+    chosen = [option for option in offered(interface) if names is None or option.name in names]
     for option in chosen:
         if option.group not in groups:
             groups[option.group] = parser.add_argument_group(option.group)
@@ -33,18 +33,18 @@ def add_options(parser: argparse.ArgumentParser, door: Door, names: Iterable[str
             if option.instead_of not in groups:
                 groups[option.instead_of] = group.add_mutually_exclusive_group()
             group = groups[option.instead_of]
-        group.add_argument(option.flag, dest=option.name, **_how(option, door))
+        group.add_argument(option.flag, dest=option.name, **_how(option, interface))
 
 
-def _how(option: Option, door: Door) -> dict[str, Any]:
+def _how(option: Option, interface: Interface) -> dict[str, Any]:
     """Arguments of `add_argument`."""
     how: dict[str, Any] = {"help": option.help.replace("%", "%%")}
-    repeated = option.kind in ("settings", "topics") or (door == "sweep" and option.varied)
+    repeated = option.kind in ("settings", "topics") or (interface == "sweep" and option.varied)
     if option.kind == "switch":
         return {**how, "action": "store_true", "default": None}
     if repeated:
         how["action"] = "append"
-    if door == "sweep" and option.varied:
+    if interface == "sweep" and option.varied:
         how["help"] = how["help"].removesuffix(".") + "; may be repeated."
     if option.kind == "choice":
         return {**how, "choices": option.choices}

@@ -15,7 +15,7 @@ from hsloc.cli.progress import ProgressLine
 if TYPE_CHECKING:
     import argparse
 
-    from hsloc.options import Door
+    from hsloc.options import Interface
     from hsloc.replay.run import Progress, Result
     from hsloc.warnings import RunWarning
 
@@ -30,7 +30,7 @@ EXAMPLES = """
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser, door: Door = "replay") -> None:
+def add_arguments(parser: argparse.ArgumentParser, interface: Interface = "replay") -> None:
     """Logs, options of the run, output."""
     parser.add_argument("log", nargs="+", type=Path, help="MCAP, ROS 1 or ROS 2 bag, CARMEN log; several are one run.")
     output = parser.add_argument_group("output")
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser, door: Door = "replay") -> Non
     output.add_argument("-q", "--quiet", action="store_true", help="Print losses and errors only.")
     output.add_argument("-v", "--verbose", action="store_true", help="Print what was found in the log, too.")
     add_no_progress(output)
-    add_options(parser, door)
+    add_options(parser, interface)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""The one door: `open_log` takes whatever holds a recording and gives events of the model."""
+"""`open_log` takes whatever holds a recording and gives events of the model."""
 
 from __future__ import annotations
 

@@ -29,13 +29,13 @@ def flags(command: str) -> dict[str, argparse.Action]:
     return {flag: action for action in actions for flag in action.option_strings}
 
 
-@pytest.mark.parametrize("door", ["replay", "map", "sweep", "submit"])
-def test_every_command_has_the_flags_of_the_table(door: str) -> None:
-    found = flags(door)
-    for option in offered(door):  # type: ignore[arg-type]
+@pytest.mark.parametrize("interface", ["replay", "map", "sweep", "submit"])
+def test_every_command_has_the_flags_of_the_table(interface: str) -> None:
+    found = flags(interface)
+    for option in offered(interface):  # type: ignore[arg-type]
         assert option.flag in found
         assert found[option.flag].dest == option.name
-    others = {option.flag for option in OPTIONS} - {option.flag for option in offered(door)}  # type: ignore[arg-type]
+    others = {option.flag for option in OPTIONS} - {option.flag for option in offered(interface)}  # type: ignore[arg-type]
     assert not others & set(found)
 
 

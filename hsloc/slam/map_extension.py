@@ -15,7 +15,7 @@ from hsloc.slam.loop_closer import LoopCloser
 from hsloc.slam.map_session import concatenate, from_map_state
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from numpy.random import Generator
     from numpy.typing import NDArray
@@ -27,12 +27,13 @@ if TYPE_CHECKING:
     from hsloc.slam.parameters import GraphMapperParameters, Resume
 
     F64 = NDArray[np.float64]
+    I64 = NDArray[np.int64]
 
 _ATTEMPTS = 10
 """Places of the log, evenly chosen, from which the map is searched: it may begin outside of what was drawn."""
 _LOOKED = 60
 """Keyscans looked at from each of them, at most."""
-_AROUND = 2
+AROUND = 2
 """Places compared before and after the one that was found."""
 _AGREE = 2
 """Minimum number of places that a loop connects, where the log has that many."""
@@ -98,11 +99,12 @@ def _verified(both: MapSession, scan: int, parameters: GraphMapperParameters, rn
     first_place = both.first_place
     closer = LoopCloser(both.places, both.scans, parameters.loops, rng, first=first_place)
     place = both.places.place_of(scan)
-    tried = range(max(place - _AROUND, first_place), min(place + _AROUND + 1, len(both.places)))
-    loops: list[Loop] = []
-    connected = 0
-    for near in tried:
-        accepted = [loop for loop in closer.connections(near) if loop.accepted]
-        loops += accepted[:1]
-        connected += bool(accepted)
-    return loops if connected >= min(_AGREE, len(tried)) else []
+    tried = range(max(place - AROUND, first_place), min(place + AROUND + 1, len(both.places)))
+    return loops_of_most(closer, tried, min(_AGREE, len(tried)))
+
+
+def loops_of_most(closer: LoopCloser, tried: Iterable[int], least: int, among: I64 | None = None) -> list[Loop]:
+    """The first accepted loop of each place `tried`, with those `among` others; none if they are fewer than `least`."""
+    accepted = ([loop for loop in closer.connections(place, among) if loop.accepted] for place in tried)
+    loops = [found[0] for found in accepted if found]
+    return loops if len(loops) >= least else []

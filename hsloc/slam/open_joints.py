@@ -20,7 +20,7 @@ from hsloc.model.pose2 import IDENTITY, Pose2, compose_poses, relative_poses, wr
 from hsloc.slam.keyscans import KeyScans
 from hsloc.slam.loop_closer import LoopCloser
 from hsloc.slam.loop_rounds import close_loops
-from hsloc.slam.map_extension import places_on_map
+from hsloc.slam.map_extension import AROUND, loops_of_most, places_on_map
 from hsloc.slam.map_session import between_places
 from hsloc.slam.occupancy_mapper import build_grid
 
@@ -52,8 +52,6 @@ _LOOKED = 30
 """Keyscans looked at from each of them, at most."""
 _MOST_BOXES = 1_000_000
 """Boxes of poses in a search of the map, about a tenth of a second: what takes more fits badly everywhere."""
-_AROUND = 2
-"""Places compared before and after the one that was found."""
 _AGREE = 3
 """Minimum number of places that a loop connects: 9 m. Two ends of corridors looked alike over two places."""
 _SLIP_M = 1.0
@@ -274,11 +272,5 @@ def _verified(
     closer = LoopCloser(places, session.scans, parameters.loops, rng, forbidden=session.forbidden)
     among = np.flatnonzero(np.isin(places.reference, members))
     of_piece = np.flatnonzero((places.reference >= piece.start) & (places.reference < piece.stop))
-    place = places.place_of(scan)
-    loops: list[Loop] = []
-    connected = 0
-    for near in of_piece[np.abs(of_piece - place) <= _AROUND].tolist():
-        accepted = [loop for loop in closer.connections(near, among) if loop.accepted]
-        loops += [replace(loop, reason=JOINED) for loop in accepted[:1]]
-        connected += bool(accepted)
-    return loops if connected >= _AGREE else []
+    near = of_piece[np.abs(of_piece - places.place_of(scan)) <= AROUND].tolist()
+    return [replace(loop, reason=JOINED) for loop in loops_of_most(closer, near, _AGREE, among)]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _ATTEMPTS = 10
 """Places of the log, evenly chosen, from which the map is searched: it may begin outside of what was drawn."""
-_LOOKED = 60
+LOOKED = 60
 """Keyscans looked at from each of them, at most."""
 AROUND = 2
 """Places compared before and after the one that was found."""
@@ -73,7 +73,7 @@ def _relocalised(
     starts = log.places.start[:-1]
     begins = starts[np.unique(np.linspace(0, len(starts) - 1, _ATTEMPTS).astype(np.int64))]
     return places_on_map(
-        log.scans, log.poses, [range(k, min(k + _LOOKED, len(log.poses))) for k in begins.tolist()], relocaliser
+        log.scans, log.poses, [range(k, min(k + LOOKED, len(log.poses))) for k in begins.tolist()], relocaliser
     )
 
 

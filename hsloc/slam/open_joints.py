@@ -20,7 +20,7 @@ from hsloc.model.pose2 import IDENTITY, Pose2, compose_poses, relative_poses, wr
 from hsloc.slam.keyscans import KeyScans
 from hsloc.slam.loop_closer import LoopCloser
 from hsloc.slam.loop_rounds import close_loops
-from hsloc.slam.map_extension import AROUND, loops_of_most, places_on_map
+from hsloc.slam.map_extension import AROUND, LOOKED, loops_of_most, places_on_map
 from hsloc.slam.map_session import between_places
 from hsloc.slam.occupancy_mapper import build_grid
 
@@ -48,8 +48,6 @@ _MOST_PIECES = 4
 """Pieces that are searched for, the longest. Internal: time, where the scans of a whole log refuse its steps."""
 _ATTEMPTS = 4
 """Places of a piece, evenly chosen, from which the map is searched: it may begin outside of what was drawn."""
-_LOOKED = 30
-"""Keyscans looked at from each of them, at most."""
 _MOST_BOXES = 1_000_000
 """Boxes of poses in a search of the map, about a tenth of a second: what takes more fits badly everywhere."""
 _AGREE = 3
@@ -248,7 +246,7 @@ def _next_piece(
         starts = session.places.start
         starts = starts[(starts >= piece.start) & (starts < piece.stop)]
         begins = starts[np.unique(np.linspace(0, len(starts) - 1, _ATTEMPTS).astype(np.int64))]
-        tried = [range(begin, min(begin + _LOOKED, piece.stop)) for begin in begins.tolist()]
+        tried = [range(begin, min(begin + LOOKED, piece.stop)) for begin in begins.tolist()]
         for T_map_piece, scan in places_on_map(session.scans, poses, tried, relocaliser):
             at[piece.start : piece.stop] = compose_poses(T_map_piece.to_array(), poses[piece.start : piece.stop])
             loops = _verified(session, at, members, piece, scan, parameters, rng)

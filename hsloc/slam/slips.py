@@ -21,7 +21,7 @@ from hsloc.kernels.normal_equations import Equations, add_edges
 from hsloc.kernels.registration import composed_motions, displaced_agreement, window_motions
 from hsloc.model.pose2 import relative_poses, wrap_angles
 from hsloc.slam.joint_registration import normal_equations
-from hsloc.slam.marginals import information_of_a_point
+from hsloc.slam.marginals import FLAT_IN_A_STRETCH_M, information_of_a_point
 from hsloc.slam.pose_graph import Edges, anchored
 from hsloc.slam.sparse_solver import BlockSystem
 
@@ -117,7 +117,7 @@ def compare_with_odometry(refined: Registration, steps: Edges) -> Motions:
     ends = stretch_ends(steps, covariances)
     seen, driven = np.empty((2, len(ends), 3))
     seen_covariance, driven_covariance = np.empty((2, len(ends), 3, 3))
-    of_a_point = information_of_a_point(refined)
+    of_a_point = information_of_a_point(refined, FLAT_IN_A_STRETCH_M)
     window_motions(refined.linearised_at, refined.pairs, refined.terms, of_a_point, ends, seen, seen_covariance)
     composed_motions(steps.measured, covariances, ends, driven, driven_covariance)
     difference = seen - driven
@@ -130,7 +130,7 @@ def known_by_scans(motions: Motions, refined: Registration, scans: ScanArrays, o
     """The stretches with what the scans know of them; `observed` are the terms of `marginals.observed_terms`."""
     ends = motions.ends
     seen, covariance = np.empty((len(ends), 3)), np.empty((len(ends), 3, 3))
-    of_a_point = information_of_a_point(refined)
+    of_a_point = information_of_a_point(refined, FLAT_IN_A_STRETCH_M)
     window_motions(refined.linearised_at, refined.pairs, observed, of_a_point, ends, seen, covariance)
     variances, axes = np.linalg.eigh(covariance[:, :2, :2])
     sigma = np.sqrt(np.maximum(variances[:, -1], 0.0))
@@ -228,7 +228,10 @@ def held_by_the_rest(
     if len(chosen) == 0:
         return Held(chosen, sigma, difference, odometry_sigma)
     poses, pairs = refined.linearised_at, np.concatenate((refined.pairs, edges.pairs))
-    terms, of_a_point = _without_hidden(refined, observed, stretches), information_of_a_point(refined)
+    terms, of_a_point = (
+        _without_hidden(refined, observed, stretches),
+        information_of_a_point(refined, FLAT_IN_A_STRETCH_M),
+    )
     diagonal, off_diagonal, right = normal_equations(poses, refined.pairs, terms, of_a_point, edges)
     # The covariances between all poses of a stretch are wanted: they are in the pattern, with zeros.
     wanted = [first + np.column_stack(np.triu_indices(last + 1 - first)) for first, last in ends.tolist()]

@@ -108,10 +108,11 @@ def analyse(
             observer(posed)
         if isinstance(posed.event, PairedScan):
             scan, T_map_base = posed.event.scan, posed.T_map_base
-            distance = residuals.distances(scan, T_map_base)
+            points = scan.points_base()
+            distance = residuals.distances(points, T_map_base)
             if posed.localised:
                 residuals.add(scan, distance)
-                coverage.add(scan, T_map_base)
+                coverage.add(scan, points, T_map_base)
                 check.add(scan, T_map_base)
                 sample.add(scan, T_map_base)
             overlay.add(scan, T_map_base, distance)

@@ -75,9 +75,9 @@ class Residuals:
         self._T_grid_map = grid.origin.inverse()
         self._by_laser: dict[str, NDArray[np.int64]] = {}
 
-    def distances(self, scan: Scan, T_map_base: Pose2) -> NDArray[np.float32]:
-        """Distance of each point of a scan (n,) to the nearest occupied cell [m]; outside the map, the largest one."""
-        points, pose = scan.points_base(), (self._T_grid_map @ T_map_base).to_array()
+    def distances(self, points: Floats, T_map_base: Pose2) -> NDArray[np.float32]:
+        """Distance of each of a scan's points (n, 2) to the nearest occupied cell [m]; beyond the map, the largest."""
+        pose = (self._T_grid_map @ T_map_base).to_array()
         distance = np.empty(len(points), dtype=np.float32)
         look_up(self._distance, points, pose, self._grid.resolution, _MAX_DISTANCE_M, distance)
         return distance
@@ -331,12 +331,12 @@ class CoverageCounter:
         self._T_map_corner = grid.origin
         self._T_corner_map = grid.origin.inverse()
 
-    def add(self, scan: Scan, T_map_base: Pose2) -> None:
-        """A scan, and the pose of the base at its stamp."""
+    def add(self, scan: Scan, points: Floats, T_map_base: Pose2) -> None:
+        """A scan with its points (n, 2), and the pose of the base at its stamp."""
         T_corner_base = self._T_corner_map @ T_map_base
         laser = T_corner_base @ scan.T_base_laser
         pose = (T_corner_base.x, T_corner_base.y, cos(T_corner_base.theta), sin(T_corner_base.theta))
-        count_seen(self._counts, self._work, scan.points_base(), pose, (laser.x, laser.y), self._side)
+        count_seen(self._counts, self._work, points, pose, (laser.x, laser.y), self._side)
 
     def coverage(self) -> Coverage:
         """What was counted."""

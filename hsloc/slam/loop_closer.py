@@ -77,6 +77,7 @@ class LoopCloser:
         self._matcher = LoopMatcher(places, scans, parameters, rng)
         self.poses = places.poses[places.reference].copy()
         self._found = {(loop.first, loop.second): loop for loop in known}
+        self._accepted: list[Loop] | None = None
         self._first = first
         self._unsolved = False
         self._asserted = set(asserted)
@@ -89,8 +90,18 @@ class LoopCloser:
 
     @property
     def accepted(self) -> list[Loop]:
-        """The loops that were believed."""
-        return [loop for loop in self.loops if loop.accepted]
+        """The loops that were believed, in the same order."""
+        if self._accepted is None:
+            self._accepted = [loop for loop in self.loops if loop.accepted]
+        return self._accepted
+
+    def _note(self, loop: Loop) -> None:
+        """Keep what was found between two places, in place of what was known."""
+        pair = loop.first, loop.second
+        before = self._found.get(pair)
+        if loop.accepted or (before is not None and before.accepted):
+            self._accepted = None
+        self._found[pair] = loop
 
     def close(self, progress: Callable[[float], None] | None = None) -> None:
         """Visit all places in their order, and again as long as loops are found or refused.
@@ -147,7 +158,7 @@ class LoopCloser:
         while left and searched < self._parameters.max_candidates:
             old, path_length = left[0]
             loop = self._search(old, place, path_length)
-            self._found[old, place] = loop
+            self._note(loop)
             searched += 1
             new += [loop] if loop.accepted else []
             # What the loop ties to this place need not be searched any more.
@@ -167,7 +178,7 @@ class LoopCloser:
                 f"--assert-loop: the scans of the two places disagree: {loop.reason}; give times at which the robot "
                 "was at one place, looking the same way"
             )
-        self._found[old, place] = replace(loop, accepted=True, reason=ASSERTED)
+        self._note(replace(loop, accepted=True, reason=ASSERTED))
 
     def _is_forbidden(self, old: int, place: int) -> bool:
         """Whether the user forbids a loop; a place is compared together with its neighbours."""
@@ -201,7 +212,7 @@ class LoopCloser:
                 break
             loop = accepted[worst]
             reason = f"{TORN}: {chi[worst]:.0f} sigma off, the graph solved"
-            self._found[loop.first, loop.second] = replace(loop, accepted=False, reason=reason)
+            self._note(replace(loop, accepted=False, reason=reason))
             torn += 1
             self.solve()
         return torn

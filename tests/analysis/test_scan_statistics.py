@@ -17,7 +17,7 @@ def test_each_scan_counts_once_in_each_cell_up_to_its_hits() -> None:
     beams = np.array([0.8, 0.8, np.inf], dtype=np.float32)
     scan = Scan(0, beams, 0.0, 1e-3, 0.1, 10.0, T_base_laser=Pose2(0.1, 0.0, 0.0))
     for moved in (0.0, 0.5):  # along the rows of the map, which point to +y
-        counter.add(scan, Pose2(0.9, 2.05 + moved, pi / 2))
+        counter.add(scan, scan.points_base(), Pose2(0.9, 2.05 + moved, pi / 2))
     found = counter.coverage()
     assert (found.side, found.T_map_corner) == (0.25, Pose2(1.0, 2.0, pi / 2))
     # Row 0 is the lower edge of the map; the lasers stand at 0.15 and 0.65 m along it, the hits are 0.8 m on.

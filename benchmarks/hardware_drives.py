@@ -246,17 +246,33 @@ def jittered(drive: Drive) -> Drive:
     return replace(drive, events=sorted(moved, key=lambda event: event.stamp_ns))
 
 
-def freezing(drive: Drive) -> Drive:
-    """The odometry stands still for 1.5 s every 12 s, and then is where it would have been."""
-    held: list[Event] = []
-    last = None
+def freezing(seconds: float) -> Callable[[Drive], Drive]:
+    """The odometry stands still for this time every 12 s, and then is where it would have been."""
+
+    def change(drive: Drive) -> Drive:
+        held: list[Event] = []
+        last = None
+        for event in drive.events:
+            if isinstance(event, Odometry):
+                if last is not None and drive.elapsed_s(event) % 12.0 > 12.0 - seconds:
+                    event = replace(event, T_odom_base=last)
+                last = event.T_odom_base
+            held.append(event)
+        return replace(drive, events=held)
+
+    return change
+
+
+def late(drive: Drive) -> Drive:
+    """Odometry of 1.5 s comes at once, every 12 s, 50 us after each other and with the stamps of then."""
+    found: list[Event] = []
     for event in drive.events:
-        if isinstance(event, Odometry):
-            if last is not None and drive.elapsed_s(event) % 12.0 > 10.5:
-                event = replace(event, T_odom_base=last)
-            last = event.T_odom_base
-        held.append(event)
-    return replace(drive, events=held)
+        rest = 12.0 - drive.elapsed_s(event) % 12.0
+        if isinstance(event, Odometry) and rest < 1.5:
+            ticks = int(rest * 1e9) // STEP_NS
+            event = replace(event, stamp_ns=event.stamp_ns + ticks * (STEP_NS - 50_000))
+        found.append(event)
+    return replace(drive, events=sorted(found, key=lambda event: event.stamp_ns))
 
 
 def jumping(drive: Drive) -> Drive:

@@ -123,6 +123,8 @@ class WarningCode(StrEnum):
     """The log has no odometry; it is made of measured velocities, or rotations are predicted by an IMU."""
     ODOMETRY_RESET = "odometry_reset"
     """The odometry jumps; it is continued from the pose before the jump."""
+    ODOMETRY_STALLS = "odometry_stalls"
+    """The odometry repeats a pose, or comes late, while the robot drives on; poses between are interpolated."""
     ODOMETRY_JUMPS = "odometry_jumps"
     """The odometry jumps too often to be corrected."""
     ODOMETRY_UNUSABLE = "odometry_unusable"

@@ -21,6 +21,7 @@ import numpy as np
 from hsloc.log import LEAST_JUMP, LONGEST_JUMP_S, MAX_SPEED
 from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import Pose2, wrap_angle
+from hsloc.preprocessing.odometry_stalls import FROZEN_S, UnstalledOdometry
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -35,9 +36,6 @@ _LEAST_TURN, _MAX_TURN = 0.8, 10.0
 _MOST = 20
 """Number of jumps that are mended; after more of them the odometry is taken for broken."""
 
-FROZEN_S = 3.0
-"""Odometry that is at rest for this long (s) while the scans change is frozen. A robot at 0.1 m/s
-has gone 0.3 m by then, more than scans can hide; wheel encoders tick many times."""
 _COMPARED_S = 1.0
 """Scans are compared with one that is at least this old (s)."""
 _CHANGED_M = 0.1
@@ -65,7 +63,7 @@ class ContinuousOdometry:
     """Events whose odometry goes on where it jumped. To be gone through once; then `warnings` gives what was found."""
 
     def __init__(self, events: Iterable[Event], topic: str | None = None) -> None:
-        self._events = events
+        self._stalls = UnstalledOdometry(events, topic)
         self._topic = topic
         self._start_ns = 0
         self._first = (0.0, 0.0)
@@ -74,7 +72,7 @@ class ContinuousOdometry:
     def __iter__(self) -> Iterator[Event]:
         before: Odometry | None = None
         T_joined_odom: Pose2 | None = None
-        for event in self._events:
+        for event in self._stalls:
             if not isinstance(event, Odometry):
                 yield event
                 continue
@@ -105,9 +103,9 @@ class ContinuousOdometry:
         return True
 
     def warnings(self) -> tuple[RunWarning, ...]:
-        """A warning if there were jumps."""
+        """A warning if there were stalls, and one if there were jumps."""
         if self._jumps == 0:
-            return ()
+            return self._stalls.warnings()
         way, at = self._first
         corrected = self._jumps <= _MOST
         what = (
@@ -116,6 +114,7 @@ class ContinuousOdometry:
             else "too often to be corrected: poses may be wrong"
         )
         return (
+            *self._stalls.warnings(),
             RunWarning(
                 WarningCode.ODOMETRY_RESET if corrected else WarningCode.ODOMETRY_JUMPS,
                 f"odometry ({self._topic}) jumps ({self._jumps} times, first by {way:.2f} m at {at:.3f} s); {what}",

@@ -18,6 +18,7 @@ import numpy as np
 from hsloc.log import LONGEST_OFFSET_S, open_log
 from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.options import AUTO
+from hsloc.preprocessing.odometry_stalls import UnstalledOdometry
 from hsloc.preprocessing.scans import half_sweep_ns
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.warnings import RunWarning, WarningCode
@@ -195,7 +196,7 @@ def estimate_offset(
 
     def kept() -> Iterable[Event]:
         count, last_ns = 0, 0
-        for event in events:
+        for event in UnstalledOdometry(events):
             if isinstance(event, Odometry | Heading):
                 theta = event.theta if isinstance(event, Heading) else event.T_odom_base.theta
                 odometry.append((event.stamp_ns, theta))

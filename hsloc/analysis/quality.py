@@ -10,6 +10,7 @@ import numpy as np
 from hsloc.localisation.states import localisation_reasons
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
 from hsloc.replay.clock_offset import KNOWN, matched_headings
+from hsloc.slam.mounting_choice import right_mounting
 from hsloc.slam.time_offset import clock_warnings, drift_warning, find_drift, find_offset, offsets_of_log
 from hsloc.trajectory_io.tum import NS_PER_S
 from hsloc.warnings import RunWarning, WarningCode
@@ -57,7 +58,8 @@ def quality_warnings(result: Result) -> list[RunWarning]:
     A pose found once may then be a chance fit. Mapping: single scans that are beside their place.
     """
     if result.mapping is not None:
-        return [*_stray_warnings(result.mapping, result), *_plan_warnings(result.mapping, result)]
+        of_map = [*_stray_warnings(result.mapping, result), *_plan_warnings(result.mapping, result)]
+        return [*of_map, *_direction_warnings(result)]
     if result.mode != "localise":
         return []
     of_sensor = [*_mirror_warnings(result), *_scale_warnings(result), *_mounting_warnings(result)]
@@ -165,6 +167,16 @@ def _mounting_warnings(result: Result) -> list[RunWarning]:
             f"measure it, or hsloc calibrate; --laser-pose {right.x:.3f},{right.y:.3f},{right.theta:.4f}",
         )
     ]
+
+
+def _direction_warnings(result: Result) -> list[RunWarning]:
+    """Where the mounting was given, or a map with the other one shows as much of an error."""
+    shown, request = result.mounting_error, result.request
+    if shown is None or not shown.is_turned or WarningCode.EXTRINSICS_WRONG in {each.code for each in result.warnings}:
+        return []
+    reading, front_end = result.reading or request.reading(), request.config.graph_mapper.front_end
+    found = right_mounting(request.logs, reading, front_end, used=False)
+    return [] if found is None else [found[1]]
 
 
 def offset_warnings(result: Result) -> list[RunWarning]:

@@ -70,6 +70,10 @@ class MountingError:
         """Whether place or yaw are."""
         return self.is_displaced or self.is_turned
 
+    def of_yaw(self) -> MountingError:
+        """The same without a place."""
+        return MountingError(Pose2(0.0, 0.0, self.error.theta), (inf, inf, self.sigma[2]))
+
     def pose_errors(self, poses: F64) -> F64:
         """What it makes of poses (n, 3) on a map, as absolute errors (n, 3) in m, m, rad; 0 where not significant."""
         errors = np.zeros((len(poses), 3))
@@ -88,8 +92,13 @@ def mounting_error(anchors: Sequence[Anchor]) -> MountingError | None:
         return None
     odometry = np.array([anchor.T_odom_base.to_array() for anchor in anchors])
     matched = np.array([anchor.T_map_base.to_array() for anchor in anchors])
+    return mounting_error_of_steps(odometry, matched, np.array([anchor.begins for anchor in anchors]))
+
+
+def mounting_error_of_steps(odometry: F64, matched: F64, begins: NDArray[np.bool_]) -> MountingError | None:
+    """By poses (n, 3) of the odometry and of the matches, of which some (n,) begin anew; None as above."""
     step, seen = relative_poses(odometry[:-1], odometry[1:]), relative_poses(matched[:-1], matched[1:])
-    usable = ~np.array([anchor.begins for anchor in anchors[1:]]) & (np.hypot(step[:, 0], step[:, 1]) < _LONGEST_M)
+    usable = ~begins[1:] & (np.hypot(step[:, 0], step[:, 1]) < _LONGEST_M)
     step, seen = step[usable], seen[usable]
     turned = wrap_angles(seen[:, 2])  # noise of the odometry turns its translation, too: it would show as a place
     if len(step) < _FEWEST:
@@ -111,9 +120,8 @@ def mounting_error(anchors: Sequence[Anchor]) -> MountingError | None:
     without = without_each_part(information, vectors, PARTS)
     sigma = np.sqrt((PARTS - 1) / PARTS * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     x, y, yaw = values[1:].tolist()
-    if is_one_sided:
-        return MountingError(Pose2(0.0, 0.0, yaw), (inf, inf, float(sigma[3])))
-    return MountingError(Pose2(x, y, yaw), (float(sigma[1]), float(sigma[2]), float(sigma[3])))
+    found = MountingError(Pose2(x, y, yaw), (float(sigma[1]), float(sigma[2]), float(sigma[3])))
+    return found.of_yaw() if is_one_sided else found
 
 
 def without_each_part(information: NDArray[Any], vectors: NDArray[Any], parts: int) -> NDArray[Any]:

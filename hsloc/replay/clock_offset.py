@@ -16,7 +16,7 @@ import numpy as np
 from hsloc.log import LONGEST_OFFSET_S, open_log
 from hsloc.options import AUTO
 from hsloc.replay.matched_scans import are_matched, is_lost
-from hsloc.slam.mounting_choice import direction_warnings, with_chosen_mountings
+from hsloc.slam.mounting_choice import direction_warnings, right_mounting, with_chosen_mountings
 from hsloc.slam.time_offset import (
     HINT_S,
     Headings,
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.localisation.mounting_error import MountingError
     from hsloc.log import Log, ReadOptions
     from hsloc.model.estimate import ScanDiagnostics
     from hsloc.model.trajectory import Trajectory
@@ -94,6 +95,21 @@ class SweptScans(Exception):
         ]
         found = max(tried, key=fitness)
         return found if fitness(found) > self._fitness else None
+
+
+class TurnedLaser(Exception):
+    """The laser looks elsewhere than the log states, beyond doubt; internal: who maps begins again.
+
+    `request` has the right mounting, `warning` says so.
+    """
+
+    def __init__(self, request: RunRequest, warning: RunWarning, yaw: float) -> None:
+        super().__init__()
+        self.request, self.warning, self._yaw = request, warning, yaw
+
+    def is_mended(self, left: MountingError | None) -> bool:
+        """Whether a run with that mounting has less than half of the error `left`."""
+        return left is None or abs(left.error.theta) < 0.5 * abs(self._yaw)
 
 
 MAPS_CORRECTED_FROM_S = 0.15
@@ -200,8 +216,10 @@ def offsets_of_mapping(
 
     Raises LateScans where one is certain and the user has given none, if these are to be corrected: from
     `MAPS_CORRECTED_FROM_S` on; and SweptScans where there is none from the middle of the sweeps, which is as certainly
-    another time than that of the stamps.
+    another time than that of the stamps. Raises TurnedLaser where the only laser looks elsewhere than the log states.
     """
+    if correct:
+        _require_direction(request, log, reading, history)
     if reading.stamps != "header":
         return {}
     # Corrected stamps are those of the middle.
@@ -221,6 +239,19 @@ def offsets_of_mapping(
     if correct and option is not None and is_large:
         raise LateScans({name: each for name, each in found.items() if each.is_certain}, option)
     return found
+
+
+def _require_direction(request: RunRequest, log: Log, reading: ReadOptions, history: RunHistory) -> None:
+    """Raise TurnedLaser where the matches of a map show it, and the scans by themselves."""
+    shown = history.mounting_error()
+    is_given = reading.laser_pose is not None or reading.calibration is not None
+    if shown is None or not shown.is_turned or is_given or log.summary.laser_flipped:
+        return
+    found = right_mounting(request.logs, reading, request.config.graph_mapper.front_end, used=True)
+    if found is not None:
+        pose, warning = found
+        read = replace(request.read, laser_pose=pose)
+        raise TurnedLaser(replace(request, read=read), warning, shown.error.theta)
 
 
 def _is_given(request: RunRequest) -> bool:

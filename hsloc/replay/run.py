@@ -18,6 +18,7 @@ from hsloc.replay.clock_offset import (
     ClockEvidence,
     LateScans,
     SweptScans,
+    TurnedLaser,
     clock_offsets,
     offsets_of_mapping,
     open_as_meant,
@@ -62,6 +63,10 @@ if TYPE_CHECKING:
     from hsloc.replay.engine import Estimator
     from hsloc.slam.result import MappingResult
     from hsloc.slam.time_offset import Offset
+
+    Report = Callable[["Progress"], None] | None
+    Correction = tuple[MapScale, Pose2] | None
+    """Scale of the map, and the pose from which on it is right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +197,7 @@ def run(
         return _run(request, progress)
 
 
-def _run(request: RunRequest, progress: Callable[[Progress], None] | None) -> Result:
+def _run(request: RunRequest, progress: Report) -> Result:
     """The run; on a map of another scale where that proves wrong on the way."""
     result = _run_on(request, progress)
     if result.mode != "localise" or result.lidar_only or not request.config.localiser.correct_map_scale:
@@ -209,11 +214,7 @@ def _sum(first: Mapping[str, float], second: Mapping[str, float]) -> dict[str, f
     return {name: value + second[name] for name, value in first.items()}
 
 
-def _run_on(
-    request: RunRequest,
-    progress: Callable[[Progress], None] | None,
-    correction: tuple[MapScale, Pose2] | None = None,
-) -> Result:
+def _run_on(request: RunRequest, progress: Report, correction: Correction = None) -> Result:
     """The run, with `correction` on the map of that scale from that pose on if a start is given.
 
     Once more with what shows on the way: without odometry that is unusable, with other stamps, deskewed.
@@ -232,8 +233,8 @@ def _run_on(
         whole = late.with_rest(result.clock_offsets or {})
         warnings = (*result.warnings, *(warning for _, warning in clock_warnings(whole, removed=True)))
         return replace(result, warnings=warnings, corrected_offsets=whole)
-    except SweptScans as swept:
-        better = _deskewed(swept, progress, correction)
+    except (SweptScans, TurnedLaser) as found:
+        better = _again(found, progress, correction)
         return better or _run_with(request, progress, lidar_only=False, time_offset="", correction=correction)
     is_settled = {WarningCode.CLOCK_OFFSET_APPLIED, WarningCode.CLOCK_SET} & {each.code for each in result.warnings}
     if result.mode != "localise" or result.lidar_only or is_settled:
@@ -252,29 +253,30 @@ def _run_on(
             return replace(again, seconds=_sum(result.seconds, again.seconds), corrected_offsets=certain)
     elif not result.deskewed:
         shown = swept_scans(request, evidence, offsets, mean_fitness(result.diagnostics.fitness))
-        if shown is not None and (better := _deskewed(shown, progress, correction)) is not None:
+        if shown is not None and (better := _again(shown, progress, correction)) is not None:
             return better
     return replace(result, clock_offsets=offsets)
 
 
-def _deskewed(
-    swept: SweptScans, progress: Callable[[Progress], None] | None, correction: tuple[MapScale, Pose2] | None
-) -> Result | None:
+def _again(found: SweptScans | TurnedLaser, progress: Report, correction: Correction) -> Result | None:
     def attempt(request: RunRequest, warning: RunWarning) -> Result:
         result = _run_on(request, progress, correction)
         return replace(result, warnings=(*result.warnings, warning))
 
-    return swept.best(attempt, lambda result: mean_fitness(result.diagnostics.fitness))
+    if isinstance(found, SweptScans):
+        return found.best(attempt, lambda result: mean_fitness(result.diagnostics.fitness))
+    result = attempt(found.request, found.warning)
+    return result if found.is_mended(result.mounting_error) else None
 
 
 def _run_with(
     request: RunRequest,
-    progress: Callable[[Progress], None] | None,
+    progress: Report,
     *,
     lidar_only: bool,
     warnings: tuple[RunWarning, ...] = (),
     time_offset: str | None = None,
-    correction: tuple[MapScale, Pose2] | None = None,
+    correction: Correction = None,
 ) -> Result:
     begin = time.perf_counter()
     log, reading, of_log = open_as_meant(request, lidar_only, time_offset)
@@ -342,7 +344,7 @@ def _run_with(
     scale = None if localiser is None else localiser.map_scale
     if scale is not None and correction is not None:
         scale = replace(scale, corrected=correction[0].value)
-    mounting = history.mounting_error() if localise else None
+    mounting = history.mounting_error() if localise or not lidar_only else None
     states = history.states(scale, mounting, grid) if localise else None
     tracked = localised
     if states is not None:
@@ -378,7 +380,7 @@ def _run_with(
     )
 
 
-def _share(progress: Callable[[Progress], None] | None, total: float, scans: int) -> Callable[[float], None] | None:
+def _share(progress: Report, total: float, scans: int) -> Callable[[float], None] | None:
     if progress is None:
         return None
     return lambda share: progress(Progress("refine", share * total, total, scans))

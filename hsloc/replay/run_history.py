@@ -17,7 +17,7 @@ from hsloc.localisation.kalman_filter import (
     smooth_matches,
 )
 from hsloc.localisation.motion_models import OdometryNoise
-from hsloc.localisation.mounting_error import mounting_error
+from hsloc.localisation.mounting_error import mounting_error, mounting_error_of_steps
 from hsloc.localisation.states import StateLog, with_odometry_alone, with_pose_errors
 from hsloc.model.estimate import ScanDiagnostics, State, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
@@ -71,6 +71,7 @@ class RunHistory:
         self._smoothed: SmoothedMatches | None = None
         self._track_ended = True
         self._frames: set[str] = set()
+        self._mapped = array("d")
         self._odometry_stamps = array("q")
         self._odometry = array("d")
         self._poses = array("d")
@@ -138,6 +139,9 @@ class RunHistory:
         if estimate.status is Status.SEARCHING:
             self._track_ended = True
         is_match = estimate.status in (Status.MATCHED, Status.RELOCALISED)
+        if self._motion_model is None and is_match:
+            pose, place = paired.T_odom_base, estimate.T_map_base
+            self._mapped.extend((pose.x, pose.y, pose.theta, place.x, place.y, place.theta))
         if self._motion_model is not None and is_match and estimate.covariance is not None:
             begins = self._track_ended or estimate.status is Status.RELOCALISED
             self._anchors.append(
@@ -284,8 +288,17 @@ class RunHistory:
         return found
 
     def mounting_error(self) -> MountingError | None:
-        """How far the laser is from where it is said to be; None where that is not known, or with several lasers."""
-        return mounting_error(self._anchors) if len(self._frames) == 1 else None
+        """How far the laser is from where it is said to be; None where that is not known, or with several lasers.
+
+        Of a map that is built only the yaw, and a part of that: its scans are matched to each other with the odometry.
+        """
+        if len(self._frames) != 1:
+            return None
+        if self._motion_model is not None:
+            return mounting_error(self._anchors)
+        poses = np.array(self._mapped).reshape(-1, 6)
+        found = mounting_error_of_steps(poses[:, :3], poses[:, 3:], np.zeros(len(poses), dtype=np.bool_))
+        return None if found is None else found.of_yaw()
 
     def ambiguities(self, states: StateRows | None) -> tuple[Ambiguity, ...]:
         """Between which places the run does not decide, and when; `states` are those of its poses."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import HslocError
-from hsloc.localisation.mounting_error import MIN_SIGMAS, PARTS, PRIOR, without_each_part
+from hsloc.localisation.mounting_error import MIN_SIGMAS, PARTS, PRIOR, MountingError, without_each_part
 from hsloc.log import laser_mounting, open_log
 from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import Pose2, relative_poses, wrap_angle, wrap_angles
@@ -141,6 +141,29 @@ def direction_warnings(
         remedy = f"--laser-pose={pose.x:.3f},{pose.y:.3f},{pose.theta:.3f}; hsloc calibrate finds {place}"
         found.append(RunWarning(WarningCode.EXTRINSICS_WRONG, text, remedy))
     return found
+
+
+def right_mounting(
+    paths: Sequence[Path], options: ReadOptions, parameters: FrontEndParameters, *, used: bool
+) -> tuple[Pose2, RunWarning] | None:
+    """How the only laser of a log is mounted, and a warning of that; None where it may look to where it is stated to.
+
+    Its place stays as it is stated. `used` says that a map will be built with that. Raises LogError as `open_log` does.
+    """
+    log = open_log(paths, replace(options, deskew=False, start_s=None, end_s=None))
+    stated, source = log.summary.T_base_laser, log.summary.extrinsics
+    *_, motion = _motions(log.events(), parameters, (_MOST_SCANS,))
+    error, _, sigma = _direction_by(motion)
+    if not MountingError(error, (inf, inf, sigma)).is_turned:
+        return None
+    pose = Pose2(stated.x, stated.y, wrap_angle(stated.theta + error.theta))
+    where = "is assumed to" if source == "identity" else f"is stated to ({source})"
+    return pose, RunWarning(
+        WarningCode.EXTRINSICS_WRONG,
+        f"the laser looks {degrees(error.theta):.1f} ± {degrees(sigma):.1f} deg from where it {where}, by its scans "
+        f"alone and the odometry{': the map is built with that' if used else ''}",
+        f"measure it, or hsloc calibrate; --laser-pose={pose.x:.3f},{pose.y:.3f},{pose.theta:.4f}",
+    )
 
 
 def _direction(motions: Iterable[_Motion]) -> tuple[Pose2, float, float]:

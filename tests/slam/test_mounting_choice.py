@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from hsloc.analysis.quality import quality_warnings
 from hsloc.log import LogWriter, ReadOptions, Transform3, open_log
 from hsloc.model import Odometry, Pose2, Scan
+from hsloc.replay.run import run
 from hsloc.simulation.scenario import Scenario
 from hsloc.simulation.sensors import Lidar
 from hsloc.simulation.simulator import events
@@ -109,3 +111,19 @@ def test_a_laser_that_looks_elsewhere_than_it_is_said_to_is_reported(
         assert (x, y) == pytest.approx((RIGHT.x, RIGHT.y), abs=0.03)
     if mounting is not None:  # A run asks only where the log states nothing.
         assert direction_warnings(log, [path], options, FrontEndParameters(), stated=False) == []
+
+
+def test_a_map_is_built_with_the_yaw_that_scans_and_odometry_show(tmp_path: Path, recorded: list[Event]) -> None:
+    wrong = RIGHT @ Pose2(0.0, 0.0, 0.14)
+    path = write(tmp_path / "a.mcap", recorded, [Transform3.from_pose2(wrong)])
+    result = run(path, mode="slam")
+    (warning,) = (each for each in result.warnings if each.code == WarningCode.EXTRINSICS_WRONG)
+    assert "from where it is stated to (/tf_static)" in warning.text
+    used = result.summary.T_base_laser
+    assert f"--laser-pose={used.x:.3f},{used.y:.3f},{used.theta:.4f}" in warning.remedy
+    assert used.to_array() == pytest.approx(RIGHT.to_array(), abs=0.02)
+    given = run(path, mode="slam", laser_pose=wrong)
+    assert given.summary.T_base_laser == wrong
+    (named,) = quality_warnings(given)
+    assert named.code == WarningCode.EXTRINSICS_WRONG
+    assert named.remedy == warning.remedy

@@ -13,6 +13,7 @@ from math import hypot
 from statistics import median
 from typing import TYPE_CHECKING
 
+from hsloc.log import MAX_SPEED
 from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import wrap_angle
 from hsloc.warnings import RunWarning, WarningCode
@@ -38,8 +39,8 @@ _HARDEST, _HARDEST_TURN = 10.0, 30.0
 _USUAL, _USUAL_TURN = 2.5, 5.0
 """Accelerations (m/s^2, rad/s^2) of ordinary robots, with which the motion over the whole stall must be possible. Of
 the 250 times that odometry of real logs was at rest for `_STALL_S` or longer none ends with a fifth of a jump."""
-_MOVES_M_S, _MOVES_RAD_S = 0.05, 0.05
-"""Speeds (m/s, rad/s) from which on a robot moves. Odometry is set to another pose while it stands."""
+_MOVES_M_S, _MOVES_RAD_S, _FASTEST_RAD_S = 0.05, 0.05, 10.0
+"""Speeds (m/s, rad/s) from which on a robot moves, as odometry is set anew while it stands; and fastest turn."""
 _BURST = 0.5
 """Messages that follow each other within this part of their usual interval come at once."""
 _FEWEST_SCANS = 2
@@ -253,7 +254,12 @@ def _speeds(before: Odometry, after: Odometry) -> tuple[float, float]:
 
 
 def _moves(speeds: tuple[float, float]) -> bool:
-    return speeds[0] > _MOVES_M_S or speeds[1] > _MOVES_RAD_S
+    return _are_possible(speeds) and (speeds[0] > _MOVES_M_S or speeds[1] > _MOVES_RAD_S)
+
+
+def _are_possible(speeds: tuple[float, float]) -> bool:
+    """Whether robots move so fast; what comes in millimetres does not."""
+    return speeds[0] <= MAX_SPEED and speeds[1] <= _FASTEST_RAD_S
 
 
 def _is_impossible(before: Odometry, after: Odometry, speeds: tuple[float, float]) -> bool:
@@ -267,7 +273,7 @@ def _is_possible(before: Odometry, after: Odometry, speeds: tuple[float, float])
     """Whether ordinary robots with these speeds (m/s, rad/s) move from message to message."""
     way, turn, seconds = _step(before, after)
     longest, widest = _reached(seconds, speeds, (_USUAL, _USUAL_TURN))
-    return way <= longest and turn <= widest
+    return _are_possible(speeds) and way <= longest and turn <= widest
 
 
 def _reached(seconds: float, speeds: tuple[float, float], accelerations: tuple[float, float]) -> tuple[float, float]:

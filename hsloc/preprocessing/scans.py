@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 _RECENT_ODOMETRY = 64
 """Odometry messages remembered for pairing; logs with jumping clocks need more than two."""
-_WAITING_SCANS = 64
-"""Scans that may wait for odometry; then the last odometry must do."""
+_WAITING_SCANS = 256
+"""Scans that may wait for odometry, of 5 s at 50 Hz; then the last odometry must do."""
 _RECENT_SWEEP = 512
 """Odometry messages that are kept. Internal: a fifth of a second at 2.5 kHz, longer than a sweep."""
 _WAITING_SWEEPS = 16

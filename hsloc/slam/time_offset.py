@@ -356,7 +356,8 @@ def clock_warnings(
             warnings.append((topic, RunWarning(WarningCode.SCANS_MIRRORED, text, remedy)))
         if offset.is_significant and removed:
             text = f"the stamps of {topic} were {in_words(offset)} those of the odometry, which was corrected"
-            warnings.append((topic, RunWarning(WarningCode.CLOCK_OFFSET_APPLIED, text)))
+            late = f"or --time-offset ODOM_TOPIC={offset.seconds:.3f}, if that is late" if offset.seconds < 0.0 else ""
+            warnings.append((topic, RunWarning(WarningCode.CLOCK_OFFSET_APPLIED, text, late)))
         elif offset.is_significant:
             warnings.append((topic, offset_warning(topic, offset, (given or {}).get(topic.lstrip("/"), 0.0))))
         if offset.drift_s:

@@ -154,6 +154,9 @@ def test_a_run_warns_of_late_scans_and_auto_removes_it(tmp_path: Path) -> None:
     (sweeping,) = ({topic: offset._replace(seconds=0.2, half_sweep_s=0.05)} for topic, offset in found.items())
     assert as_option(sweeping, deskew=True) == "/scan=-0.200"
     assert as_option(sweeping, deskew=False) == "/scan=-0.150"
+    remedies = [clock_warnings({"/scan": found["/scan"]._replace(seconds=s)}, removed=True) for s in (0.2, -0.2)]
+    # Messages wait, and are stamped late: where scans are early, the odometry may be what is wrong.
+    assert ["ODOM_TOPIC=-0.200" in warning.remedy for ((_, warning),) in remedies] == [False, True]
     sound = run(RunRequest(logs=(OFFICE,), read=replace(END, time_offset="auto")))
     assert sound.reference is not None
     assert evaluate(sound.trajectory, sound.reference).ape.trans_part.rmse < 0.01

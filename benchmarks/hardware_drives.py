@@ -269,7 +269,7 @@ def late(drive: Drive) -> Drive:
     for event in drive.events:
         rest = 12.0 - drive.elapsed_s(event) % 12.0
         if isinstance(event, Odometry) and rest < 1.5:
-            ticks = int(rest * 1e9) // STEP_NS
+            ticks = round(rest * 1e9 / STEP_NS)
             event = replace(event, stamp_ns=event.stamp_ns + ticks * (STEP_NS - 50_000))
         found.append(event)
     return replace(drive, events=sorted(found, key=lambda event: event.stamp_ns))

@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from hsloc.cli.main import EXIT_BELOW_LIMIT
-    from hsloc.log import check_log, open_log, read_profile, violations
+    from hsloc.log import Severity, check_log, open_log, read_profile, violations
 
     profile = None if arguments.profile is None else read_profile(arguments.profile)
     log = open_log(arguments.log, replace(read_options(arguments), require_scan=False, require_odometry=False))
@@ -54,7 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
     options, findings = _with_choices(read_options(arguments), log, report.findings)
     of_odometry = _of_odometry(log)
     # An offset is none where a clock was set in the middle, or to odometry that says nothing.
-    offsets = {} if report.losses.clock_steps or of_odometry else _offsets(options, log)
+    unknown = report.losses.clock_steps or any(found.severity is Severity.ERROR for found in of_odometry)
+    offsets = {} if unknown else _offsets(options, log)
     report = replace(report, findings=(*findings, *of_odometry, *_of_clocks(offsets)))
     seconds = {topic: offset.seconds for topic, offset in offsets.items()}
     unkept = [] if profile is None else violations(profile, log.summary, report, seconds)
@@ -97,22 +98,24 @@ def _with_choices(
 
 
 def _of_odometry(log: Log) -> list[Finding]:
-    """A finding where the odometry proves unusable, so that a run would go on without it."""
+    """A finding where the odometry proves unusable, so that a run would go on without it, or stalls."""
     from hsloc.log import Finding, Severity
     from hsloc.preprocessing.odometry import OdometryWatch, UnusableOdometry
+    from hsloc.preprocessing.odometry_stalls import UnstalledOdometry
     from hsloc.warnings import WarningCode
 
     topic = log.summary.odom_topic
     if log.summary.scan_topic is None or topic is None:
         return []
+    stalls = UnstalledOdometry(OdometryWatch(log.events()), topic)
     try:
-        for _ in OdometryWatch(log.events()):
+        for _ in stalls:
             pass
     except UnusableOdometry as error:
         remedy = "repair its source, or name another with --odom-topic; a run ignores it"
         text = f"the odometry cannot be used: {error}"
         return [Finding(WarningCode.ODOMETRY_UNUSABLE, Severity.ERROR, topic, text, remedy, 1)]
-    return []
+    return [Finding(each.code, Severity.WARNING, topic, each.text, each.remedy, 1) for each in stalls.warnings()]
 
 
 def _offsets(options: ReadOptions, log: Log) -> dict[str, Offset]:

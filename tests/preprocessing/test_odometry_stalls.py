@@ -12,12 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from hsloc.cli.main import main
+from hsloc.log import LogWriter
 from hsloc.model import Odometry, Pose2, Scan
 from hsloc.preprocessing.odometry import ContinuousOdometry
 from hsloc.preprocessing.odometry_stalls import UnstalledOdometry
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from hsloc.model import Event
 
@@ -129,6 +132,19 @@ def test_what_is_no_stall_is_left_as_it_is(pose: Callable[[float], Pose2 | None]
     odometry = ContinuousOdometry(events)
     list(odometry)
     assert [warning.code for warning in odometry.warnings()] == codes
+
+
+def test_a_check_names_stalls(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with LogWriter(tmp_path / "log.mcap") as log:
+        for event in drive(repeats(4.0, 5.5)):
+            if isinstance(event, Odometry):
+                log.odometry(event.stamp_ns, event.T_odom_base)
+            elif isinstance(event, Scan):
+                log.scan(event)
+    main(["check", str(tmp_path / "log.mcap")])
+    printed = capsys.readouterr().out
+    assert "warning: /odom: odometry (/odom) stalls while the robot drives on" in printed
+    assert "look for a driver or a network that hangs" in printed
 
 
 @pytest.mark.parametrize(

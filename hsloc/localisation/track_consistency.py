@@ -18,6 +18,7 @@ between them, the others as wrong. The sum over all subsets is one over paths th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from math import ceil, exp, isfinite, log, pi
 from typing import TYPE_CHECKING
@@ -80,6 +81,10 @@ _ALIKE_M, _LEAST_LASTS, _ENDS, _OVER_M = 20.0, 0.1, 10.0, 3.0
 counts the third, and its length against another map, but no less than the second, for a place may be a copy. It has
 ended where the robot went on for more than the last (m) on mapped ground. Assumed, and looked at on seed 81 of
 benchmarks/confusion.py."""
+_ASTRAY = 0.03
+"""Weight of being astray from the beginning on another map. There it is the rule, and on the right one the prior of all
+starts is 0.01; but of those that do not fit so many are wrong, or stand where the map has changed, that another map
+gains 3 by it and not 100. Assumed; from 0.01 to 0.1 the states of 125 runs (benchmarks/confusion.py) differ in one."""
 _FOUND_AFTER_M, _LOST_M, _MOST_FROM_LOST = 6.0, 5.0, 6.0
 """A robot on mapped ground is found again within the first (m); each further stretch of the second (m) counts 1, up to
 the third in all."""
@@ -151,7 +156,7 @@ class Track:
         of_rivals = min(max(_RIVALLED**rivalled * _UNRIVALLED**unique, 1.0 / _MOST_RIVALLED), _MOST_RIVALLED)
         metres = float(np.diff(way.metres(np.array((self.enters, self.leaves))))[0])
         lasts = max(exp(-metres / _ALIKE_M), _LEAST_LASTS)
-        return self.look_alike() * of_rivals * lasts * (_ENDS if went_on > _OVER_M else 1.0) + self.astray
+        return self.look_alike() * of_rivals * lasts * (_ENDS if went_on > _OVER_M else 1.0) + _ASTRAY * self.astray
 
 
 class MappedGround:
@@ -164,6 +169,12 @@ class MappedGround:
         self._resolution = grid.resolution
         self.volume = 2.0 * pi * float(self._free.sum()) * grid.resolution**2
         """Of all poses on free ground (m^2 rad)."""
+
+    @cached_property
+    def is_closed(self) -> bool:
+        """Whether no free ground borders on what is unknown, or on the edge of the map: then nobody leaves it."""
+        unknown = np.pad(~self._known, 1, constant_values=True)
+        return not (self._free & _beside(unknown)).any()
 
     def holds(self, points: F64) -> Bools:
         """Which of the points (n, 2) in the map lie on known cells."""
@@ -186,12 +197,17 @@ class MappedGround:
         unknown[0], unknown[-1] = v - reach <= 0, v + reach >= height - 1
         unknown[:, 0] |= u - reach <= 0
         unknown[:, -1] |= u + reach >= width - 1
-        beside = unknown[:-2, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :-2] | unknown[1:-1, 2:]
-        return bool((self._free[rows, columns] & beside).any())
+        return bool((self._free[rows, columns] & _beside(unknown)).any())
 
     def _cells(self, points: F64) -> NDArray[np.int64]:
         cells: NDArray[np.int64] = np.floor((self._inverse @ points) / self._resolution).astype(np.int64)
         return cells
+
+
+def _beside(cells: Bools) -> Bools:
+    """Which cells (h, w) are next to one of `cells` (h + 2, w + 2), which has a margin of one around them."""
+    result: Bools = cells[:-2, 1:-1] | cells[2:, 1:-1] | cells[1:-1, :-2] | cells[1:-1, 2:]
+    return result
 
 
 def _left_open(way: Way, start: tuple[int, Pose2], last: int, ground: MappedGround, errors: Errors) -> Bools:
@@ -341,7 +357,7 @@ def _lost_way(one: Track, other: Track, way: Way, ground: MappedGround, errors: 
     """Metres of the search after a track that, the first track being right, did not lead to ground off the map."""
     gone = _left_open(way, (one.leaves, one.exit), int(other.lost[-1]), ground, errors)
     some = np.unique(np.linspace(0, len(other.lost) - 1, _LOOKED_AT).astype(np.int64))
-    known = [way.known(one.leaves, int(other.lost[k]), errors) for k in some]
+    known = [1.0 if ground.is_closed else way.known(one.leaves, int(other.lost[k]), errors) for k in some]
     weights = np.interp(np.arange(1, len(other.lost)), some, known)
     weights[gone[other.lost[1:] - one.leaves]] = 0.0
     return float(np.diff(way.metres(other.lost)) @ weights)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import pi, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,13 +28,9 @@ class Window:
         centre: Pose2, covariance: NDArray[np.float64], sigmas: float, minimum: tuple[float, float]
     ) -> Window:
         """The box of `sigmas` standard deviations, at least `minimum` = (metres, radians) and at most half a turn."""
-        spread = sigmas * np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        return Window(
-            centre,
-            max(float(spread[0]), minimum[0]),
-            max(float(spread[1]), minimum[0]),
-            min(max(float(spread[2]), minimum[1]), np.pi),
-        )
+        # Python's own numbers: this is done for each scan.
+        x, y, theta = (sigmas * sqrt(max(variance, 0.0)) for variance in covariance.diagonal().tolist())
+        return Window(centre, max(x, minimum[0]), max(y, minimum[0]), min(max(theta, minimum[1]), pi))
 
     def half_widths(self) -> NDArray[np.float64]:
         """(half_x, half_y, half_theta), shape (3,)."""

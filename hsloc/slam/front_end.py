@@ -195,25 +195,31 @@ class FrontEnd:
             points = paired.points_base()
             if len(points) < p.min_points:
                 return LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.NO_RETURNS, False, reason=f"{len(points)} returns")
-            return self._keep(paired, points, LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.MATCHED, True, 1.0))
+            first = LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.MATCHED, True, 1.0)
+            return self._keep(paired, points, self._near(points), first)
         motion, covariance = self._predict(paired)
         predicted, tracker = self._T_map_key @ motion, self._tracker
         gate = self._known_map_gate if tracker is not None and tracker.is_following else self._motion_gate
         if self._use_odometry and not gate.is_open(motion):
             return LocalMatch(predicted, motion, covariance, Status.PREDICTED, False, reason="motion gate")
         points = paired.points_base()
+        near = self._near(points)
         if len(points) < p.min_points:
             found = LocalMatch(predicted, motion, covariance, Status.NO_RETURNS, False, reason=f"{len(points)} returns")
         else:
             scans = moving_scans(paired, points)
-            near = points[np.hypot(*points.T) < p.local_range]
             on_map = self._followed(paired, near, scans, motion, covariance)
             if on_map is not None:
                 return on_map
             found = replace(self._matched(near, scans, motion, covariance), scans=scans)
         if not self._use_odometry:
             found = self._without_odometry(paired, found)
-        return self._keep(paired, points, found) if found.is_keyscan else found
+        return self._keep(paired, points, near, found) if found.is_keyscan else found
+
+    def _near(self, points: F64) -> F64:
+        """The points (n, 2) within the range that is used."""
+        near: F64 = points[np.hypot(points[:, 0], points[:, 1]) < self._parameters.local_range]
+        return near
 
     def _predict(self, paired: PairedScan) -> tuple[Pose2, F64]:
         """The motion since the last keyscan and its covariance in the keyscan's frame."""
@@ -362,7 +368,7 @@ class FrontEnd:
         keep = found.is_keyscan and (long_refused or self._motion_gate.is_open(found.motion))
         return replace(found, is_keyscan=keep)
 
-    def _keep(self, paired: PairedScan, points: F64, found: LocalMatch) -> LocalMatch:
+    def _keep(self, paired: PairedScan, points: F64, near: F64, found: LocalMatch) -> LocalMatch:
         """Make the scan a keyscan: add it to the local maps."""
         p = self._parameters
         scans = found.scans or moving_scans(paired, points)
@@ -380,8 +386,8 @@ class FrontEnd:
             found = replace(found, anchor=self._tracker.tie(found.pose, self._covariance))
         if self._last is None:
             self._last, self._last_heading = (paired.scan.stamp_ns, found.pose), paired.heading
-        moved = found.pose @ points[np.hypot(points[:, 0], points[:, 1]) < p.local_range]
         if found.status is Status.MATCHED or len(self._maps) == 1:
+            moved = found.pose @ near
             for local, _ in self._maps:
                 local.add(moved, _KNOWN)
             self._recent.add(found.pose, scans)

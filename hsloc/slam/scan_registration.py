@@ -37,6 +37,9 @@ _SCALE_OF_GATE = 0.33
 _PRIOR_SCALE = 3.0
 """Scale of the Cauchy weight on the chi of the odometry: a step that the scans refute loses its weight."""
 _ROUNDS = 8
+_REGISTRATION = RegistrationParameters(
+    _GATES, _SCALE_OF_GATE, 1.0 / (_POINT_SIGMA**2 * _CORRELATED), _PRIOR_SCALE, _ROUNDS
+)
 SURPRISE = 3.0
 """Chi of a step against the odometry above which the two contradict each other."""
 _FEWEST_PAIRED = 30.0
@@ -131,7 +134,7 @@ class RecentScans:
     """State: the keyscans since the local map began, newest last, with their poses in the front end's map."""
 
     def __init__(self) -> None:
-        self._kept: list[tuple[F64, tuple[MovingScan, ...]]] = []
+        self._kept: list[list[tuple[F64, MovingScan]]] = []
         self._stored = StoredScans()
 
     def __len__(self) -> int:
@@ -143,31 +146,33 @@ class RecentScans:
 
     def start_with(self, known: list[tuple[F64, MovingScan]]) -> None:
         """Forget all but scans of a map at their poses (3,), the nearest last."""
-        self._kept = [(pose, (scan,)) for pose, scan in known[-_BACK[-1] :]]
+        self._kept = [[each] for each in known[-_BACK[-1] :]]
 
     def move(self, T_new_old: Pose2) -> None:
         """Move all into another frame."""
-        self._kept = [((T_new_old @ Pose2.from_array(pose)).to_array(), scans) for pose, scans in self._kept]
+        self._kept = [
+            [((T_new_old @ Pose2.from_array(pose)).to_array(), scan) for pose, scan in kept] for kept in self._kept
+        ]
 
     def hits(self, max_range: float) -> list[F64]:
         """Hits (n, 2) of each scan within `max_range` metres of the base, in the front end's map."""
         found = []
-        for pose, scans in self._kept:
-            for scan in scans:
+        for kept in self._kept:
+            for pose, scan in kept:
                 points = scan.scan.points[np.hypot(scan.scan.points[:, 0], scan.scan.points[:, 1]) < max_range]
-                found.append(Pose2.from_array(_composed(pose, scan.pose)) @ points.astype(np.float64))
+                found.append(Pose2.from_array(pose) @ points.astype(np.float64))
         return found
 
     def add(self, pose: Pose2, scans: tuple[MovingScan, ...]) -> None:
         """Keep a scan with its companions."""
-        self._kept = [*self._kept[-(_BACK[-1] - 1) :], (pose.to_array(), scans)]
+        base = pose.to_array()
+        self._kept = [*self._kept[-(_BACK[-1] - 1) :], [(_composed(base, scan.pose), scan) for scan in scans]]
 
     def register(
         self, scans: tuple[MovingScan, ...], start: Pose2, predicted: Pose2, covariance: F64
     ) -> ScanRegistration:
         """Register a scan with its companions from `start` on; odometry has it at `predicted`, `covariance` (3, 3)."""
-        fixed = [self._kept[-back] for back in _BACK if back <= len(self._kept)]
-        still = [(_composed(pose, scan.pose), scan) for pose, kept in fixed for scan in kept]
+        still = [each for back in _BACK if back <= len(self._kept) for each in self._kept[-back]]
         return register_onto(still, scans, start, predicted, covariance, self._stored)
 
 
@@ -253,12 +258,9 @@ def register_onto(
     """
     poses = np.array([pose for pose, _ in still] + [scan.pose for scan in scans])
     arrays, rows = (StoredScans() if stored is None else stored).rows([*(scan for _, scan in still), *scans])
-    parameters = RegistrationParameters(
-        _GATES, _SCALE_OF_GATE, 1.0 / (_POINT_SIGMA**2 * _CORRELATED), _PRIOR_SCALE, _ROUNDS
-    )
     pose, information, counts = start.to_array(), np.zeros((3, 3)), np.zeros(5)
     prior = Prior(predicted.to_array(), np.asarray(np.linalg.inv(covariance), dtype=np.float64))
-    chi = register(pose, Scene(len(still), poses, rows, arrays), prior, parameters, information, counts)
+    chi = register(pose, Scene(len(still), poses, rows, arrays), prior, _REGISTRATION, information, counts)
     seen = max(float(counts[2]), 1.0)
     return ScanRegistration(
         Pose2.from_array(pose),

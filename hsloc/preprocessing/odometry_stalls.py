@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 FROZEN_S = 3.0
 """Odometry that is at rest for this long (s) while the scans change is frozen. A robot at 0.1 m/s
 has gone 0.3 m by then, more than scans can hide; wheel encoders tick many times."""
-_STALL_S, _LONGEST_S = 0.2, 5.0
-"""Shortest stall (s): a base that counts more slowly than it publishes repeats poses, too; and longest: with scans that
-change all the time odometry is frozen after `FROZEN_S`, and seconds later at most that is known."""
+_STALL_S, _LONGEST_S = 0.2, 10.0
+"""Shortest stall (s): a base that counts more slowly than it publishes repeats poses, too; and longest: before that
+`OdometryWatch` finds the odometry frozen, but where walls are too far away for the scans to change."""
 _SAME = 1e-6
 """Poses that differ by no more than this (m, rad) are the same one again; a sensor at rest has more noise."""
 _STALL_M, _STALL_RAD = 0.1, 0.1
@@ -38,7 +38,7 @@ _HARDEST, _HARDEST_TURN = 10.0, 30.0
 """... and more than a robot does with these accelerations (m/s^2, rad/s^2), the first that of tyres that just hold."""
 _USUAL, _USUAL_TURN = 2.5, 5.0
 """Accelerations (m/s^2, rad/s^2) of ordinary robots, with which the motion over the whole stall must be possible. Of
-the 250 times that odometry of real logs was at rest for `_STALL_S` or longer none ends with a fifth of a jump."""
+the 193 times that odometry of real logs was at rest for `_STALL_S` or longer none ends with a fifth of a jump."""
 _MOVES_M_S, _MOVES_RAD_S, _FASTEST_RAD_S = 0.05, 0.05, 10.0
 """Speeds (m/s, rad/s) from which on a robot moves, as odometry is set anew while it stands; and fastest turn."""
 _BURST = 0.5
@@ -48,7 +48,7 @@ _FEWEST_SCANS = 2
 _INTERVALS = 9
 """Intervals that say what is usual."""
 _MOST_HELD = 5000
-"""Events that are held back, at most: of a base at 1 kHz and several lidars in 5 s there are about as many."""
+"""Events that are held back, at most: of a base at 200 Hz and several lidars in 10 s there are fewer."""
 
 
 class UnstalledOdometry:

@@ -2,7 +2,8 @@
 
 The pose of a matched scan follows what the lidar saw; odometry with the same stamp should have turned as much. Where it
 did not, the correction of each match belongs to another moment, and poses are wrong by what the robot moved meanwhile.
-Stamps are then corrected, or the beams of a lidar that turns while the robot does, and the log is replayed once more.
+Stamps are then corrected, or the beams of a lidar that turns while the robot does, and the log is replayed once more;
+as a map is where the laser looks elsewhere than the log states.
 """
 
 from __future__ import annotations

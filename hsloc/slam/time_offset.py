@@ -3,8 +3,7 @@
 A driver that stamps a scan when it arrives, a lidar with a clock of its own: the odometry at the scan's stamp is then
 that of another moment, and every turn bends the pose. The offset is found where the heading that the scans show agrees
 best with the heading of the odometry, as in Censi et al. (T-RO 2013) for the rotation alone; a robot that never turns
-does not determine it. What the odometry gets wrong about each turn averages out over many of them, and is counted in
-the uncertainty.
+does not determine it. The odometry's errors in single turns average out over many, and are counted in the uncertainty.
 """
 
 from __future__ import annotations

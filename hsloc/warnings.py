@@ -146,6 +146,8 @@ class WarningCode(StrEnum):
     """The scans of one laser fit the map far worse than those of another."""
     EXTRINSICS_WRONG = "extrinsics_wrong"
     """The steps between matches and those of the odometry agree only if the laser is mounted elsewhere than stated."""
+    EXTRINSICS_MEASURED = "extrinsics_measured"
+    """Nothing states where the laser is mounted; the scans of a map and the odometry show it."""
     EXTRINSICS_DISAGREE = "extrinsics_disagree"
     """Two lasers, each matched alone, disagree about the pose of the base: a mounting is wrong."""
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.evaluation.association import interpolate_poses
+from hsloc.localisation.mounting_error import mounting_error_of_steps
 from hsloc.localisation.states import localisation_reasons
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
 from hsloc.replay.clock_offset import KNOWN, matched_headings
@@ -59,7 +61,7 @@ def quality_warnings(result: Result) -> list[RunWarning]:
     """
     if result.mapping is not None:
         of_map = [*_stray_warnings(result.mapping, result), *_plan_warnings(result.mapping, result)]
-        return [*of_map, *_direction_warnings(result)]
+        return [*of_map, *(_direction_warnings(result) or _place_warnings(result.mapping, result))]
     if result.mode != "localise":
         return []
     of_sensor = [*_mirror_warnings(result), *_scale_warnings(result), *_mounting_warnings(result)]
@@ -177,6 +179,38 @@ def _direction_warnings(result: Result) -> list[RunWarning]:
     reading, front_end = result.reading or request.reading(), request.config.graph_mapper.front_end
     found = right_mounting(request.logs, reading, front_end, used=False)
     return [] if found is None else [found[1]]
+
+
+def _place_warnings(mapping: MappingResult, result: Result) -> list[RunWarning]:
+    """Where a laser is that is not where it is stated or assumed to be: by the finished map and the odometry.
+
+    An offset of the clocks looks like another place, and is none.
+    """
+    odometry, stamps = result.odometry, mapping.keyscan_stamps_ns
+    if result.lidar_only or len(odometry) == 0 or len(result.summary.lasers) > 1:
+        return []
+    # Those of a map that is extended are of other logs.
+    own = (stamps >= odometry.stamps_ns[0]) & (stamps <= odometry.stamps_ns[-1])
+    driven, begins = interpolate_poses(odometry, stamps[own]), np.zeros(np.count_nonzero(own), dtype=np.bool_)
+    found = mounting_error_of_steps(driven, mapping.keyscan_poses[own], begins)
+    if found is None or not found.is_displaced:
+        return []
+    offset = find_offset(*matched_headings(result.diagnostics, odometry, result.trajectory))
+    if offset.is_significant or not isfinite(offset.sigma):
+        return []
+    stated = result.summary.T_base_laser
+    right, sigma = found.error @ stated, hypot(*found.sigma[:2])
+    option = f"--laser-pose={right.x:.3f},{right.y:.3f},{stated.theta:.4f}"
+    if result.summary.extrinsics == "identity":
+        text = f"by scans and odometry the laser is at ({right.x:.3f}, {right.y:.3f}) ± {sigma:.3f} m in the base frame"
+        remedy = f"the poses are those of the laser; {option} makes them those of the base"
+        return [RunWarning(WarningCode.EXTRINSICS_MEASURED, text, remedy)]
+    by = hypot(found.error.x, found.error.y)
+    text = (
+        f"scans and odometry agree if the laser is {by:.3f} ± {sigma:.3f} m from where it is stated; where no wall "
+        "fixes the motion, the map is off by as much after each turn"
+    )
+    return [RunWarning(WarningCode.EXTRINSICS_WRONG, text, f"measure it, or hsloc calibrate; {option}")]
 
 
 def offset_warnings(result: Result) -> list[RunWarning]:

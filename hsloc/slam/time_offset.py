@@ -322,7 +322,7 @@ def offsets_of_log(paths: Sequence[Path], options: ReadOptions, parameters: Fron
         apart = log.summary.clocks_apart_s
         apart = apart if 0.5 * RANGE_S < abs(apart) <= LONGEST_OFFSET_S else 0.0
         if apart:
-            items = [*([given] if given else []), f"{_first(topic)}={-apart!r}"]
+            items = [*([given] if given else []), f"{topic.partition(' + ')[0]}={-apart!r}"]
             log = open_log(paths, replace(named, time_offset=",".join(items)))
         offset = estimate_offset(log.events(), parameters, np.random.default_rng(0))
         if isfinite(offset.sigma) or offset.is_mirrored:
@@ -378,23 +378,19 @@ def offset_warning(topic: str, offset: Offset, given_s: float = 0.0) -> RunWarni
     return RunWarning(
         WarningCode.CLOCK_OFFSET_LARGE if abs(offset.seconds) >= LARGE_S else WarningCode.CLOCK_OFFSET,
         f"the stamps of {topic} are {in_words(offset)} those of the odometry, by their headings",
-        f"--time-offset {_first(topic)}={given_s - offset.seconds:.3f} removes it, or --time-offset auto",
+        f"--time-offset {topic.partition(' + ')[0]}={given_s - offset.seconds:.3f} removes it, or --time-offset auto",
     )
 
 
 def as_option(offsets: Mapping[str, Offset], *, deskew: bool) -> str | None:
     """The value of `--time-offset` that removes the offsets that are significant; None where none is.
 
-    A scan that is not deskewed shows the robot as it was in the middle of the sweep: it gets the stamp of then.
+    A scan that is not deskewed shows the robot as it was in the middle of the sweep: it gets the stamp of then. Of the
+    kinds of lines of a text log, which are joined by plus signs, the first is named.
     """
     items = [
-        f"{_first(topic)}={(0.0 if deskew else offset.half_sweep_s) - offset.seconds:.3f}"
+        f"{topic.partition(' + ')[0]}={(0.0 if deskew else offset.half_sweep_s) - offset.seconds:.3f}"
         for topic, offset in offsets.items()
         if offset.is_significant
     ]
     return ",".join(items) or None
-
-
-def _first(topic: str) -> str:
-    """The topic; of the kinds of lines of a text log, which are joined by plus signs, the first."""
-    return topic.partition(" + ")[0]

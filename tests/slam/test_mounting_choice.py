@@ -127,3 +127,12 @@ def test_a_map_is_built_with_the_yaw_that_scans_and_odometry_show(tmp_path: Path
     (named,) = quality_warnings(given)
     assert named.code == WarningCode.EXTRINSICS_WRONG
     assert named.remedy == warning.remedy
+
+
+def test_a_map_shows_a_laser_that_is_elsewhere_than_it_is_stated(tmp_path: Path, recorded: list[Event]) -> None:
+    path = write(tmp_path / "a.mcap", recorded, [Transform3.from_pose2(Pose2(0.2, -0.1, 0.0) @ RIGHT)])
+    (warning,) = quality_warnings(run(path, mode="slam"))
+    assert warning.code == WarningCode.EXTRINSICS_WRONG
+    assert "0.22" in warning.text
+    x, y, _ = (float(value) for value in warning.remedy.partition("--laser-pose=")[2].split(","))
+    assert (x, y) == pytest.approx((RIGHT.x, RIGHT.y), abs=0.02)

@@ -189,7 +189,9 @@ def _in_clock_of_poses(result: Result, stamps_ns: NDArray[np.int64]) -> NDArray[
 
     References that were made of a log's scans bear their stamps as recorded: where these were corrected, they are, too.
     """
-    shifts = set(result.reading.offsets_s().values()) if result.corrected_offsets and result.reading else set()
+    given = result.reading.offsets_s() if result.corrected_offsets and result.reading else {}
+    odometry = (result.summary.odom_topic or "").lstrip("/")
+    shifts = {offset_s for topic, offset_s in given.items() if topic != odometry}
     scans = np.sort(result.diagnostics.stamps_ns)
     if len(shifts) != 1 or len(stamps_ns) == 0 or len(scans) < 2:
         return stamps_ns

@@ -169,7 +169,7 @@ class MapScaleEstimator:
         beams, ranges = beams[on_walls], ranges[on_walls]
         distance, found = self._distances(scaled, normals, pose)
         step = np.hypot(*np.diff(scaled, axis=0, prepend=scaled[:1]).T)
-        squares = distance**2 + paired.noise()[on_walls] ** 2
+        squares = distance**2 + paired.scan.noise()[on_walls] ** 2
         weight = np.minimum(step / self._field.resolution, 1.0) * found / (1.0 + squares / _ROBUST_M**2)
         self._add_walls(scaled, normals, np.where(found, distance, np.inf), pose)
         across = (normals * beams).sum(axis=1)

@@ -150,10 +150,6 @@ class PairedScan:
             return points
         return np.concatenate((points, *(self.to(other) @ other.scan.points_base() for other in self.companions)))
 
-    def noise(self) -> NDArray[np.float64]:
-        """The standard deviation of the range of each point of `points_base` (m), shape (m,); 0 where not known."""
-        return np.concatenate([each.scan.noise() for each in (self, *self.companions)])
-
     def to(self, other: PairedScan) -> Pose2:
         """How the base moved from this scan to another, by odometry."""
         return self.T_odom_base.between(other.T_odom_base)

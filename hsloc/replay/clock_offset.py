@@ -21,7 +21,6 @@ from hsloc.slam.mounting_choice import direction_warnings, right_mounting, with_
 from hsloc.slam.time_offset import (
     HINT_S,
     Headings,
-    as_option,
     clock_warnings,
     find_offset,
     offsets_of_log,
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.localisation.mounting_error import MountingError
-    from hsloc.log import Log, ReadOptions
+    from hsloc.log import Log, LogSummary, ReadOptions
     from hsloc.model.estimate import ScanDiagnostics
     from hsloc.model.trajectory import Trajectory
     from hsloc.replay.run_history import RunHistory
@@ -42,6 +41,10 @@ if TYPE_CHECKING:
     from hsloc.slam.time_offset import Offset
 
 R = TypeVar("R")
+_TRANSFORMS = ("TFMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
+"""Types of messages that hold transforms of other frames, too."""
+_MILLISECOND = 1e-3
+"""Rest of an offset (s) that is left as it is: a millimetre."""
 
 
 class LateScans(Exception):
@@ -158,7 +161,7 @@ def open_as_meant(
     if automatic or apart:
         found = offsets_of_log(request.logs, reading, front_end)
         if automatic:
-            time_offset = as_option(found, deskew=reading.deskew or log.summary.segments > 1)
+            time_offset = as_option(found, own_odometry(log.summary), deskew=reading.deskew or log.summary.segments > 1)
         warnings = (*warnings, *(warning for _, warning in clock_warnings(found, removed=automatic)))
     if time_offset is not None:
         reading = replace(reading, time_offset=time_offset or reading.time_offset)
@@ -227,11 +230,11 @@ def offsets_of_mapping(
     offset = history.clock_offset(sweeps=correct and not deskew)
     if offset is None or (history.lasers > 1 and offset.is_significant):
         # Several lasers have clocks of their own.
-        found, option = clock_offsets(request, reading, deskew=deskew)
+        found, option = clock_offsets(request, reading, log.summary, deskew=deskew)
     else:
         found = {log.summary.scan_topic or "": offset}
         is_free = offset.is_certain and not _is_given(request)
-        option = as_option(found, deskew=deskew) if is_free else None
+        option = as_option(found, own_odometry(log.summary), deskew=deskew) if is_free else None
     if correct and offset is not None and not (offset.is_significant or _is_given(request)):
         of_stamps = offset._replace(seconds=-offset.half_sweep_s)
         if of_stamps.is_certain:
@@ -278,7 +281,9 @@ def swept_scans(
     return SweptScans(request, half, fitness)
 
 
-def clock_offsets(request: RunRequest, reading: ReadOptions, *, deskew: bool) -> tuple[dict[str, Offset], str | None]:
+def clock_offsets(
+    request: RunRequest, reading: ReadOptions, summary: LogSummary, *, deskew: bool
+) -> tuple[dict[str, Offset], str | None]:
     """The offsets (s) by topic that the scans of a log, as it was read, show by themselves, and what removes them.
 
     That is a value of `--time-offset`; None where there is no offset that is certain, and where the user has given one.
@@ -287,4 +292,31 @@ def clock_offsets(request: RunRequest, reading: ReadOptions, *, deskew: bool) ->
     # Poses are weighed with the odometry, which hides a part of the offset: the scans alone show the whole of it.
     found = offsets_of_log(request.logs, reading, request.config.graph_mapper.front_end)
     certain = {topic: offset for topic, offset in found.items() if offset.is_certain}
-    return found, None if _is_given(request) else as_option(certain, deskew=deskew)
+    odometry = own_odometry(summary) if len(certain) == len(found) else None
+    return found, None if _is_given(request) else as_option(certain, odometry, deskew=deskew)
+
+
+def as_option(offsets: Mapping[str, Offset], odometry: str | None, *, deskew: bool) -> str | None:
+    """The value of `--time-offset` that removes the offsets that are significant; None where none is.
+
+    Messages wait, and are stamped late, not early. Where the scans of all lidars are early it is therefore the topic of
+    the `odometry` that is moved, as far as they have it in common; None: it cannot be. A scan that is not deskewed
+    shows the robot as it was in the middle of the sweep: it gets the stamp of then. Of the kinds of lines of a text
+    log, which are joined by plus signs, the first is named.
+    """
+    late_s = -max((offset.seconds if offset.is_significant else 0.0 for offset in offsets.values()), default=0.0)
+    late_s = max(late_s, 0.0) if odometry is not None else 0.0
+    moved = [f"{odometry}={-late_s:.3f}"] if late_s else []
+    for topic, offset in offsets.items():
+        left_s = (0.0 if deskew else offset.half_sweep_s) - offset.seconds - late_s
+        if offset.is_significant and not (moved and abs(left_s) < _MILLISECOND):
+            moved.append(f"{topic.partition(' + ')[0]}={left_s:.3f}")
+    return ",".join(moved) or None
+
+
+def own_odometry(summary: LogSummary) -> str | None:
+    """The topic of the odometry, if it has stamps of its own: neither those of other transforms nor of scans."""
+    kinds = {each.topic: each.typename.rpartition("/")[2] for each in summary.topics}
+    topic = summary.odom_topic
+    is_own = kinds.get(topic or "", _TRANSFORMS[0]) not in _TRANSFORMS and topic != summary.scan_topic
+    return topic if is_own and summary.heading_topic is None else None

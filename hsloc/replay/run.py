@@ -239,10 +239,10 @@ def _run_on(request: RunRequest, progress: Report, correction: Correction = None
     is_settled = {WarningCode.CLOCK_OFFSET_APPLIED, WarningCode.CLOCK_SET} & {each.code for each in result.warnings}
     if result.mode != "localise" or result.lidar_only or is_settled:
         return result
-    evidence = result.clock_evidence()
-    if not evidence.hints:
+    if not (evidence := result.clock_evidence()).hints:
         return result
-    offsets, option = clock_offsets(request, result.reading or request.reading(), deskew=result.deskewed)
+    reading = result.reading or request.reading()
+    offsets, option = clock_offsets(request, reading, result.summary, deskew=result.deskewed)
     if option is not None:
         warnings = tuple(warning for _, warning in clock_warnings(offsets, removed=True))
         again = _run_with(

@@ -355,8 +355,7 @@ def clock_warnings(
             warnings.append((topic, RunWarning(WarningCode.SCANS_MIRRORED, text, remedy)))
         if offset.is_significant and removed:
             text = f"the stamps of {topic} were {in_words(offset)} those of the odometry, which was corrected"
-            late = f"or --time-offset ODOM_TOPIC={offset.seconds:.3f}, if that is late" if offset.seconds < 0.0 else ""
-            warnings.append((topic, RunWarning(WarningCode.CLOCK_OFFSET_APPLIED, text, late)))
+            warnings.append((topic, RunWarning(WarningCode.CLOCK_OFFSET_APPLIED, text)))
         elif offset.is_significant:
             warnings.append((topic, offset_warning(topic, offset, (given or {}).get(topic.lstrip("/"), 0.0))))
         if offset.drift_s:
@@ -380,17 +379,3 @@ def offset_warning(topic: str, offset: Offset, given_s: float = 0.0) -> RunWarni
         f"the stamps of {topic} are {in_words(offset)} those of the odometry, by their headings",
         f"--time-offset {topic.partition(' + ')[0]}={given_s - offset.seconds:.3f} removes it, or --time-offset auto",
     )
-
-
-def as_option(offsets: Mapping[str, Offset], *, deskew: bool) -> str | None:
-    """The value of `--time-offset` that removes the offsets that are significant; None where none is.
-
-    A scan that is not deskewed shows the robot as it was in the middle of the sweep: it gets the stamp of then. Of the
-    kinds of lines of a text log, which are joined by plus signs, the first is named.
-    """
-    items = [
-        f"{topic.partition(' + ')[0]}={(0.0 if deskew else offset.half_sweep_s) - offset.seconds:.3f}"
-        for topic, offset in offsets.items()
-        if offset.is_significant
-    ]
-    return ",".join(items) or None

@@ -16,6 +16,7 @@ from hsloc.evaluation.association import interpolate_poses
 from hsloc.log import ReadOptions, convert_log, open_log
 from hsloc.model import Odometry, Scan
 from hsloc.model.pose2 import relative_poses
+from hsloc.replay.clock_offset import as_option
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
 from hsloc.slam.front_end import FrontEndParameters
@@ -23,7 +24,6 @@ from hsloc.slam.time_offset import (
     UNKNOWN,
     Headings,
     Offset,
-    as_option,
     best_offset,
     clock_warnings,
     estimate_offset,
@@ -150,17 +150,37 @@ def test_a_run_warns_of_late_scans_and_auto_removes_it(tmp_path: Path) -> None:
     assert re.search(r"--time-offset /scan=-?0\.00", warning.remedy)
     assert metrics.verdict == "check"
     found = offsets_of_log((OFFICE,), END, FrontEndParameters())
-    assert as_option(found, deskew=False) is None
-    (sweeping,) = ({topic: offset._replace(seconds=0.2, half_sweep_s=0.05)} for topic, offset in found.items())
-    assert as_option(sweeping, deskew=True) == "/scan=-0.200"
-    assert as_option(sweeping, deskew=False) == "/scan=-0.150"
-    remedies = [clock_warnings({"/scan": found["/scan"]._replace(seconds=s)}, removed=True) for s in (0.2, -0.2)]
-    # Messages wait, and are stamped late: where scans are early, the odometry may be what is wrong.
-    assert ["ODOM_TOPIC=-0.200" in warning.remedy for ((_, warning),) in remedies] == [False, True]
+    assert as_option(found, "/odom", deskew=False) is None
     sound = run(RunRequest(logs=(OFFICE,), read=replace(END, time_offset="auto")))
     assert sound.reference is not None
     assert evaluate(sound.trajectory, sound.reference).ape.trans_part.rmse < 0.01
     assert analyse(sound).metrics.warnings == ()
+
+
+def test_what_is_late_is_moved() -> None:
+    """Messages wait, and are stamped late, not early: of scans that are early it is the odometry that is late."""
+    late, early = (UNKNOWN._replace(seconds=s, sigma=0.001, half_sweep_s=0.05) for s in (0.2, -0.2))
+    assert as_option({"/scan": late}, "/odom", deskew=True) == "/scan=-0.200"
+    assert as_option({"/scan": late}, "/odom", deskew=False) == "/scan=-0.150"
+    assert as_option({"/scan": early}, "/odom", deskew=True) == "/odom=-0.200"
+    assert as_option({"/scan": early}, "/odom", deskew=False) == "/odom=-0.200,/scan=0.050"
+    assert as_option({"FLASER + RLASER": early}, None, deskew=False) == "FLASER=0.250"
+    earlier = early._replace(seconds=-0.3)
+    assert as_option({"/front": early, "/rear": earlier}, "/odom", deskew=True) == "/odom=-0.200,/rear=0.100"
+    assert as_option({"/front": late, "/rear": early}, "/odom", deskew=True) == "/front=-0.200,/rear=0.200"
+    sound = UNKNOWN._replace(seconds=0.0, sigma=0.001)
+    assert as_option({"/front": sound, "/rear": early}, "/odom", deskew=True) == "/rear=0.200"
+
+
+def test_odometry_that_is_late_is_moved(tmp_path: Path) -> None:
+    late = tmp_path / "late.mcap"
+    convert_log(open_log((OFFICE,), replace(END, time_offset="/odom=0.3", end_s=20.0)), late)
+    result = run(RunRequest(logs=(late,)))
+    assert [warning.code for warning in analyse(result).metrics.warnings] == ["clock_offset_applied"]
+    assert result.reading is not None
+    assert result.reading.offsets_s()["odom"] == pytest.approx(-0.3, abs=0.01)
+    assert result.reference is not None
+    assert evaluate(result.trajectory, result.reference).ape.trans_part.max < 0.05
 
 
 def test_late_scans_of_a_log_that_is_mapped_are_corrected(tmp_path: Path) -> None:

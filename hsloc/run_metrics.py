@@ -118,7 +118,7 @@ class ClockOffsetMetrics:
     sigma: float
     """Standard deviation of the offset [s]."""
     corrected: bool
-    """Whether the stamps of the scans were corrected by it."""
+    """Whether it was removed: from the stamps of the scans, or, where these are early, from those of the odometry."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

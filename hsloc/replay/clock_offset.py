@@ -162,7 +162,7 @@ def open_as_meant(
         found = offsets_of_log(request.logs, reading, front_end)
         if automatic:
             time_offset = as_option(found, own_odometry(log.summary), deskew=reading.deskew or log.summary.segments > 1)
-        warnings = (*warnings, *(warning for _, warning in clock_warnings(found, removed=automatic)))
+        warnings = (*warnings, *(warning for _, warning in clock_warnings(found, removed=time_offset)))
     if time_offset is not None:
         reading = replace(reading, time_offset=time_offset or reading.time_offset)
     return (log if reading == plain else open_log(request.logs, reading)), reading, warnings

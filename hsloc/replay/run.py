@@ -231,7 +231,7 @@ def _run_on(request: RunRequest, progress: Report, correction: Correction = None
     except LateScans as late:
         result = _run_with(request, progress, lidar_only=False, time_offset=late.option)
         whole = late.with_rest(result.clock_offsets or {})
-        warnings = (*result.warnings, *(warning for _, warning in clock_warnings(whole, removed=True)))
+        warnings = (*result.warnings, *(warning for _, warning in clock_warnings(whole, removed=late.option)))
         return replace(result, warnings=warnings, corrected_offsets=whole)
     except (SweptScans, TurnedLaser) as found:
         better = _again(found, progress, correction)
@@ -244,7 +244,7 @@ def _run_on(request: RunRequest, progress: Report, correction: Correction = None
     reading = result.reading or request.reading()
     offsets, option = clock_offsets(request, reading, result.summary, deskew=result.deskewed)
     if option is not None:
-        warnings = tuple(warning for _, warning in clock_warnings(offsets, removed=True))
+        warnings = tuple(warning for _, warning in clock_warnings(offsets, removed=option))
         again = _run_with(
             request, progress, lidar_only=False, warnings=warnings, time_offset=option, correction=correction
         )

@@ -337,12 +337,12 @@ def in_words(offset: Offset) -> str:
 
 
 def clock_warnings(
-    found: Mapping[str, Offset], given: Mapping[str, float] | None = None, removed: bool = False
+    found: Mapping[str, Offset], given: Mapping[str, float] | None = None, removed: str | None = None
 ) -> list[tuple[str, RunWarning]]:
     """(topic, warning) of the offsets that are none by chance, of clocks that drift, and of scans that are mirrored.
 
-    `given` is what the user adds to the stamps already (s) by topic, without its leading slash; `removed` says that the
-    offsets were removed.
+    `given` is what the user adds to the stamps already (s) by topic, without its leading slash; `removed` is the value
+    of `--time-offset` by which the offsets were removed.
     """
     warnings = []
     for topic, offset in found.items():
@@ -353,8 +353,9 @@ def clock_warnings(
             )
             remedy = "--scan-fix angles=negate turns them; increment=negate, if only that has the wrong sign"
             warnings.append((topic, RunWarning(WarningCode.SCANS_MIRRORED, text, remedy)))
-        if offset.is_significant and removed:
-            text = f"the stamps of {topic} were {in_words(offset)} those of the odometry, which was corrected"
+        if offset.is_significant and removed is not None:
+            by = f"which was corrected (--time-offset {removed})"
+            text = f"the stamps of {topic} were {in_words(offset)} those of the odometry, {by}"
             warnings.append((topic, RunWarning(WarningCode.CLOCK_OFFSET_APPLIED, text)))
         elif offset.is_significant:
             warnings.append((topic, offset_warning(topic, offset, (given or {}).get(topic.lstrip("/"), 0.0))))

@@ -191,8 +191,7 @@ def _place_warnings(mapping: MappingResult, result: Result) -> list[RunWarning]:
         return []
     # Those of a map that is extended are of other logs.
     own = (stamps >= odometry.stamps_ns[0]) & (stamps <= odometry.stamps_ns[-1])
-    driven, begins = interpolate_poses(odometry, stamps[own]), np.zeros(np.count_nonzero(own), dtype=np.bool_)
-    found = mounting_error_of_steps(driven, mapping.keyscan_poses[own], begins)
+    found = mounting_error_of_steps(interpolate_poses(odometry, stamps[own]), mapping.keyscan_poses[own])
     if found is None or not found.is_displaced:
         return []
     offset = find_offset(*matched_headings(result.diagnostics, odometry, result.trajectory))

@@ -95,10 +95,14 @@ def mounting_error(anchors: Sequence[Anchor]) -> MountingError | None:
     return mounting_error_of_steps(odometry, matched, np.array([anchor.begins for anchor in anchors]))
 
 
-def mounting_error_of_steps(odometry: F64, matched: F64, begins: NDArray[np.bool_]) -> MountingError | None:
-    """By poses (n, 3) of the odometry and of the matches, of which some (n,) begin anew; None as above."""
+def mounting_error_of_steps(
+    odometry: F64, matched: F64, begins: NDArray[np.bool_] | None = None
+) -> MountingError | None:
+    """By poses (n, 3) of the odometry and of the matches; `begins` (n,): a new track begins there. None as above."""
     step, seen = relative_poses(odometry[:-1], odometry[1:]), relative_poses(matched[:-1], matched[1:])
-    usable = ~begins[1:] & (np.hypot(step[:, 0], step[:, 1]) < _LONGEST_M)
+    usable = np.hypot(step[:, 0], step[:, 1]) < _LONGEST_M
+    if begins is not None:
+        usable &= ~begins[1:]
     step, seen = step[usable], seen[usable]
     turned = wrap_angles(seen[:, 2])  # noise of the odometry turns its translation, too: it would show as a place
     if len(step) < _FEWEST:

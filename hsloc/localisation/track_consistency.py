@@ -83,7 +83,7 @@ ended where the robot went on for more than the last (m) on mapped ground. Assum
 benchmarks/confusion.py."""
 _ASTRAY = 0.03
 """Weight of being astray from the beginning on another map. There it is the rule, and on the right one the prior of all
-starts is 0.01; but of those that do not fit so many are wrong, or stand where the map has changed, that another map
+starts is 0.01; but of those that do not fit many are wrong, or stand where the map has changed, so that another map
 gains 3 by it and not 100. Assumed; from 0.01 to 0.1 the states of 125 runs (benchmarks/confusion.py) differ in one."""
 _FOUND_AFTER_M, _LOST_M, _MOST_FROM_LOST = 6.0, 5.0, 6.0
 """A robot on mapped ground is found again within the first (m); each further stretch of the second (m) counts 1, up to
@@ -172,7 +172,7 @@ class MappedGround:
 
     @cached_property
     def is_closed(self) -> bool:
-        """Whether no free ground borders on what is unknown, or on the edge of the map: then nobody leaves it."""
+        """Whether no free ground borders on the unknown, or on the edge of the map: then a robot cannot leave it."""
         unknown = np.pad(~self._known, 1, constant_values=True)
         return not (self._free & _beside(unknown)).any()
 

@@ -21,7 +21,7 @@ import numpy as np
 from hsloc.log import LEAST_JUMP, LONGEST_JUMP_S, MAX_SPEED
 from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import Pose2, wrap_angle
-from hsloc.preprocessing.odometry_stalls import FROZEN_S, UnstalledOdometry
+from hsloc.preprocessing.odometry_stalls import UnstalledOdometry
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -36,6 +36,9 @@ _LEAST_TURN, _MAX_TURN = 0.8, 10.0
 _MOST = 20
 """Number of jumps that are mended; after more of them the odometry is taken for broken."""
 
+_FROZEN_S = 3.0
+"""Odometry that is at rest for this long (s) while the scans change is frozen. A robot at 0.1 m/s
+has gone 0.3 m by then, more than scans can hide; wheel encoders tick many times."""
 _COMPARED_S = 1.0
 """Scans are compared with one that is at least this old (s)."""
 _CHANGED_M = 0.1
@@ -202,7 +205,7 @@ class OdometryWatch:
             self._moving_ns += seconds_ns
         else:
             self._moving_ns = 0
-        if self._moving_ns >= FROZEN_S * 1e9:
+        if self._moving_ns >= _FROZEN_S * 1e9:
             seconds = (scan.stamp_ns - self._since_ns) / 1e9
             raise UnusableOdometry(f"it does not move for {seconds:.1f} s while the scans do")
 

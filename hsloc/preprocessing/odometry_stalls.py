@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from hsloc.model.events import Event
     from hsloc.model.pose2 import Pose2
 
-FROZEN_S = 3.0
-"""Odometry that is at rest for this long (s) while the scans change is frozen. A robot at 0.1 m/s
-has gone 0.3 m by then, more than scans can hide; wheel encoders tick many times."""
 _STALL_S, _LONGEST_S = 0.2, 10.0
 """Shortest stall (s): a base that counts more slowly than it publishes repeats poses, too; and longest: before that
 `OdometryWatch` finds the odometry frozen, but where walls are too far away for the scans to change."""
@@ -40,7 +37,7 @@ _USUAL, _USUAL_TURN = 2.5, 5.0
 """Accelerations (m/s^2, rad/s^2) of ordinary robots, with which the motion over the whole stall must be possible. Of
 the 193 times that odometry of real logs was at rest for `_STALL_S` or longer none ends with a fifth of a jump."""
 _MOVES_M_S, _MOVES_RAD_S, _FASTEST_RAD_S = 0.05, 0.05, 10.0
-"""Speeds (m/s, rad/s) from which on a robot moves, as odometry is set anew while it stands; and fastest turn."""
+"""Speeds (m/s, rad/s) from which on a robot moves, as odometry is reset while it stands; and fastest turn."""
 _BURST = 0.5
 """Messages that follow each other within this part of their usual interval come at once."""
 _FEWEST_SCANS = 2

@@ -297,7 +297,7 @@ class RunHistory:
         if self._motion_model is not None:
             return mounting_error(self._anchors)
         poses = np.array(self._mapped).reshape(-1, 6)
-        found = mounting_error_of_steps(poses[:, :3], poses[:, 3:], np.zeros(len(poses), dtype=np.bool_))
+        found = mounting_error_of_steps(poses[:, :3], poses[:, 3:])
         return None if found is None else found.of_yaw()
 
     def ambiguities(self, states: StateRows | None) -> tuple[Ambiguity, ...]:

@@ -97,6 +97,7 @@ class LocalMap:
         old_low, old_high = grown.corner, grown.corner + np.array((width, height))
         if height == 0:
             new_low, new_high = low, high
+            self._packed = None  # That of an empty map, where the field was asked for before the first point.
         else:
             spare = (old_high - old_low) // 4
             new_low = np.where(low < old_low, np.minimum(low, old_low) - spare, old_low)

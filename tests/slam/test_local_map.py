@@ -31,6 +31,7 @@ def test_it_scores_as_a_field_of_the_same_points_does() -> None:
 def test_growing_changes_nothing_that_was_drawn() -> None:
     grown, whole = LocalMap(0.05, 0.2, 0.6), LocalMap(0.05, 0.2, 0.6)
     parts = [wall(), wall(y=7.0) + np.array((5.0, 0.0)), wall(y=-9.0) - np.array((20.0, 0.0))]
+    assert grown.field.fitness(wall(), IDENTITY) == 0.0  # searched before the first point, as after a scan without any
     for part in parts:
         grown.add(part, saturation_score=2.0)
     whole.add(np.concatenate(parts), saturation_score=2.0)

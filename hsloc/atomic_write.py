@@ -7,7 +7,7 @@ import os
 import shutil
 from typing import TYPE_CHECKING
 
-from hsloc.errors import OutputError
+from hsloc.errors import OutputError, not_written
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -26,7 +26,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
             write(stream)
         beside.replace(path)
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error}); choose another folder") from error
+        raise OutputError(not_written(path, error)) from error
     finally:
         # Gone already after a good run; after a bad one nothing half-written may stay behind.
         with contextlib.suppress(OSError):
@@ -52,6 +52,8 @@ def whole_folder(folder: Path) -> Iterator[Path]:
             shutil.rmtree(folder)
         partial.rename(folder)
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
+        raise OutputError(not_written(folder, error)) from error
+    except OutputError as error:  # Of a file in it: there is no such folder any more.
+        raise OutputError(str(error).replace(str(partial), str(folder))) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)

@@ -23,7 +23,7 @@ import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from hsloc.errors import HslocError, no_such
+from hsloc.errors import HslocError, no_such, not_written
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -199,7 +199,7 @@ class Client:
                     raise ClientError(f"the server names a file {asset['name']!r}, which is no plain name")
                 paths.append(self._fetch(asset, folder / asset["name"]))
         except OSError as error:
-            raise ClientError(f"{folder}: cannot be written: {error.strerror or error}") from error
+            raise ClientError(not_written(folder, error)) from error
         return paths
 
     def _fetch(self, asset: Mapping[str, Any], path: Path) -> Path:

@@ -55,6 +55,11 @@ class OutputError(HslocError):
     """Results cannot be written."""
 
 
+def not_written(path: object, error: OSError) -> str:
+    """The message for a file or folder that cannot be written."""
+    return f"{path}: cannot be written ({error.strerror or error}); check the folder, its rights and free space"
+
+
 def no_such(path: Path, what: str = "file", remedy: str = "; check the path") -> str:
     """The message for a path that does not exist: names a similar file beside it, else the remedy."""
     try:

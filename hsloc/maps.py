@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hsloc.errors import MapError, OutputError
+from hsloc.errors import MapError, OutputError, not_written
 from hsloc.model import OccupancyGrid, Pose2
 from hsloc.model.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from hsloc.warnings import RunWarning, WarningCode
@@ -316,6 +316,4 @@ def _write(path: Path, data: bytes) -> None:
     except OSError as error:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
-        raise OutputError(
-            f"{path}: cannot be written ({error.strerror or error}); check the folder, its rights and free space"
-        ) from error
+        raise OutputError(not_written(path, error)) from error

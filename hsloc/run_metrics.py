@@ -105,6 +105,8 @@ class LogMetrics:
     """The lasers whose scans were used."""
     clock_offsets: tuple[ClockOffsetMetrics, ...] | None = None
     """Offsets of the clocks, by the matches of the run; left out where none was determined."""
+    time_offset: str | None = None
+    """Whose stamps were moved and by how much [s], as --time-offset takes it: given, or found; left out if none was."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

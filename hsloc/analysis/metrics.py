@@ -14,6 +14,7 @@ from hsloc.evaluation.maps import compare_maps, crispness
 from hsloc.evaluation.metrics import compare_run
 from hsloc.log import LaserSummary
 from hsloc.matching import summarise
+from hsloc.options import AUTO
 from hsloc.run_metrics import (
     CertificateMetrics,
     ClockOffsetMetrics,
@@ -80,7 +81,13 @@ def log_metrics(result: Result) -> LogMetrics:
         reference=None if result.reference is None else reference,
         lasers=tuple(LaserMetrics.of(laser) for laser in lasers),
         clock_offsets=_clock_offsets(result),
+        time_offset=_time_offset(result),
     )
+
+
+def _time_offset(result: Result) -> str | None:
+    found = (result.reading or result.request.reading()).time_offset
+    return None if found == AUTO else found
 
 
 def _clock_offsets(result: Result) -> tuple[ClockOffsetMetrics, ...] | None:

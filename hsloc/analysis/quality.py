@@ -10,9 +10,10 @@ import numpy as np
 from hsloc.evaluation.association import interpolate_poses
 from hsloc.localisation.mounting_error import mounting_error_of_steps
 from hsloc.localisation.states import localisation_reasons
+from hsloc.model.pose2 import Pose2
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
 from hsloc.replay.clock_offset import KNOWN, matched_headings
-from hsloc.slam.mounting_choice import right_mounting
+from hsloc.slam.mounting_choice import laser_pose_option, right_mounting
 from hsloc.slam.time_offset import clock_warnings, drift_warning, find_drift, find_offset, offsets_of_log
 from hsloc.trajectory_io.tum import NS_PER_S
 from hsloc.warnings import RunWarning, WarningCode
@@ -159,14 +160,13 @@ def _mounting_warnings(result: Result) -> list[RunWarning]:
         return []
     (laser,) = result.summary.lasers
     error, (x, y, yaw) = found.error, found.sigma
-    right = error @ laser.T_base_laser
     place = f"{hypot(error.x, error.y):.3f} ± {hypot(x, y):.3f} m and " if isfinite(x) else ""
     return [
         RunWarning(
             WarningCode.EXTRINSICS_WRONG,
             f"scans and odometry agree if the laser is {place}"
             f"{degrees(error.theta):.1f} ± {degrees(yaw):.1f} deg from where it is stated, and so are the poses",
-            f"measure it, or hsloc calibrate; --laser-pose {right.x:.3f},{right.y:.3f},{right.theta:.4f}",
+            f"measure it, or hsloc calibrate; {laser_pose_option(error @ laser.T_base_laser)}",
         )
     ]
 
@@ -174,7 +174,9 @@ def _mounting_warnings(result: Result) -> list[RunWarning]:
 def _direction_warnings(result: Result) -> list[RunWarning]:
     """Where the mounting was given, or a map with the other one shows as much of an error."""
     shown, request = result.mounting_error, result.request
-    if shown is None or not shown.is_turned or WarningCode.EXTRINSICS_WRONG in {each.code for each in result.warnings}:
+    if shown is None or not shown.is_turned or result.direction_is_right:
+        return []
+    if WarningCode.EXTRINSICS_WRONG in {each.code for each in result.warnings}:
         return []
     reading, front_end = result.reading or request.reading(), request.config.graph_mapper.front_end
     found = right_mounting(request.logs, reading, front_end, used=False)
@@ -199,7 +201,7 @@ def _place_warnings(mapping: MappingResult, result: Result) -> list[RunWarning]:
         return []
     stated = result.summary.T_base_laser
     right, sigma = found.error @ stated, hypot(*found.sigma[:2])
-    option = f"--laser-pose={right.x:.3f},{right.y:.3f},{stated.theta:.4f}"
+    option = laser_pose_option(Pose2(right.x, right.y, stated.theta))
     if result.summary.extrinsics == "identity":
         text = f"by scans and odometry the laser is at ({right.x:.3f}, {right.y:.3f}) ± {sigma:.3f} m in the base frame"
         remedy = f"the poses are those of the laser; {option} makes them those of the base"

@@ -35,7 +35,8 @@ def refuse_early(folder: Path, overwrite: bool) -> None:
     while not parent.exists():
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise OutputError(f"{folder}: cannot be written: {parent} is not a folder that may be written to")
+        reason = f"{parent} is not a folder that may be written to"
+        raise OutputError(f"{folder}: cannot be written ({reason}); choose another --out")
 
 
 def link_latest(folder: Path) -> None:

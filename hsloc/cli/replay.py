@@ -106,9 +106,9 @@ def _warn(result: Result, warnings: tuple[RunWarning, ...], arguments: argparse.
         print_warnings(warnings)
         if result.reference is None and candidates:
             print(f"hsloc: the log has poses to compare with: --truth-topic {' or '.join(candidates)}", file=sys.stderr)
-    lines = result.losses.lines()
-    for line in lines:
+    lines, reasons = result.losses.lines(), result.losses.reasons
+    if lines and not arguments.verbose:
+        # The first says which file it is.
+        reasons = [f"{reasons[0]}; hsloc check shows all"] if reasons and result.losses.data_lost else []
+    for line in (*lines, *reasons):
         print(f"hsloc: log: {line}", file=sys.stderr)
-    if arguments.verbose or not lines:
-        for reason in result.losses.reasons:
-            print(f"hsloc: log: {reason}", file=sys.stderr)

@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Sweep; 1 where a run failed, else 4 where one does not keep a limit, else 3 where part of an input was lost."""
     from hsloc.cli.main import EXIT_USAGE
     from hsloc.cli.output import print_lines
-    from hsloc.errors import OutputError
+    from hsloc.errors import OutputError, not_written
     from hsloc.report.sweep_page import sweep_lines, sweep_page
     from hsloc.sweep.parallel import merge, write_shard
     from hsloc.sweep.table import as_csv, as_json, as_markdown, as_parquet, as_text, rows
@@ -119,7 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
             if (content := as_parquet(table)) is not None:
                 (folder / "sweep.parquet").write_bytes(content)
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
+        raise OutputError(not_written(folder, error)) from error
     form = as_json if arguments.json else as_csv if arguments.csv else as_text
     if form is not as_text:
         sys.stdout.write(form(table))

@@ -111,23 +111,43 @@ def _median(values: F64) -> float:
 
 
 @njit(cache=True, nogil=True)
+def _off_neighbours(ranges: F32, i: int, range_min: float, range_max: float, increment: float) -> float:
+    """How far a range is off those beside it (m), scaled to the deviation of one range; -1 if one of them is no hit.
+
+    Inverse ranges of a straight wall are a sinusoid of the bearing, so that `u[i-1] - 2 cos(increment) u[i] + u[i+1]`
+    is zero but for the noise.
+    """
+    before, here, after = np.float64(ranges[i - 1]), np.float64(ranges[i]), np.float64(ranges[i + 1])
+    low, high = min(before, here, after), max(before, here, after)
+    if not (low >= range_min and high <= range_max and low > 0.0 and before + here + after < np.inf):
+        return -1.0
+    middle = 2.0 * cos(increment)
+    return abs(1.0 / before - middle / here + 1.0 / after) * here * here / sqrt(2.0 + middle * middle)
+
+
+@njit(cache=True, nogil=True)
+def _beams_beside(increment: float) -> int:
+    """To each side, over which a wall is straight."""
+    return min(max(int(_SLOPE / max(abs(increment), 1e-9)), 2), _MOST_BESIDE)
+
+
+@njit(cache=True, nogil=True)
 def score_with_noise(ranges: F32, range_min: float, range_max: float, increment: float, sigma: float) -> float:
     """Mean of `exp(-distance / sigma)` (m) over the hits of a scan at walls that are where they seem; 1 where unknown.
 
-    How far a hit is off shows its neighbours: `r[i-1] - 2 r[i] + r[i+1]` has sqrt(6) times the noise of a range.
-    Only the part across the wall counts, by the slope of the ranges around it. Edges are left aside.
+    How far a hit is off shows its neighbours. Only the part across the wall counts, by the slope of the ranges around
+    it. Edges are left aside.
     """
     n = len(ranges)
-    beside = min(max(int(_SLOPE / max(abs(increment), 1e-9)), 2), _MOST_BESIDE)
+    beside = _beams_beside(increment)
     stride = max(n // 360, 1)
     off = np.empty(n, dtype=np.float64)
     across = np.empty(n, dtype=np.float64)
     away = np.empty(n, dtype=np.float64)
     count = 0
     for i in range(beside, n - beside, stride):
-        before, here, after = np.float64(ranges[i - 1]), np.float64(ranges[i]), np.float64(ranges[i + 1])
-        low, high = min(before, here, after), max(before, here, after)
-        if not (low >= range_min and high <= range_max and low > 0.0 and before + here + after < np.inf):
+        found = _off_neighbours(ranges, i, range_min, range_max, increment)
+        if found < 0.0:
             continue
         hits, sum_k, sum_kk, sum_r, sum_kr = 0, 0.0, 0.0, 0.0, 0.0
         for k in range(-beside, beside + 1):
@@ -140,8 +160,9 @@ def score_with_noise(ranges: F32, range_min: float, range_max: float, increment:
                 sum_kr += k * r
         if hits < _FEWEST_BESIDE:
             continue
+        here = np.float64(ranges[i])
         slope = (sum_kr - sum_k * sum_r / hits) / (sum_kk - sum_k * sum_k / hits) / (abs(increment) * here)
-        off[count] = abs(before - 2.0 * here + after) / sqrt(6.0)
+        off[count] = found
         across[count] = 1.0 / sqrt(1.0 + slope * slope)
         away[count] = here
         count += 1
@@ -160,21 +181,17 @@ def score_with_noise(ranges: F32, range_min: float, range_max: float, increment:
 def range_noise(ranges: F32, range_min: float, range_max: float, increment: float, noise: F64) -> None:
     """Write the standard deviation of each range (m), as those around it show it, to `noise` (n,); 0 where unknown.
 
-    Inverse ranges of a straight wall are a sinusoid of the bearing, so that `u[i-1] - 2 cos(increment) u[i] + u[i+1]`
-    is zero but for the noise. Edges are left aside.
+    Edges are left aside.
     """
     n = len(ranges)
-    middle = 2.0 * cos(increment)
     off = np.zeros(n)
     parts = np.empty(n)
     count = 0
     for i in range(1, n - 1):
-        before, here, after = np.float64(ranges[i - 1]), np.float64(ranges[i]), np.float64(ranges[i + 1])
-        low, high = min(before, here, after), max(before, here, after)
-        if low >= range_min and high <= range_max and low > 0.0 and before + here + after < np.inf:
-            bent = 1.0 / before - middle / here + 1.0 / after
-            off[i] = max(abs(bent) * here * here / sqrt(2.0 + middle * middle), 1e-9)
-            parts[count] = off[i] / here
+        found = _off_neighbours(ranges, i, range_min, range_max, increment)
+        if found >= 0.0:
+            off[i] = max(found, 1e-9)
+            parts[count] = off[i] / np.float64(ranges[i])
             count += 1
     noise[:] = 0.0
     if count < _FEWEST_TRIPLES:
@@ -183,7 +200,7 @@ def range_noise(ranges: F32, range_min: float, range_max: float, increment: floa
     for i in range(n):
         if off[i] >= _EDGE * max(part * np.float64(ranges[i]), _LEAST_NOISE_M):
             off[i] = 0.0
-    beside = min(max(int(_SLOPE / max(abs(increment), 1e-9)), 2), _MOST_BESIDE)
+    beside = _beams_beside(increment)
     squares, known = 0.0, 0
     for i in range(-beside, n):
         if i + beside < n and off[i + beside] > 0.0:

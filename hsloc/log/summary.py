@@ -338,25 +338,30 @@ class Losses:
     def lines(self) -> list[str]:
         """Everything counted, in words; empty where nothing happened."""
         named = (
-            ("messages could not be decoded", self.undecodable_messages),
-            ("messages hold no usable values and were skipped", self.invalid_messages),
-            ("stamps run backwards; the order of the log was kept", self.stamps_backwards),
-            ("stamps jump out of line and were not trusted for the order", self.stamp_jumps),
-            ("messages without stamp; the log's time was taken", self.stamps_zero),
-            ("messages without stamp were dropped", self.stamps_zero_dropped),
+            ("message{s} could not be decoded", self.undecodable_messages),
+            ("message{s} hold{es} no usable values and {were} skipped", self.invalid_messages),
+            ("stamp{s} run{es} backwards; the order of the log was kept", self.stamps_backwards),
+            ("stamp{s} jump{es} out of line and {were} not trusted for the order", self.stamp_jumps),
+            ("message{s} without stamp; the log's time was taken", self.stamps_zero),
+            ("message{s} without stamp {were} dropped", self.stamps_zero_dropped),
             (
-                "orientations are no rotations (zeros, NaN, no w, or angles beside w = 1): left out between others",
+                "orientation{s} {are} no rotation{s} (zeros, NaN, no w, angles beside w = 1): left out between others",
                 self.orientations_unset,
             ),
         )
         plain = (
-            (self.damaged_chunks, "damaged chunks were skipped"),
-            (self.bytes_lost, "bytes were lost"),
-            (self.truncated_files, "files end too early (cut off, or never closed)"),
-            (self.late_messages, "messages came later than the window of reordering"),
-            (self.log_times_repaired, "messages with an impossible log time; the time of the one before was taken"),
+            (self.damaged_chunks, "damaged chunk{s} {were} skipped"),
+            (self.bytes_lost, "byte{s} {were} lost"),
+            (self.truncated_files, "file{s} end{es} too early (cut off, or never closed)"),
+            (self.late_messages, "message{s} came later than the window of reordering"),
+            (self.log_times_repaired, "message{s} with an impossible log time; the time of the one before was taken"),
         )
-        found = [f"{count} {text}" for count, text in plain if count]
+
+        def counted(count: int, text: str) -> str:
+            forms = ("", "s", "is", "was") if count == 1 else ("s", "", "are", "were")
+            return f"{count} " + text.format_map(dict(zip(("s", "es", "are", "were"), forms, strict=True)))
+
+        found = [counted(count, text) for count, text in plain if count]
         found += [f"{n} chunks in unknown compression {name!r}" for name, n in self.unknown_compression.items()]
-        found += [f"{n} {text}: {topic}" for text, counter in named for topic, n in sorted(counter.items())]
+        found += [f"{counted(n, text)}: {topic}" for text, counter in named for topic, n in sorted(counter.items())]
         return found

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from mcap.writer import CompressionType, Writer
 
-from hsloc.errors import OutputError
+from hsloc.errors import OutputError, not_written
 from hsloc.log.messages import definitions, encode
 
 if TYPE_CHECKING:
@@ -253,5 +253,4 @@ class LogWriter:
         return channel
 
     def _error(self, error: OSError) -> OutputError:
-        reason = error.strerror or str(error)
-        return OutputError(f"{self.target}: cannot be written ({reason}); check the folder, its rights and free space")
+        return OutputError(not_written(self.target, error))

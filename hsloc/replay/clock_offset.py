@@ -220,10 +220,8 @@ def offsets_of_mapping(
 
     Raises LateScans where one is certain and the user has given none, if these are to be corrected: from
     `MAPS_CORRECTED_FROM_S` on; and SweptScans where there is none from the middle of the sweeps, which is as certainly
-    another time than that of the stamps. Raises TurnedLaser where the only laser looks elsewhere than the log states.
+    another time than that of the stamps.
     """
-    if correct:
-        _require_direction(request, log, reading, history)
     if reading.stamps != "header":
         return {}
     # Corrected stamps are those of the middle.
@@ -245,17 +243,18 @@ def offsets_of_mapping(
     return found
 
 
-def _require_direction(request: RunRequest, log: Log, reading: ReadOptions, history: RunHistory) -> None:
-    """Raise TurnedLaser where the matches of a map show it, and the scans by themselves."""
+def require_direction(request: RunRequest, log: Log, reading: ReadOptions, history: RunHistory) -> bool:
+    """Raise TurnedLaser where the matches of a map show it, and the scans by themselves; whether these were asked."""
     shown = history.mounting_error()
     is_given = reading.laser_pose is not None or reading.calibration is not None
     if shown is None or not shown.is_turned or is_given or log.summary.laser_flipped:
-        return
+        return False
     found = right_mounting(request.logs, reading, request.config.graph_mapper.front_end, used=True)
     if found is not None:
         pose, warning = found
         read = replace(request.read, laser_pose=pose)
         raise TurnedLaser(replace(request, read=read), warning, shown.error.theta)
+    return True
 
 
 def _is_given(request: RunRequest) -> bool:

@@ -22,6 +22,7 @@ from hsloc.replay.clock_offset import (
     clock_offsets,
     offsets_of_mapping,
     open_as_meant,
+    require_direction,
     swept_scans,
 )
 from hsloc.replay.engine import replay
@@ -128,6 +129,8 @@ class Result:
     """Those that were found by the matches of the run and removed."""
     reading: ReadOptions | None = None
     """How the log was read, with what was found on the way; None is what the request says."""
+    direction_is_right: bool = False
+    """Whether the laser looks to where it is stated to by the scans alone; False too where they were not asked."""
     log: Log | None = field(default=None, repr=False)
     """The log as it was opened, to be read once more; None where that would keep unpacked files on the disk."""
 
@@ -237,9 +240,7 @@ def _run_on(request: RunRequest, progress: Report, correction: Correction = None
         better = _again(found, progress, correction)
         return better or _run_with(request, progress, lidar_only=False, time_offset="", correction=correction)
     is_settled = {WarningCode.CLOCK_OFFSET_APPLIED, WarningCode.CLOCK_SET} & {each.code for each in result.warnings}
-    if result.mode != "localise" or result.lidar_only or is_settled:
-        return result
-    if not (evidence := result.clock_evidence()).hints:
+    if result.mode != "localise" or result.lidar_only or is_settled or not (evidence := result.clock_evidence()).hints:
         return result
     reading = result.reading or request.reading()
     offsets, option = clock_offsets(request, reading, result.summary, deskew=result.deskewed)
@@ -280,13 +281,12 @@ def _run_with(
 ) -> Result:
     begin = time.perf_counter()
     log, reading, of_log = open_as_meant(request, lidar_only, time_offset)
-    warnings = (*warnings, *of_log)
     lidar_only = lidar_only or log.summary.odom_topic is None
     of_reference: list[RunWarning] = []
     reference = None if request.reference is None else read_reference(request.reference, request.logs, of_reference)
     grid, of_map = find_map(request, log)
     state, of_state = load_state(request)
-    warnings = (*warnings, *of_map, *of_state, *of_reference)
+    warnings = (*warnings, *of_log, *of_map, *of_state, *of_reference)
     # Without odometry the map of a log is used where the user asks for it.
     builds = (
         request.mode == "slam"
@@ -330,10 +330,11 @@ def _run_with(
     require_data(request, log, scans=history.scans > 0, odometry=first is not None or lidar_only)
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
     of_steps = log.losses.step_warnings(log.summary)
-    mapping, true_grid, offsets = None, None if localise else grid, None
+    mapping, true_grid, offsets, is_right = None, None if localise else grid, None, False
     if isinstance(estimator, Mapper):
         if not lidar_only and not of_steps:
             is_first = time_offset is None
+            is_right = is_first and require_direction(request, log, reading, history)
             offsets = offsets_of_mapping(request, log, reading, history, deskew=deskew, correct=is_first)
         mapping = estimator.finish(_share(progress, log.summary.duration_s, history.scans))
         grid = mapping.grid
@@ -346,9 +347,7 @@ def _run_with(
         scale = replace(scale, corrected=correction[0].value)
     mounting = history.mounting_error() if localise or not lidar_only else None
     states = history.states(scale, mounting, grid) if localise else None
-    tracked = localised
-    if states is not None:
-        localised = states.is_localised()
+    tracked, localised = localised, localised if states is None else states.is_localised()
     return Result(
         request=request,
         summary=log.summary,
@@ -376,6 +375,7 @@ def _run_with(
         deskewed=deskew,
         clock_offsets=offsets,
         reading=reading,
+        direction_is_right=is_right,
         log=None if log.is_unpacked else log,
     )
 

@@ -17,7 +17,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from hsloc.atomic_write import write_atomically
-from hsloc.errors import OutputError
+from hsloc.errors import OutputError, not_written
 from hsloc.report import style
 from hsloc.report.charts import Chart, run_charts
 from hsloc.report.data import prepare, since
@@ -257,7 +257,7 @@ def save_plot(path: Path, comparisons: Mapping[str, Comparison]) -> None:
         with matplotlib.rc_context({"svg.hashsalt": "hsloc"}):  # else ids of an SVG differ from one time to the next
             draw_comparisons(comparisons).savefig(path, dpi=140, metadata=FORMATS[kind])
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}; choose another file") from error
+        raise OutputError(not_written(path, error)) from error
 
 
 def show_plot(comparisons: Mapping[str, Comparison]) -> None:

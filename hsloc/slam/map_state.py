@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hsloc.errors import MapError, OutputError
+from hsloc.errors import MapError, OutputError, not_written
 from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import Pose2
 from hsloc.slam.keyscans import KeyScans
@@ -103,7 +103,7 @@ def write_state(state: MapState, path: Path) -> None:
                 np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)
                 archive.writestr(entry, stream.getbuffer(), compresslevel=_COMPRESSION)
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise OutputError(not_written(path, error)) from error
 
 
 def read_state(path: Path) -> MapState:

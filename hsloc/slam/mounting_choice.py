@@ -138,7 +138,7 @@ def direction_warnings(
             f"odometry (± {degrees(sigma):.1f} deg)"
         )
         place = "the place exactly" if is_placed else "the place, which is not known yet"
-        remedy = f"--laser-pose={pose.x:.3f},{pose.y:.3f},{pose.theta:.3f}; hsloc calibrate finds {place}"
+        remedy = f"{laser_pose_option(pose)}; hsloc calibrate finds {place}"
         found.append(RunWarning(WarningCode.EXTRINSICS_WRONG, text, remedy))
     return found
 
@@ -162,8 +162,13 @@ def right_mounting(
         WarningCode.EXTRINSICS_WRONG,
         f"the laser looks {degrees(error.theta):.1f} ± {degrees(sigma):.1f} deg from where it {where}, by its scans "
         f"alone and the odometry{': the map is built with that' if used else ''}",
-        f"measure it, or hsloc calibrate; --laser-pose={pose.x:.3f},{pose.y:.3f},{pose.theta:.4f}",
+        f"measure it, or hsloc calibrate; {laser_pose_option(pose)}",
     )
+
+
+def laser_pose_option(T_base_laser: Pose2) -> str:
+    """The option that states this mounting, in m and rad."""
+    return f"--laser-pose={T_base_laser.x:.3f},{T_base_laser.y:.3f},{T_base_laser.theta:.4f}"
 
 
 def _direction(motions: Iterable[_Motion]) -> tuple[Pose2, float, float]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.errors import LogFormatError, OutputError
+from hsloc.errors import LogFormatError, OutputError, not_written
 from hsloc.kernels.normal_equations import Equations, add_edges
 from hsloc.model.pose2 import wrap_angles
 from hsloc.slam.sparse_solver import BlockSystem
@@ -91,7 +91,7 @@ class PoseGraph:
         try:
             Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")
         except OSError as error:
-            raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+            raise OutputError(not_written(path, error)) from error
 
     @staticmethod
     def read_g2o(path: str | Path) -> PoseGraph:

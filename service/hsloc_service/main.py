@@ -24,7 +24,7 @@ from hsloc_service.http.app import create_app
 from hsloc_service.http.middleware import protocol_class
 from hsloc_service.logs import configure
 from hsloc_service.settings import Settings, SettingsError
-from hsloc_service.storage import Storage
+from hsloc_service.storage import Storage, make_data_folder
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -117,7 +117,6 @@ def listen(host: str, port: int) -> socket.socket:
 
 def with_tokens(settings: Settings, host: str, open_to_all: bool, first_token: bool, secret: str | None) -> Settings:
     """The settings, with tokens required where they must be. Raises SettingsError where none is there."""
-    settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     # A server that holds the folder must not find its database migrated, or its token gone, by one that may not start.
     Storage(settings.data, settings.min_free_bytes).close()
     database = open_database(settings)
@@ -170,7 +169,7 @@ def move_database(settings: Settings, url: str) -> int:
 
 def new_token(settings: Settings, tenant: str, scopes: str = ",".join(SCOPES), days: float | None = None) -> int:
     """Make a token and show it; works while the service runs. Raises SettingsError."""
-    settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+    make_data_folder(settings.data)
     database = open_database(settings)
     try:
         chosen = tuple(part.strip() for part in scopes.split(",") if part.strip())

@@ -50,7 +50,6 @@ def open_parts(
     store_failed: Callable[[], None] = lambda: None,
 ) -> Parts:
     """The parts that the settings describe. Raises SettingsError."""
-    settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     storage = Storage(settings.data, settings.min_free_bytes)
     try:
         sandbox = choose_sandbox(settings.sandbox, settings.data, settings.worker_command)

@@ -27,6 +27,19 @@ MAX_DEPTH = 64
 """Folders in folders that a job may make."""
 
 
+def make_data_folder(root: Path, *folders: Path) -> None:
+    """Make the data folder and those in it, for this user alone. Raises SettingsError."""
+    try:
+        for folder in (root, *folders):
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        raise _unusable(root, error) from error
+
+
+def _unusable(root: Path, error: OSError) -> SettingsError:
+    return SettingsError(f"{root}: cannot be used as data folder ({error.strerror}); give another --data")
+
+
 class Storage:
     """The local data folder, held by one server at a time. Results are the business of `results`."""
 
@@ -35,12 +48,11 @@ class Storage:
         self.min_free_bytes = min_free_bytes
         self.uploads, self.work, self.results = root / "uploads", root / "work", root / "results"
         self.cache, self.quarantine = root / "cache", root / "quarantine"
+        make_data_folder(root, self.uploads, self.work, self.results, self.cache)
         try:
-            for folder in (self.uploads, self.work, self.results, self.cache):
-                folder.mkdir(parents=True, exist_ok=True, mode=0o700)
             self._lock = os.open(root / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError as error:
-            raise SettingsError(f"{root}: cannot be used as data folder: {error.strerror}") from error
+            raise _unusable(root, error) from error
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

@@ -66,16 +66,16 @@ def bad_crc(data: bytes) -> bytes:
 
 
 DAMAGES: dict[str, tuple[Callable[[bytes], bytes], int, str]] = {
-    "cut in a chunk": (lambda d: d[: middle(d)[0] + 100], 25, "files end too early"),
-    "cut behind a chunk": (lambda d: d[: sum(middle(d))], 25, "files end too early"),
-    "killed recorder": (lambda d: d[: sum(chunks_of(d)[-1])], SCANS, "files end too early"),
-    "last 20 bytes missing": (lambda d: d[:-20], SCANS, "files end too early"),
-    "wrong checksum": (bad_crc, SCANS - 8, "damaged chunks were skipped"),
+    "cut in a chunk": (lambda d: d[: middle(d)[0] + 100], 25, "1 file ends too early"),
+    "cut behind a chunk": (lambda d: d[: sum(middle(d))], 25, "1 file ends too early"),
+    "killed recorder": (lambda d: d[: sum(chunks_of(d)[-1])], SCANS, "1 file ends too early"),
+    "last 20 bytes missing": (lambda d: d[:-20], SCANS, "1 file ends too early"),
+    "wrong checksum": (bad_crc, SCANS - 8, "1 damaged chunk was skipped"),
     "flipped byte, zstd": (
-        lambda d: flipped(d, chunk_data_at(d, middle(d)) + 40), SCANS - 8, "damaged chunks were skipped",
+        lambda d: flipped(d, chunk_data_at(d, middle(d)) + 40), SCANS - 8, "1 damaged chunk was skipped",
     ),
     "absurd length": (
-        lambda d: d[: middle(d)[0] + 1] + b"\xff" * 8 + d[middle(d)[0] + 9 :], SCANS - 8, "damaged chunks were skipped",
+        lambda d: d[: middle(d)[0] + 1] + b"\xff" * 8 + d[middle(d)[0] + 9 :], SCANS - 8, "1 damaged chunk was skipped",
     ),
     "unknown compression, one chunk": (
         lambda d: renamed(d, [middle(d)]), SCANS - 8, "chunks in unknown compression 'qbit'",
@@ -113,6 +113,7 @@ def test_of_a_damaged_log_what_is_whole_is_used_and_the_loss_is_named(
     assert metrics["scans"]["total"] == report["events"]["scan"]
     assert metrics["losses"]["data_lost"]
     assert words in err
+    assert f"hsloc: log: {path}: " in err
     if name.startswith("cut "):
         # The start is at the end of the file. Without it the scans give the right pose, less precisely.
         assert metrics["ape"]["trans_part"]["rmse"] < 0.05
@@ -136,7 +137,7 @@ def test_a_flipped_byte_without_compression_is_found_by_the_checksum(
     code, report = counts(capsys, path)
     assert code == 3
     assert SCANS - 8 <= report["events"]["scan"] < SCANS
-    assert "1 damaged chunks were skipped" in report["losses"]
+    assert "1 damaged chunk was skipped" in report["losses"]
 
 
 def test_a_log_all_of_whose_chunks_are_unreadable_is_an_error_with_its_reason(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from hsloc.atomic_write import whole_folder, write_text_atomically
 from hsloc.errors import OutputError
 from hsloc.export.results_folder import refuse_folder, write_hypotheses
 from hsloc.model import Pose2
@@ -28,6 +29,16 @@ def test_only_results_are_overwritten(tmp_path: Path) -> None:
     for name in ("metrics.json", "config.yaml"):
         (tmp_path / name).write_text("{}")
     refuse_folder(tmp_path, True)
+
+
+def test_a_file_that_cannot_be_written_is_named_in_the_folder_that_was_asked_for(tmp_path: Path) -> None:
+    def into(folder: Path) -> None:
+        with whole_folder(folder) as partial:
+            write_text_atomically(partial / "missing" / "graph.g2o", "")
+
+    with pytest.raises(OutputError, match=r"/out/missing/graph\.g2o: cannot be written \(No such file"):
+        into(tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_hypotheses_csv_has_a_line_for_each_place(tmp_path: Path) -> None:

@@ -117,7 +117,7 @@ def test_a_robot_that_is_not_found_on_mapped_ground_was_not_where_it_seemed() ->
     assert odds[2] < 0.5 * odds[0]
 
 
-def test_nobody_leaves_a_map_whose_free_ground_is_enclosed_by_walls() -> None:
+def test_no_robot_leaves_a_map_whose_free_ground_is_enclosed_by_walls() -> None:
     # The odometry turns by half a radian a metre: where it leads is not known.
     way, track, vague = Way.of(along(), OdometryNoise()), a_track(0, 5, lost=np.arange(6, 61)), Errors(1.0, 0.5)
     opened = hall()

@@ -266,7 +266,7 @@ def test_exit_codes_of_the_command(run: Run, capsys: pytest.CaptureFixture[str])
     path.write_bytes(flipped(whole, chunk_data_at(whole, chunks_of(whole)[9]) + 30))
     code, out = command(capsys, path)
     assert code == 3
-    assert out.startswith("damage: 1 damaged chunks were skipped")
+    assert out.startswith("damage: 1 damaged chunk was skipped")
     code, out = command(capsys, path, "--json")
     report = json.loads(out)
     assert (code, report["data_lost"], report["ok"]) == (3, True, False)

@@ -65,8 +65,8 @@ def test_info_of_a_damaged_log_names_the_damage_once_and_ends_with_3(
     path.write_bytes(flipped(data, chunk_data_at(data, chunks_of(data)[9]) + 30)[:-50])
     code, out, _ = run(capsys, "info", path)
     assert code == 3
-    assert "1 damaged chunks were skipped" in out
-    assert "1 files end too early" in out
+    assert "1 damaged chunk was skipped" in out
+    assert "1 file ends too early" in out
     assert "exit code 3" in out
     code, out, _ = run(capsys, "info", path, "--json", "--quick")
     assert code == 3  # the cut is seen without reading on
@@ -107,7 +107,7 @@ def carmen(path: Path) -> Path:
 def test_convert_reports_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, target = carmen(tmp_path / "log.clf"), tmp_path / "log.mcap"
     code, out, err = run(capsys, "convert", source, target, "--laser-pose=-0.1,0,1.5")
-    assert (code, err) == (0, "hsloc: warning: 1 stamps run backwards; the order of the log was kept: ODOM\n")
+    assert (code, err) == (0, "hsloc: warning: 1 stamp runs backwards; the order of the log was kept: ODOM\n")
     assert "1 scans, 2 odometry messages, from CARMEN" in out
     assert "x -0.100 m, y 0.000 m, yaw 1.5000 rad" in out
     assert "stamps that run backwards: 1" in out
@@ -136,7 +136,7 @@ def test_convert_of_a_damaged_log_ends_with_3(tmp_path: Path, capsys: pytest.Cap
     path.write_bytes(path.read_bytes()[:20_000])
     code, _, err = run(capsys, "convert", path, tmp_path / "out.mcap", "-q")
     assert code == 3
-    assert "files end too early" in err
+    assert "file ends too early" in err
     assert (tmp_path / "out.mcap").exists()
 
 

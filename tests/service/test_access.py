@@ -312,6 +312,18 @@ def test_a_busy_port_is_found_before_anything_is_recovered(
     assert not other.exists()
 
 
+@pytest.mark.parametrize("options", [("--port", "0"), ("--new-token", "lab")])
+def test_a_data_folder_that_cannot_be_made_is_one_line(
+    options: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    for folder, reason in ((tmp_path / "file", "File exists"), (tmp_path / "file" / "data", "Not a directory")):
+        assert program(["serve", "--data", str(folder), *options]) == 1
+        assert capsys.readouterr().err == (
+            f"hsloc: error: {folder}: cannot be used as data folder ({reason}); give another --data\n"
+        )
+
+
 def test_a_damaged_database_is_an_answer_and_a_line_in_the_log(make_live: Callable[..., Live]) -> None:
     live = make_live()
     with live.client() as client:

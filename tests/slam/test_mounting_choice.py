@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from hsloc.analysis import quality
 from hsloc.analysis.quality import quality_warnings
 from hsloc.log import LogWriter, ReadOptions, Transform3, open_log
 from hsloc.model import Odometry, Pose2, Scan
+from hsloc.replay import clock_offset
 from hsloc.replay.run import run
 from hsloc.simulation.scenario import Scenario
 from hsloc.simulation.sensors import Lidar
@@ -127,6 +129,20 @@ def test_a_map_is_built_with_the_yaw_that_scans_and_odometry_show(tmp_path: Path
     (named,) = quality_warnings(given)
     assert named.code == WarningCode.EXTRINSICS_WRONG
     assert named.remedy == warning.remedy
+
+
+def test_scans_that_show_no_other_yaw_by_themselves_are_asked_once(
+    tmp_path: Path, recorded: list[Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    for module in (clock_offset, quality):
+        monkeypatch.setattr(module, "right_mounting", lambda *_, used: asked.append(used))
+    path = write(tmp_path / "a.mcap", recorded, [Transform3.from_pose2(RIGHT @ Pose2(0.0, 0.0, 0.14))])
+    result = run(path, mode="slam")
+    assert result.mounting_error is not None
+    assert result.mounting_error.is_turned
+    assert quality_warnings(result) == []
+    assert asked == [True]
 
 
 def test_a_map_shows_a_laser_that_is_elsewhere_than_it_is_stated(tmp_path: Path, recorded: list[Event]) -> None:

@@ -104,7 +104,7 @@ def test_a_piece_is_not_found_where_the_user_says_that_it_is_elsewhere() -> None
     assert (found.joints, loops) == ((), 0)
 
 
-def test_nobody_carries_a_robot_12_m_in_a_second() -> None:
+def test_a_robot_is_not_carried_12_m_in_a_second() -> None:
     true = np.concatenate((FIRST, line((4.0, 12.5), (4.0, 3.0)), line((4.0, 3.0), (10.0, 3.0))))
     found, _, loops = joined(session(true, len(FIRST), (0.0, 0.0, 0.0), WALLS, seconds=1.0))
     assert (found.joints, loops) == ((), 0)

@@ -206,6 +206,9 @@ def test_late_scans_of_a_log_that_is_mapped_are_corrected(tmp_path: Path) -> Non
         (offset,) = metrics.log.clock_offsets
         assert offset.corrected
         assert offset.seconds == pytest.approx(0.25, abs=0.005)
+        topic, _, moved = (metrics.log.time_offset or "").partition("=")
+        assert topic == "/scan"
+        assert float(moved) == pytest.approx(-offset.seconds, abs=0.005)
         assert metrics.relations is not None
         means.append(metrics.relations.statistics.trans_part.mean)
     assert max(means) < 0.02

@@ -115,6 +115,7 @@ def test_freiburg_is_not_built_twice(data: Path) -> None:
     assert metrics.log.clock_offsets is not None
     (offset,) = metrics.log.clock_offsets
     assert not offset.corrected
+    assert metrics.log.time_offset is None
     assert offset.seconds == pytest.approx(0.13, abs=0.02)
 
 

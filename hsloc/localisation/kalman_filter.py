@@ -232,13 +232,20 @@ def _between(odometry: F64, anchors: Sequence[Anchor]) -> _Between:
     rows = np.flatnonzero((before >= 0) & (before + 1 < len(anchors)))
     rows = rows[~begins[before[rows] + 1]]
     first, second = before[rows], before[rows] + 1
-    steps = np.diff(odometry, axis=0, prepend=odometry[:1])
-    moved = np.cumsum(
-        _STILL_M + np.hypot(steps[:, 0], steps[:, 1]) + _METRES_PER_RADIAN * np.abs(wrap_angles(steps[:, 2]))
-    )
-    begin, end = moved[np.maximum(counts[first] - 1, 0)], moved[np.maximum(counts[second] - 1, 0)]
+    moved = np.cumsum(_STILL_M + _way(np.diff(odometry, axis=0, prepend=odometry[:1])))
+    # Messages may be seconds apart: the motion from the last one before a scan to the scan counts, too.
+    last = np.maximum(counts - 1, 0)
+    at = np.array([anchor.T_odom_base.to_array() for anchor in anchors])
+    at_anchors = moved[last] + np.where(counts > 0, _way(at - odometry[last]), 0.0)
+    begin, end = at_anchors[first], at_anchors[second]
     share = np.clip((moved[rows] - begin) / np.maximum(end - begin, 1e-9), 0.0, 1.0)[:, None]
     return _Between(rows, first, second, share)
+
+
+def _way(steps: F64) -> F64:
+    """Metres of each step (n, 3), its rotation with them."""
+    way: F64 = np.hypot(steps[:, 0], steps[:, 1]) + _METRES_PER_RADIAN * np.abs(wrap_angles(steps[:, 2]))
+    return way
 
 
 def between_matches(

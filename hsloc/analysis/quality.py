@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import degrees, hypot, isfinite
 from typing import TYPE_CHECKING
 
@@ -52,6 +53,7 @@ _MOST_NAMED = 5
 """Stray scans whose times a warning names."""
 _RANGES_REMEDY = "see what the lidar measured: hsloc check; correct its limits with --scan-fix, or choose --scan-topic"
 """Where beams or whole scans have no return, nothing else helps."""
+_ONE_SIDED = "; all turns go to one side, where slip of the wheels may be a part of that"
 _FAILING = {"failed": (Verdict.FAILED,), "check": (Verdict.FAILED, Verdict.CHECK)}
 
 
@@ -159,13 +161,14 @@ def _mounting_warnings(result: Result) -> list[RunWarning]:
     if found is None or not found.is_significant or len(result.summary.lasers) != 1:
         return []
     (laser,) = result.summary.lasers
-    error, (x, y, yaw) = found.error, found.sigma
-    place = f"{hypot(error.x, error.y):.3f} ± {hypot(x, y):.3f} m and " if isfinite(x) else ""
+    error, yaw = found.error, found.sigma[2]
+    place = f"{hypot(error.x, error.y):.3f} ± {sigma:.3f} m and " if isfinite(sigma := found.place_sigma) else ""
     return [
         RunWarning(
             WarningCode.EXTRINSICS_WRONG,
             f"scans and odometry agree if the laser is {place}"
-            f"{degrees(error.theta):.1f} ± {degrees(yaw):.1f} deg from where it is stated, and so are the poses",
+            f"{degrees(error.theta):.1f} ± {degrees(yaw):.1f} deg from where it is stated, and so are the poses"
+            f"{_ONE_SIDED if found.slip else ''}",
             f"measure it, or hsloc calibrate; {laser_pose_option(error @ laser.T_base_laser)}",
         )
     ]
@@ -186,21 +189,29 @@ def _direction_warnings(result: Result) -> list[RunWarning]:
 def _place_warnings(mapping: MappingResult, result: Result) -> list[RunWarning]:
     """Where a laser is that is not where it is stated or assumed to be: by the finished map and the odometry.
 
-    An offset of the clocks looks like another place, and is none.
+    Clocks that differ move it ahead or back, by the robot's way in that time: that much is no other place.
     """
     odometry, stamps = result.odometry, mapping.keyscan_stamps_ns
     if result.lidar_only or len(odometry) == 0 or len(result.summary.lasers) > 1:
         return []
     # Those of a map that is extended are of other logs.
     own = (stamps >= odometry.stamps_ns[0]) & (stamps <= odometry.stamps_ns[-1])
-    found = mounting_error_of_steps(interpolate_poses(odometry, stamps[own]), mapping.keyscan_poses[own])
+    by_odometry = interpolate_poses(odometry, stamps[own])
+    found = mounting_error_of_steps(by_odometry, mapping.keyscan_poses[own])
     if found is None or not found.is_displaced:
         return []
     offset = find_offset(*matched_headings(result.diagnostics, odometry, result.trajectory))
-    if offset.is_significant or not isfinite(offset.sigma):
+    if not isfinite(offset.sigma):
         return []
+    by_clocks = 0.0
+    if offset.is_significant:
+        metres, seconds = np.hypot(*np.diff(by_odometry[:, :2], axis=0).T), np.diff(stamps[own]) / NS_PER_S
+        by_clocks = abs(offset.seconds) * float(np.quantile(metres / np.maximum(seconds, 1e-3), 0.95))
+        left = replace(found.error, x=max(abs(found.error.x) - by_clocks, 0.0))
+        if not replace(found, error=left).is_displaced:
+            return []
     stated = result.summary.T_base_laser
-    right, sigma = found.error @ stated, hypot(*found.sigma[:2])
+    right, sigma = found.error @ stated, hypot(found.place_sigma, by_clocks)
     option = laser_pose_option(Pose2(right.x, right.y, stated.theta))
     if result.summary.extrinsics == "identity":
         text = f"by scans and odometry the laser is at ({right.x:.3f}, {right.y:.3f}) ± {sigma:.3f} m in the base frame"
@@ -210,6 +221,7 @@ def _place_warnings(mapping: MappingResult, result: Result) -> list[RunWarning]:
     text = (
         f"scans and odometry agree if the laser is {by:.3f} ± {sigma:.3f} m from where it is stated; where no wall "
         "fixes the motion, the map is off by as much after each turn"
+        f"{_ONE_SIDED if found.slip else ''}"
     )
     return [RunWarning(WarningCode.EXTRINSICS_WRONG, text, f"measure it, or hsloc calibrate; {option}")]
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hsloc.model.pose2 import Pose2, relative_poses, wrap_angles
+from hsloc.model.pose2 import Pose2, compose_poses, relative_poses, wrap_angles
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,7 +32,11 @@ _FEWEST = 40
 PARTS = 10
 """Parts of the run whose errors count as independent of each other: what odometry gets wrong lasts for many steps."""
 _LEAST_OTHER_SIDE = 0.1
-"""Part of the rotation that goes to the other side, at least: to one side alone, slip looks like another place."""
+"""Part of the rotation that goes to the other side, at least: to one side alone, wheels that slip in turns look like a
+laser that is mounted aside. One that is ahead or behind moves sideways in turns, as no wheel does."""
+_SLIP_M, _SLIP_SIGMAS = 0.05, 3.0
+"""Standard deviation (m) of what wheels lose by slip in each radian, a tenth of a bend of half a metre's radius, and by
+how many of them a laser has to be aside where all turns go to one side."""
 _LONGEST_M = 1.0
 """Steps that are longer hold refused scans (m)."""
 MIN_SIGMAS = 7.0
@@ -48,17 +52,27 @@ _LEAST_M, _LEAST_RAD = 0.05, radians(2.0)
 class MountingError:
     """The laser is at `error @ mounting` where `mounting` is stated; standard deviations in m, m, rad.
 
-    Those of the place are infinite where nearly all turns go to one side.
+    Where nearly all turns go to one side, slip in turns may be a part of y: `slip` is the standard deviation (m) of it,
+    and of a place that is not wrong beyond doubt nothing is said: its standard deviations are infinite.
     """
 
     error: Pose2
     sigma: tuple[float, float, float]
+    slip: float = 0.0
+
+    @property
+    def place_sigma(self) -> float:
+        """Standard deviation (m) of the place, by slip, too."""
+        return hypot(*self.sigma[:2], self.slip)
 
     @property
     def is_displaced(self) -> bool:
         """Whether the place is wrong beyond doubt, and by enough to matter."""
-        size = hypot(self.error.x, self.error.y)
-        return size > max(_LEAST_M, MIN_SIGMAS * hypot(*self.sigma[:2]))
+        x, y = abs(self.error.x), abs(self.error.y)
+        of_x, of_y = (MIN_SIGMAS * sigma for sigma in self.sigma[:2])
+        if self.slip:
+            return x > max(_LEAST_M, of_x) or y > max(_LEAST_M, hypot(of_y, _SLIP_SIGMAS * self.slip))
+        return hypot(x, y) > max(_LEAST_M, hypot(of_x, of_y))
 
     @property
     def is_turned(self) -> bool:
@@ -107,6 +121,9 @@ def mounting_error_of_steps(
     turned = wrap_angles(seen[:, 2])  # noise of the odometry turns its translation, too: it would show as a place
     if len(step) < _FEWEST:
         return None
+    # So would a scale of its turns: along an arc half of what is turned too far is in the direction of the step.
+    half = np.column_stack((np.zeros((len(step), 2)), 0.5 * wrap_angles(turned - step[:, 2])))
+    step = compose_poses(half, step)
     other_side = min(turned[turned > 0.0].sum(), -turned[turned < 0.0].sum())
     is_one_sided = other_side <= _LEAST_OTHER_SIDE * np.abs(turned).sum()
     c, s = np.cos(turned), np.sin(turned)
@@ -124,8 +141,9 @@ def mounting_error_of_steps(
     without = without_each_part(information, vectors, PARTS)
     sigma = np.sqrt((PARTS - 1) / PARTS * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     x, y, yaw = values[1:].tolist()
-    found = MountingError(Pose2(x, y, yaw), (float(sigma[1]), float(sigma[2]), float(sigma[3])))
-    return found.of_yaw() if is_one_sided else found
+    sigmas = (float(sigma[1]), float(sigma[2]), float(sigma[3]))
+    found = MountingError(Pose2(x, y, yaw), sigmas, _SLIP_M if is_one_sided else 0.0)
+    return found.of_yaw() if is_one_sided and not found.is_displaced else found
 
 
 def without_each_part(information: NDArray[Any], vectors: NDArray[Any], parts: int) -> NDArray[Any]:

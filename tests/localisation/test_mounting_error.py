@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import pairwise
+from math import isfinite
+
 import numpy as np
 import pytest
 
@@ -59,11 +63,34 @@ def test_noise_of_the_odometry_that_turns_its_steps_is_no_place_of_the_laser(see
     assert abs(found.error.x) < 0.035  # by the turns of the odometry it would be 0.05
 
 
-def test_few_matches_say_nothing_and_turns_to_one_side_only_the_yaw() -> None:
+def test_few_matches_say_nothing() -> None:
     assert mounting_error(drive(IDENTITY, 0)[:40]) is None
     assert mounting_error([]) is None
-    found = mounting_error(drive(Pose2(0.2, 0.0, 0.05), 0, left=1.0))
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "is_displaced"), [(0.08, 0.0, True), (0.0, 0.25, True), (0.0, 0.1, False), (0.0, 0.0, False)]
+)
+def test_where_all_turns_go_to_one_side_a_place_aside_may_be_slip(x: float, y: float, is_displaced: bool) -> None:
+    found = mounting_error(drive(Pose2(x, y, 0.05), 0, left=1.0))
     assert found is not None
-    assert not found.is_displaced
+    assert found.is_displaced == is_displaced
+    assert isfinite(found.place_sigma) == is_displaced
+    assert found.error.x == pytest.approx(x, abs=0.02)
     assert found.is_turned
     assert found.error.theta == pytest.approx(0.05, abs=0.01)
+
+
+@pytest.mark.parametrize("left", [0.5, 1.0], ids=["both sides", "one side"])
+def test_odometry_that_turns_too_far_is_no_place_of_the_laser(left: float) -> None:
+    """Half of what an arc turns too far is in the direction of the odometry's step."""
+    anchors = drive(IDENTITY, 0, left=left)
+    odometry, turned = IDENTITY, [anchors[0]]
+    for last, anchor in pairwise(anchors):
+        step = last.T_odom_base.between(anchor.T_odom_base)
+        odometry = odometry @ Pose2(step.x, step.y + 0.25 * step.theta * step.x, 1.5 * step.theta)
+        turned.append(replace(anchor, T_odom_base=odometry))
+    found = mounting_error(turned)
+    assert found is not None
+    assert not found.is_displaced
+    assert abs(found.error.x) < 0.01

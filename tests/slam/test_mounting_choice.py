@@ -19,6 +19,7 @@ from hsloc.simulation.simulator import events
 from hsloc.simulation.world_files import load_world
 from hsloc.slam.front_end import FrontEndParameters
 from hsloc.slam.mounting_choice import direction_warnings, with_chosen_mountings
+from hsloc.slam.time_offset import UNKNOWN
 from hsloc.warnings import WarningCode
 
 if TYPE_CHECKING:
@@ -145,10 +146,19 @@ def test_scans_that_show_no_other_yaw_by_themselves_are_asked_once(
     assert asked == [True]
 
 
-def test_a_map_shows_a_laser_that_is_elsewhere_than_it_is_stated(tmp_path: Path, recorded: list[Event]) -> None:
-    path = write(tmp_path / "a.mcap", recorded, [Transform3.from_pose2(Pose2(0.2, -0.1, 0.0) @ RIGHT)])
-    (warning,) = quality_warnings(run(path, mode="slam"))
+def test_a_map_shows_a_laser_that_is_elsewhere_than_it_is_stated(
+    tmp_path: Path, recorded: list[Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "a.mcap", recorded, [Transform3.from_pose2(Pose2(0.22, 0.0, 0.0) @ RIGHT)])
+    result = run(path, mode="slam")
+    (warning,) = quality_warnings(result)
     assert warning.code == WarningCode.EXTRINSICS_WRONG
     assert "0.22" in warning.text
     x, y, _ = (float(value) for value in warning.remedy.partition("--laser-pose=")[2].split(","))
     assert (x, y) == pytest.approx((RIGHT.x, RIGHT.y), abs=0.02)
+    # Clocks that differ put it ahead or behind by the way in that time.
+    for seconds, is_named in ((0.05, True), (1.0, False)):
+        monkeypatch.setattr(
+            "hsloc.analysis.quality.find_offset", lambda *_, s=seconds: UNKNOWN._replace(seconds=s, sigma=1e-3)
+        )
+        assert bool(quality_warnings(result)) == is_named

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.localisation.map_scale import MapScale
+    from hsloc.localisation.odometry_scale import OdometryScale
     from hsloc.localisation.states import StateRows
 
 NOISE_20 = OdometryNoise(4e-2, 2.4e-3, 8e-2, 4e-2)
@@ -131,11 +132,12 @@ def crowded(drive: list[Event], share: float, seed: int) -> Iterator[Event]:
 
 
 class Scored(NamedTuple):
-    """Errors of a run's poses in x, y and heading (n, 3; m, m, rad), which of them are wrong, and the states."""
+    """Errors of poses in x, y and heading (n, 3; m, m, rad), which are wrong, the states, and the odometry's scale."""
 
     off: NDArray[np.float64]
     wrong: NDArray[np.bool_]
     states: StateRows
+    odometry_scale: OdometryScale | None
 
     def false(self) -> float:
         """The share of all poses that are wrong and called localised."""
@@ -157,8 +159,8 @@ def scored(
 ) -> Scored:
     """Localise on a map; wrong are poses off by more than 0.25 m or 5 deg, and all where the map `is_wrong`.
 
-    As in `hsloc.run`, the drive is replayed again with stamps of scans that turn out to be late or early corrected, and
-    on a map whose resolution turns out to be wrong with that corrected.
+    As in `hsloc.run`, the drive is replayed again with stamps of scans that turn out to be late or early corrected, on
+    a map whose resolution turns out to be wrong with that corrected, or with odometry that turns out to count wrongly.
     """
     drive, state = list(drive), rng.bit_generator.state
     found, before = _scored_on(drive, grid, start, rng, is_wrong)
@@ -168,6 +170,12 @@ def scored(
         begin = None if start is None else before.scale.moved(before.start)
         again, after = _scored_on(drive, grid, begin, rng, is_wrong, before.scale)
         if after.is_better(before):
+            return again
+    odometry, of_map = found.odometry_scale, before.scale
+    if odometry is not None and odometry.is_significant and not (of_map is not None and of_map.moves_poses):
+        rng.bit_generator.state = state
+        again, after = _scored_on(list(odometry.applied(drive)), grid, start, rng, is_wrong)
+        if odometry.is_mended(again.odometry_scale) and after.fits_as(before):
             return again
     return found
 
@@ -226,7 +234,7 @@ def _localised(
     wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.25) | (np.abs(off[:, 2]) > np.radians(5.0)) | is_wrong
     of_clock = ClockEvidence.of(history.diagnostics(), history.odometry(), trajectory, states.is_localised())
     of_scale = ScaleEvidence.of(scale, history.diagnostics(), history.odometry(), trajectory)
-    return Scored(off, wrong, states), of_clock, of_scale
+    return Scored(off, wrong, states, localiser.odometry_scale), of_clock, of_scale
 
 
 def measure(name: str, seed: int, is_known: bool) -> str:

@@ -154,6 +154,7 @@ KINDS: dict[str, Kind] = {
     "turns x 1.5": Kind(drives.steps(1.5, 1.0)),
     "turns x 0.6": Kind(drives.steps(0.6, 1.0)),
     "way x 1.1": Kind(drives.steps(1.0, 1.1)),
+    "way x 1.05": Kind(drives.steps(1.0, 1.05)),
     "way x 0.8": Kind(drives.steps(1.0, 0.8)),
     "skid steer": Kind(drives.steps(1.35, 1.08)),
     "odometry 5 Hz": Kind(drives.at_rate(10)),

@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from hsloc.maps import load_map, save_map
     from hsloc.matching import HarmonySearch, Hide, Icp, LikelihoodField, Match, Matcher, Window
     from hsloc.model import Estimate, OccupancyGrid, Odometry, Pose2, Scan, Status, Trajectory
-    from hsloc.replay.run import Progress, Result, run
+    from hsloc.replay.progress import Progress
+    from hsloc.replay.run import Result, run
     from hsloc.request import RunRequest
     from hsloc.run_metrics import RunMetrics
 
@@ -59,7 +60,8 @@ _MODULES = {
     "hsloc.maps": ("load_map", "save_map"),
     "hsloc.matching": ("HarmonySearch", "Hide", "Icp", "LikelihoodField", "Match", "Matcher", "Window"),
     "hsloc.model": ("Estimate", "OccupancyGrid", "Odometry", "Pose2", "Scan", "Status", "Trajectory"),
-    "hsloc.replay.run": ("Progress", "Result", "run"),
+    "hsloc.replay.progress": ("Progress",),
+    "hsloc.replay.run": ("Result", "run"),
     "hsloc.request": ("RunRequest",),
     "hsloc.run_metrics": ("RunMetrics",),
 }  # fmt: skip

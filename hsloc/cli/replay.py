@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     import argparse
 
     from hsloc.options import Interface
-    from hsloc.replay.run import Progress, Result
+    from hsloc.replay.progress import Progress
+    from hsloc.replay.run import Result
     from hsloc.warnings import RunWarning
 
 HELP = "localise the robot of a recorded log, or build a map"

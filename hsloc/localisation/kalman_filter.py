@@ -10,7 +10,7 @@ variance grows with it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import cos, exp, log, sin
+from math import cos, exp, hypot, log, sin
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -27,15 +27,20 @@ if TYPE_CHECKING:
 
     F64 = NDArray[np.float64]
 
-_MAX_SQUARED = 16.3
+MAX_SQUARED = 16.3
 """Squared difference by its covariance, prediction to smoothed pose, up to which it was noise: the 99.9 % quantile
 of chi squared with 3 degrees of freedom. Beyond it a wheel slipped."""
 _METRES_PER_RADIAN = 0.5
 """Metres that a radian counts for in the share of the motion: about the track width of an indoor robot."""
+_STEP_M, _FEW_STEPS = 0.2, 3.0
+"""Motions (m) whose noise is independent, as the filter takes it from match to match, and the number of them from which
+on the noise of a motion between two matches is theirs: taken as one, it is three times as large over 2 m."""
 _STILL_M = 1e-6
 """Motion (m) that an odometry message counts for that states none, as where it is frozen and the robot is not."""
 _REMEMBERED = 0.98
 """Weight of an innovation after the next one: about 50 are remembered, the 10 m of a match each 0.2 m."""
+_HALF_MEMORY = 25
+"""Innovations after which what is remembered is centred on one."""
 _ASSUMED = 7.5
 """Information of the assumption that the odometry is as noisy as stated: that of five innovations."""
 _EXCESS_GAIN = 0.1
@@ -93,7 +98,7 @@ def fuse_match(prediction: Pose2, covariance: F64, match: Match, information: F6
 def is_slip(innovation: F64, covariance: F64, information: F64) -> bool:
     """Whether an innovation (3,), by covariance of the prediction and information of the match (3, 3), is no noise."""
     weight = information @ np.linalg.inv(np.eye(3) + covariance @ information)
-    return float(innovation @ weight @ innovation) > _MAX_SQUARED
+    return float(innovation @ weight @ innovation) > MAX_SQUARED
 
 
 class Innovations:
@@ -119,32 +124,35 @@ class Innovations:
         """See the class."""
         return max(self._excess, 1.0)
 
-    def add(self, innovation: F64, information: F64, propagated: F64, noise: F64) -> None:
+    def add(self, innovation: F64, information: F64, propagated: F64, noise: F64) -> F64:
         """Take an innovation (3,): a measured pose of known information (3, 3) less a prediction.
 
         The prediction's covariance is that of the pose before, `propagated` (3, 3), and the assumed one of the motion,
         `noise` (3, 3), by the scale; all in the map frame. Directions that are not measured count for none: the inverse
-        of the innovation's covariance is `L (I + P L)^-1`, its degrees of freedom are the trace of the gain.
+        of the innovation's covariance, which is returned (3, 3), is `L (I + P L)^-1`, its degrees of freedom are the
+        trace of the gain.
         """
         covariance = propagated + max(self.noise_scale, 1.0) * noise
-        weight = information @ np.linalg.inv(np.eye(3) + covariance @ information)
+        weight: F64 = information @ np.linalg.inv(np.eye(3) + covariance @ information)
+        found = weight
         squared = float(innovation @ weight @ innovation)
         freedom = float(np.trace(covariance @ weight))
         if freedom <= 0.0:
-            return
+            return weight
         self._excess += _EXCESS_GAIN * (min(squared / freedom, _MOST_EXCESS) - self._excess)
         if self.noise_scale < 1.0:
             scaled = propagated + self.noise_scale * noise
             weight = information @ np.linalg.inv(np.eye(3) + scaled @ information)
             squared = float(innovation @ weight @ innovation)
         part = weight @ (self.noise_scale * noise)
-        limited = min(1.0, _MAX_SQUARED / squared) if squared > 0.0 else 1.0  # a slip is not noise
+        limited = min(1.0, MAX_SQUARED / squared) if squared > 0.0 else 1.0  # a slip is not noise
         score = 0.5 * (limited * float(innovation @ part @ weight @ innovation) - float(np.trace(part)))
         weighed = 0.5 * float(np.trace(part @ part))
         self._sum = _REMEMBERED * self._sum + weighed * log(self.noise_scale) + score
         self._information = _REMEMBERED * self._information + weighed
-        found = self._sum / (self._information + _ASSUMED)
-        self.noise_scale = exp(min(max(found, log(_LEAST_NOISE)), log(_MOST_NOISE)))
+        logarithm = self._sum / (self._information + _ASSUMED)
+        self.noise_scale = exp(min(max(logarithm, log(_LEAST_NOISE)), log(_MOST_NOISE)))
+        return found
 
 
 def difference(pose: Pose2, other: Pose2) -> F64:
@@ -197,13 +205,13 @@ def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> Smoo
             continue
         motion = here.T_odom_base.between(following.T_odom_base)
         noise = motion_model.covariance(motion)
-        variances[k + 1] = following.noise_scale * np.diag(rotated(noise, here.T_map_base.theta))
+        variances[k + 1] = _noise_around(anchors, k + 1) * np.diag(rotated(noise, here.T_map_base.theta))
         noise = max(following.noise_scale, 1.0) * noise
         predicted = here.T_map_base @ motion
         variance = predict_covariance(here.covariance, here.T_map_base, motion, noise) + _NO_NOISE
         off = difference(Pose2.from_array(poses[k + 1]), predicted)
         weighted = np.linalg.solve(variance, off)
-        if off @ weighted > _MAX_SQUARED:
+        if off @ weighted > MAX_SQUARED:
             if not here.fits_as_usual:
                 jump = np.outer(off, off)
             covariances[k] += jump
@@ -216,13 +224,22 @@ def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> Smoo
     return SmoothedMatches(poses, covariances, variances)
 
 
+def _noise_around(anchors: Sequence[Anchor], k: int) -> float:
+    """Variance of the odometry by the assumed one around the k-th anchor; its own knows only the matches before."""
+    return anchors[min(k + _HALF_MEMORY, len(anchors) - 1)].noise_scale
+
+
 class _Between(NamedTuple):
-    """Poses between two matches of a track: rows, anchors before and after, and the share (n, 1) of the motion."""
+    """Poses between two matches of a track: rows, anchors before and after, and the share (n, 1) of the motion.
+
+    `steps` (n,) are the motions of `_STEP_M` between the two.
+    """
 
     rows: NDArray[np.int64]
     first: NDArray[np.int64]
     second: NDArray[np.int64]
     share: F64
+    steps: F64
 
 
 def _between(odometry: F64, anchors: Sequence[Anchor]) -> _Between:
@@ -239,7 +256,7 @@ def _between(odometry: F64, anchors: Sequence[Anchor]) -> _Between:
     at_anchors = moved[last] + np.where(counts > 0, _way(at - odometry[last]), 0.0)
     begin, end = at_anchors[first], at_anchors[second]
     share = np.clip((moved[rows] - begin) / np.maximum(end - begin, 1e-9), 0.0, 1.0)[:, None]
-    return _Between(rows, first, second, share)
+    return _Between(rows, first, second, share, (end - begin) / _STEP_M)
 
 
 def _way(steps: F64) -> F64:
@@ -260,7 +277,7 @@ def between_matches(
         return poses
     at_odometry = np.array([anchor.T_odom_base.inverse().to_array() for anchor in anchors])
     T_map_odom = compose_poses(matched, at_odometry)
-    rows, first, second, share = _between(odometry, anchors)
+    rows, first, second, share, _ = _between(odometry, anchors)
     ahead = compose_poses(T_map_odom[first], odometry[rows])
     back = compose_poses(T_map_odom[second], odometry[rows])
     off = back - ahead
@@ -273,13 +290,37 @@ def between_matches(
     return smoothed
 
 
-def bridge_variances(odometry: F64, anchors: Sequence[Anchor], motion: F64) -> F64:
+def bridge_variances(odometry: F64, anchors: Sequence[Anchor], motion: F64, motion_model: MotionModel) -> F64:
     """What the odometry (n, 3) adds to the variances (n, 3) of poses between two matches: a walk whose ends are known.
 
     `motion` (m, 3) are the variances of the odometry up to each anchor; half-way a quarter of them is left.
     """
     variances = np.zeros((len(odometry), 3))
     if len(anchors) >= 2:
-        rows, _, second, share = _between(odometry, anchors)
+        rows, _, second, share, steps = _between(odometry, anchors)
+        motion = motion.copy()
+        for k in np.unique(second[steps > _FEW_STEPS]).tolist():
+            way = odometry[max(anchors[k - 1].count - 1, 0) : anchors[k].count]
+            turned = anchors[k].T_map_base.theta - anchors[k].T_odom_base.theta
+            motion[k] = _noise_around(anchors, k) * _walk_variances(way, turned, motion_model)
         variances[rows] = share * (1.0 - share) * motion[second]
+    return variances
+
+
+def _walk_variances(way: F64, turned: float, motion_model: MotionModel) -> F64:
+    """Variances (3,) of odometry (n, 3) as a walk of short motions, in a frame in which its own is `turned`."""
+    total, last = np.zeros((3, 3)), Pose2.from_array(way[0])
+    for k, row in enumerate(way[1:], start=2):
+        here = Pose2.from_array(row)
+        step = last.between(here)
+        size = hypot(step.x, step.y) + _METRES_PER_RADIAN * abs(step.theta)
+        if size >= _STEP_M or k == len(way):
+            covariance = min(_STEP_M / max(size, _STILL_M), 1.0) * motion_model.covariance(step)
+            total += rotated(covariance, last.theta + turned)
+            last = here
+    # A walk of the heading takes the way aside; where that is known at both ends, 1/192 of its square is left half-way.
+    x, y = (way[-1, :2] - way[0, :2]).tolist()
+    c, s = cos(turned), sin(turned)
+    aside = np.array((s * x + c * y, c * x - s * y, 0.0)) ** 2
+    variances: F64 = np.diag(total) + total[2, 2] * aside / 48.0
     return variances

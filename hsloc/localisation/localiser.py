@@ -15,6 +15,7 @@ from hsloc.kernels.fitness import fitness_many
 from hsloc.localisation.gates import MatchGate, MotionGate, RestGate
 from hsloc.localisation.kalman_filter import Innovations, difference, fuse_match, is_slip, predict_covariance
 from hsloc.localisation.map_scale import MapScale, MapScaleEstimator
+from hsloc.localisation.odometry_scale import OdometryScale, OdometryScaleEstimator
 from hsloc.localisation.place_check import PlaceCheck
 from hsloc.localisation.relocaliser import Relocaliser
 from hsloc.localisation.track_evidence import TrackMonitor
@@ -89,6 +90,7 @@ class Localiser:
             (parameters.initial_sigma**2, parameters.initial_sigma**2, parameters.initial_sigma_angle**2)
         )
         self._innovations = Innovations()
+        self._odometry_scale = OdometryScaleEstimator()
         self._rest_gate = RestGate()
         # Where a proof is asked for, the optimum next to the prediction has none.
         proves = parameters.certify or heuristic(matcher) is not matcher
@@ -129,6 +131,11 @@ class Localiser:
         """Length on the map by length as the lidar measures it; None while too little is seen, or without estimator."""
         return None if self._map_scale is None else self._map_scale.estimate()
 
+    @property
+    def odometry_scale(self) -> OdometryScale | None:
+        """By how much the odometry counts wrongly; None while too little is seen."""
+        return self._odometry_scale.estimate()
+
     def update(self, event: Odometry | PairedScan) -> Estimate:
         """Take an event; the estimate at its stamp."""
         if self._T_odom_match is None:
@@ -164,6 +171,7 @@ class Localiser:
         noise = rotated(self._motion_model.covariance(motion), self._T_map_match.theta)
         covariance = propagated + max(self._innovations.noise_scale, 1.0) * noise
         points = paired.points_base()
+        self._odometry_scale.predict(self._T_map_match, motion)
         for each in (self._monitor, self._map_scale):
             if each is not None:
                 each.move(hypot(motion.x, motion.y))
@@ -180,9 +188,13 @@ class Localiser:
             return self._refuse(paired, predicted, covariance, match, evaluations, reason)
         information = match_information(points, self._field, match.pose, self._wall_variance())
         if p.fuse:
-            if information is not None:
+            off = difference(match.pose, predicted)
+            if information is None:
+                weight: F64 = np.asarray(np.linalg.inv(covariance + match.covariance), dtype=np.float64)
+            else:
                 information = self._match_gate.trust(match.fitness) * information
-                self._innovations.add(difference(match.pose, predicted), information, propagated, noise)
+                weight = self._innovations.add(off, information, propagated, noise)
+            self._odometry_scale.update(off, covariance, weight)
             pose, covariance = fuse_match(predicted, covariance, match, information)
         else:
             pose, covariance = match.pose, match.covariance
@@ -330,6 +342,7 @@ class Localiser:
             self._searching = False
             self._match_gate.restart(result.fitness)
             self._rest_gate.matched(result.fitness or 0.0)
+            self._odometry_scale.restart()
             if self._monitor is not None:
                 self._monitor.begin()
             status = Status.RELOCALISED

@@ -48,6 +48,8 @@ _OUTSIDE = 5.0
 _CHORD_M, _SPACING_M = 3.0, 0.5
 """Path length of a chord whose lengths by matches and by odometry are compared, and of two beginnings (m): matches are
 off by 1 to 2 cm."""
+_FITNESS_NOISE = 0.01
+"""Mean fitness of two runs on the same map differs by less: that of a scan scatters by 0.02 (localisation/gates.py)."""
 _GIVE_START = "give the start with --initial-pose"
 
 
@@ -280,6 +282,10 @@ class ScaleEvidence:
     def hints(self) -> bool:
         """Whether map and lidar differ beyond doubt, so that it is worth while to replay on a corrected map."""
         return self.scale is not None and self.scale.is_significant and not self.is_lost
+
+    def fits_as(self, before: ScaleEvidence) -> bool:
+        """Whether the scans of this run fit as well as those of one before, but for noise."""
+        return not self.is_lost and self.fitness > before.fitness - _FITNESS_NOISE
 
     def is_better(self, before: ScaleEvidence) -> bool:
         """Whether the map was wrong, by this run on the corrected one.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from hsloc.errors import ConfigError
 from hsloc.garbage_collection import rarely_collected
 from hsloc.kernels.cache import compilation_reported
-from hsloc.model.events import Scan
+from hsloc.localisation.odometry_scale import OdometryScale
 from hsloc.preprocessing.body_returns import body_beams, body_warnings
 from hsloc.preprocessing.odometry import ContinuousOdometry, UnusableOdometry
 from hsloc.preprocessing.scans import ScanWatch
@@ -37,6 +37,7 @@ from hsloc.replay.map_and_start import (
     require_map,
 )
 from hsloc.replay.matched_scans import mean_fitness
+from hsloc.replay.progress import Progress, share_of, with_progress
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory, pose_covariances
 from hsloc.request import RunRequest
@@ -46,7 +47,7 @@ from hsloc.slam.time_offset import clock_warnings
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -57,30 +58,16 @@ if TYPE_CHECKING:
     from hsloc.log import Log, LogSummary, Losses, ReadOptions
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.model.estimate import Ambiguity, ScanDiagnostics
-    from hsloc.model.events import Event
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.model.pose2 import Pose2
     from hsloc.model.trajectory import Trajectory
     from hsloc.replay.engine import Estimator
+    from hsloc.replay.progress import Report
     from hsloc.slam.result import MappingResult
     from hsloc.slam.time_offset import Offset
 
-    Report = Callable[["Progress"], None] | None
-    Correction = tuple[MapScale, Pose2] | None
-    """Scale of the map, and the pose from which on it is right."""
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """How far a run is: the phase in a word, seconds of the log done and in all, and the scans so far.
-
-    In the phase "compile", `done_s` is the number of kernels compiled; how many there will be is not known.
-    """
-
-    phase: str
-    done_s: float
-    total_s: float
-    scans: int
+    Correction = tuple[MapScale, Pose2] | OdometryScale | None
+    """Scale of the map, and the pose from which on it is right; or that of the odometry."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -94,8 +81,9 @@ class Result:
     `tracked` the poses that were not searched for, whether their scans fit or not.
     `map_scale` is the size of a given map by what the lidar measures, `mounting_error` where the only laser is by the
     odometry, from where it is said to be, `ambiguities` where several places of it fit.
-    With `lidar_only` no odometry of the log was used: a localiser's `odometry` is then that of the scans. `deskewed`
-    says whether the beams were moved to where the robot was when each was measured.
+    Odometry that counts wrongly is corrected in `odometry`, with a warning. With `lidar_only` no odometry of the log
+    was used: a localiser's `odometry` is then that of the scans. `deskewed` says whether the beams were moved to where
+    the robot was when each was measured.
     """
 
     request: RunRequest
@@ -119,6 +107,8 @@ class Result:
     map_scale: MapScale | None = None
     given_resolution: float | None = None
     """Side of a cell of the map as it was given (m), where that was wrong and `grid` has another."""
+    odometry_scale: OdometryScale | None = None
+    """How much more a metre and a radian of `odometry` are, by a localiser on a given map."""
     mounting_error: MountingError | None = None
     ambiguities: tuple[Ambiguity, ...] = ()
     lidar_only: bool = False
@@ -201,15 +191,21 @@ def run(
 
 
 def _run(request: RunRequest, progress: Report) -> Result:
-    """The run; on a map of another scale where that proves wrong on the way."""
+    """The run; where the scale of the map or of the odometry proves wrong on the way, with that corrected."""
     result = _run_on(request, progress)
-    if result.mode != "localise" or result.lidar_only or not request.config.localiser.correct_map_scale:
+    if result.mode != "localise" or result.lidar_only:
         return result
     scale, evidence = result.map_scale, result.scale_evidence()
-    if scale is not None and evidence.hints:
+    if scale is not None and evidence.hints and request.config.localiser.correct_map_scale:
         again = _run_on(request, progress, (scale, evidence.start))
         if again.scale_evidence().is_better(evidence):
             return replace(again, seconds=_sum(result.seconds, again.seconds))
+    odometry = result.odometry_scale
+    if odometry is not None and odometry.is_significant and not (scale is not None and scale.moves_poses):
+        again = _run_on(request, progress, odometry)
+        if odometry.is_mended(again.odometry_scale) and again.scale_evidence().fits_as(evidence):
+            warnings = (*again.warnings, odometry.warning())
+            return replace(again, warnings=warnings, seconds=_sum(result.seconds, again.seconds))
     return result
 
 
@@ -303,7 +299,7 @@ def _run_with(
             raise ConfigError("loops are stated for a map that is built; add --mode slam, or leave them out")
         start, of_start = find_start(request, log, require_map(grid))
         warnings = (*warnings, *of_start)
-        if correction is not None:
+        if isinstance(correction, tuple):
             scale_before, first_pose = correction
             given_resolution, grid = require_map(grid).resolution, scale_before.applied(require_map(grid))
             start = None if start is None else scale_before.moved(first_pose)
@@ -323,7 +319,8 @@ def _run_with(
     # Turns that were joined of segments are known beam by beam; a whole turn is deskewed if the user asks for it.
     deskew = request.read.deskew or (log.summary.segments > 1 and not lidar_only)
     with rarely_collected():
-        reported = _reported(log, watched, history, progress)
+        counted = correction.applied(watched) if isinstance(correction, OdometryScale) else watched
+        reported = with_progress(log, counted, history, progress)
         for event, estimate in replay(reported, estimator, deskew=deskew, first=first):
             history.add(event, estimate)
     replayed = time.perf_counter()
@@ -336,14 +333,14 @@ def _run_with(
             is_first = time_offset is None
             is_right = is_first and require_direction(request, log, reading, history)
             offsets = offsets_of_mapping(request, log, reading, history, deskew=deskew, correct=is_first)
-        mapping = estimator.finish(_share(progress, log.summary.duration_s, history.scans))
+        mapping = estimator.finish(share_of(progress, log.summary.duration_s, history.scans))
         grid = mapping.grid
         seconds["finish"] = time.perf_counter() - replayed
     elif isinstance(estimator, PointMapper):
         grid = estimator.grid()
     trajectory, localised = history.trajectory() if mapping is None else history.mapped(mapping)
     scale = None if localiser is None else localiser.map_scale
-    if scale is not None and correction is not None:
+    if scale is not None and isinstance(correction, tuple):
         scale = replace(scale, corrected=correction[0].value)
     mounting = history.mounting_error() if localise or not lidar_only else None
     states = history.states(scale, mounting, grid) if localise else None
@@ -368,6 +365,7 @@ def _run_with(
         states=states,
         tracked=tracked,
         map_scale=scale,
+        odometry_scale=None if localiser is None else localiser.odometry_scale,
         given_resolution=given_resolution,
         mounting_error=mounting,
         ambiguities=history.ambiguities(states),
@@ -378,23 +376,3 @@ def _run_with(
         direction_is_right=is_right,
         log=None if log.is_unpacked else log,
     )
-
-
-def _share(progress: Report, total: float, scans: int) -> Callable[[float], None] | None:
-    if progress is None:
-        return None
-    return lambda share: progress(Progress("refine", share * total, total, scans))
-
-
-def _reported(
-    log: Log, events: Iterable[Event], history: RunHistory, progress: Callable[[Progress], None] | None
-) -> Iterator[Event]:
-    """The events, telling now and then how far they are."""
-    if progress is None:
-        yield from events
-        return
-    total, origin = log.summary.duration_s, log.summary.origin_ns
-    for event in events:
-        yield event
-        if isinstance(event, Scan):
-            progress(Progress("replay", max((event.stamp_ns - origin) / 1e9, 0.0), total, history.scans))

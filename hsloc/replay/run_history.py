@@ -258,11 +258,12 @@ class RunHistory:
         """
         if len(self._states) == 0:
             return None
+        model = self._motion_model or OdometryNoise()
         if grid is not None:
-            self._states.join_tracks(self.odometry().poses, self._motion_model or OdometryNoise(), grid)
+            self._states.join_tracks(self.odometry().poses, model, grid)
         smoothed = self._smooth()
         covariances = dict(zip(self._anchor_states, smoothed.covariances, strict=True))
-        between = bridge_variances(self.odometry().poses, self._anchors, smoothed.motion)
+        between = bridge_variances(self.odometry().poses, self._anchors, smoothed.motion, model)
         rows = self._states.at_odometry(len(self._odometry_stamps), covariances, between)
         if self._motion_model is not None:
             noise, factor = self._motion_model, self._anchors[-1].noise_scale if self._anchors else 1.0

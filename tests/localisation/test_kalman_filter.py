@@ -197,7 +197,24 @@ def test_between_two_matches_the_odometry_adds_its_noise() -> None:
     ]
     motion = smooth_matches(anchors, OdometryNoise()).motion
     assert motion[1, 0] == pytest.approx(0.01 * 0.4**2)
-    found = bridge_variances(odometry, anchors, motion)
+    found = bridge_variances(odometry, anchors, motion, OdometryNoise())
     assert found[2:4].min() > 0.0
     np.testing.assert_allclose(found[2, 0], motion[1, 0] / 4.0)
     assert (found[[0, 5, 6]] == 0.0).all()
+
+
+def test_over_a_long_gap_the_errors_of_the_odometry_are_a_walk() -> None:
+    odometry, noise = straight(21, 0.1), OdometryNoise()
+    anchors = [
+        anchor(1, Pose2(), Pose2(), SURE, begins=True),
+        anchor(21, Pose2(2.0, 0.0, 0.0), Pose2(2.0, 0.0, 0.0), SURE),
+    ]
+    found = bridge_variances(odometry, anchors, smooth_matches(anchors, noise).motion, noise)
+    # Ten motions of 0.2 m: half-way a quarter of what they add up to is left, along, and of the heading.
+    expected = np.array((0.01, 2.0 * 0.02)) * 10.0 * 0.2**2 / 4.0
+    np.testing.assert_allclose(found[10, [0, 2]], expected, rtol=0.1)
+    # Aside, what is left of walks of the heading of which both ends, places and headings, are known.
+    walks = np.cumsum(np.random.default_rng(0).normal(0.0, np.sqrt(0.04) * 0.2, (20_000, 10)), axis=1)
+    ends, middle = np.column_stack((0.2 * walks.sum(axis=1), walks[:, -1])), 0.2 * walks[:, :5].sum(axis=1)
+    aside = np.var(middle - ends @ np.linalg.lstsq(ends, middle, rcond=None)[0])
+    assert aside < found[10, 1] < 10.0 * aside

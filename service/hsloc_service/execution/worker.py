@@ -25,7 +25,7 @@ from hsloc_service.stored_request import MAPS, UPLOADS
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from hsloc.replay.run import Progress
+    from hsloc.replay.progress import Progress
     from hsloc.report.view import ReportView
     from hsloc.request import RunRequest
     from hsloc.run_metrics import RunMetrics, RunTimings

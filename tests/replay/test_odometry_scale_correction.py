@@ -1,0 +1,50 @@
+"""Odometry that counts wrongly is corrected, and the log replayed again."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from paths import RECORDINGS
+
+from hsloc.localisation.odometry_scale import OdometryScale
+from hsloc.log import LogWriter, Transform3, open_log
+from hsloc.maps import save_map
+from hsloc.model import Odometry, Scan, Trajectory, Truth
+from hsloc.replay.run import run
+from hsloc.simulation.built_in import built_in
+from hsloc.warnings import WarningCode
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_distances_that_are_counted_0_8_times_are_corrected(tmp_path: Path) -> None:
+    events = list(open_log(RECORDINGS / "office.mcap").events())
+    events = events[: 6 * len(events) // 10]
+    first = next(event for event in events if isinstance(event, Scan))
+    path = tmp_path / "run.mcap"
+    with LogWriter(path) as writer:
+        mounting = Transform3.from_pose2(first.T_base_laser)
+        writer.transforms(events[0].stamp_ns, [("base_link", first.frame_id, mounting)], static=True)
+        for event in OdometryScale(-0.2, 0.0).applied(events):
+            if isinstance(event, Odometry):
+                writer.odometry(event.stamp_ns, event.T_odom_base)
+            elif isinstance(event, Scan):
+                writer.scan(event, log_time_ns=event.stamp_ns)
+    world = built_in("office")
+    found = run(path, map=save_map(world.occupancy_grid(0.05), tmp_path), initial_pose=world.start())
+    (warning,) = found.warnings
+    assert warning.code == WarningCode.ODOMETRY_SCALE
+    counts = re.search(r"counts distances (\S+) times", warning.text)
+    assert counts is not None
+    assert float(counts[1]) == pytest.approx(0.8, abs=0.004)
+    assert found.odometry_scale is not None
+    assert abs(found.odometry_scale.way) < 0.01
+    assert found.odometry.length() == pytest.approx(found.trajectory.length(), rel=0.02)
+    true = Trajectory.from_pairs([(each.stamp_ns, each.T_map_base) for each in events if isinstance(each, Truth)])
+    off = found.trajectory.poses - true.interpolated(found.trajectory.stamps_ns)
+    assert np.hypot(off[:, 0], off[:, 1]).max() < 0.05
+    assert found.localised.all()

@@ -79,7 +79,8 @@ def test_where_all_turns_go_to_one_side_a_place_aside_may_be_slip(x: float, y: f
     assert found.error.x == pytest.approx(x, abs=0.02)
     assert found.is_turned
     assert found.error.theta == pytest.approx(0.05, abs=0.01)
-    assert (found.pose_errors(np.zeros((1, 3)))[0, :2] > 0.05).all()  # its place may be wrong as well
+    # Where its place is not known it may be wrong as well.
+    assert is_displaced or (found.pose_errors(np.zeros((1, 3)))[0, :2] > 0.05).all()
 
 
 @pytest.mark.parametrize("left", [0.5, 1.0], ids=["both sides", "one side"])

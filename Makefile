@@ -17,13 +17,21 @@ demo: $(VENV)/.demo  ## replay a fixture recording on its map and show the error
 # The kernels run twice: compiled, where coverage cannot see into them, and as plain Python, where it can. Each run has a
 # data file of its own, as pytest-cov erases what is beside its own.
 COVERAGE := build/coverage
-test: $(VENV)/.dev  ## all tests on all cores, and the coverage gate (pyproject: fail_under)
+test: $(VENV)/.dev build/numba/.compiled  ## all tests on all cores, and the coverage gate (pyproject: fail_under)
 	rm -rf $(COVERAGE) && mkdir -p $(COVERAGE)/compiled $(COVERAGE)/plain
 	COVERAGE_FILE=$(COVERAGE)/compiled/data $(PYTEST) --cov --cov-report= --cov-fail-under=0
 	NUMBA_DISABLE_JIT=1 COVERAGE_FILE=$(COVERAGE)/plain/data \
 		$(PYTEST) -p no:cacheprovider --cov --cov-report= --cov-fail-under=0 tests/kernels
 	$(BIN)/coverage combine -q --data-file=$(COVERAGE)/data $(COVERAGE)/compiled/data $(COVERAGE)/plain/data
 	$(BIN)/coverage report --data-file=$(COVERAGE)/data
+
+# Each process that runs tests would compile all kernels, which takes it a minute: here two compile a half each.
+build/numba/.compiled: hsloc/kernels/*.py requirements.lock | $(VENV)/.dev
+	mkdir -p $(@D) && rm -rf build/compiled
+	export NUMBA_CACHE_DIR=$(CURDIR)/build/numba MPLCONFIGDIR=$(CURDIR)/build/matplotlib; \
+	$(BIN)/hsloc replay recordings/office.mcap --end 15 --unknown-start --certify -q --out build/compiled/replay & \
+	$(BIN)/hsloc map recordings/office.mcap --end 15 -q --out build/compiled/map && wait $$!
+	touch $@
 
 lint: $(VENV)/.dev  ## style, types and the direction of imports
 	$(BIN)/ruff check .

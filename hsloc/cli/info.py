@@ -142,7 +142,7 @@ def _lines(summary: LogSummary, losses: Losses, report: dict[str, Any]) -> list[
         lines += [f"  {'map:':<12}{grid['width']} x {grid['height']} cells of {grid['resolution']} m"]
     if report["initial_pose"] is not None:
         start = report["initial_pose"]
-        lines += [f"  {'start pose:':<12}x {start['x']:.3f} m, y {start['y']:.3f} m, yaw {start['yaw']:.4f} rad"]
+        lines += [f"  {'start pose:':<12}x {start['x']:z.3f} m, y {start['y']:z.3f} m, yaw {start['yaw']:z.4f} rad"]
     if summary.truth_topic is None and summary.reference_candidates:
         lines += [f"  {'reference:':<12}--truth-topic could be {', '.join(summary.reference_candidates)}"]
     order = "by header stamps" if summary.order == "stamp" else "as in the log"

@@ -61,6 +61,6 @@ def _report(merge: MapMerge, out: Path) -> None:
     for reason in evidence.reasons:
         print(f"  {reason.text}")
     for name, pose, joints in zip(merge.names, merge.T_first_map, merge.joints, strict=True):
-        place = f"at x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {pose.theta:.3f} rad, by {joints} loops"
+        place = f"at x {pose.x:z.2f} m, y {pose.y:z.2f} m, yaw {pose.theta:z.3f} rad, by {joints} loops"
         print(f"{name}: {place if joints else 'its frame is kept'}")
     print(f"results: {out}")

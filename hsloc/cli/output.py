@@ -124,4 +124,4 @@ def _table(rows: Sequence[Row]) -> list[str]:
 
 def pose_text(pose: Pose2) -> str:
     """A pose for people."""
-    return f"x {pose.x:.3f} m, y {pose.y:.3f} m, yaw {pose.theta:.4f} rad"
+    return f"x {pose.x:z.3f} m, y {pose.y:z.3f} m, yaw {pose.theta:z.4f} rad"

@@ -130,7 +130,7 @@ class Comparison:
         return RunWarning(
             WarningCode.REFERENCE_DISPLACED,
             f"{whole:.3g} m from the reference, but {left.trans_part.rmse:.2g} m once moved as a whole by "
-            f"x {moved.x:.2f} m, y {moved.y:.2f} m, {math.degrees(moved.theta):.1f} deg: their frames differ, "
+            f"x {moved.x:z.2f} m, y {moved.y:z.2f} m, {math.degrees(moved.theta):z.1f} deg: their frames differ, "
             "or the robot was localised at another place",
             "if the frames differ, compare with --alignment se2",
         )

@@ -348,7 +348,7 @@ def _named_rival(rows: Sequence[TrackRow]) -> str:
             other = row.evidence.other
             if other is None:
                 break
-            place = f"x {other.x:.1f} m, y {other.y:.1f} m, yaw {np.degrees(other.theta):.0f} deg"
+            place = f"x {other.x:z.1f} m, y {other.y:z.1f} m, yaw {np.degrees(other.theta):z.0f} deg"
             return f"another place fits as well: {place} at the last comparison"
         if row.begins:
             break

@@ -189,7 +189,7 @@ def _items(lines: Iterable[str]) -> str:
 
 
 def _laser(laser: LaserMetrics) -> str:
-    where = f"x {laser.x:.3f} m, y {laser.y:.3f} m, yaw {degrees(laser.yaw):.1f}°"
+    where = f"x {laser.x:z.3f} m, y {laser.y:z.3f} m, yaw {degrees(laser.yaw):z.1f}°"
     upside_down = ", upside down" if laser.upside_down else ""
     source = "assumed" if laser.extrinsics == "identity" else f"from {laser.extrinsics}"
     return f"{laser.topic}, laser at {where}{upside_down} ({source})"

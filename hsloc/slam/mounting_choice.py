@@ -168,7 +168,7 @@ def right_mounting(
 
 def laser_pose_option(T_base_laser: Pose2) -> str:
     """The option that states this mounting, in m and rad."""
-    return f"--laser-pose={T_base_laser.x:.3f},{T_base_laser.y:.3f},{T_base_laser.theta:.4f}"
+    return f"--laser-pose={T_base_laser.x:z.3f},{T_base_laser.y:z.3f},{T_base_laser.theta:z.4f}"
 
 
 def _direction(motions: Iterable[_Motion]) -> tuple[Pose2, float, float]:

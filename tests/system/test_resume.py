@@ -92,7 +92,7 @@ def test_the_same_inputs_give_the_same_bytes(first: tuple[Result, Path], second:
 
 def test_a_log_of_another_building_is_not_joined(first: tuple[Result, Path]) -> None:
     with pytest.raises(MapError, match="no place of the log was recognised") as error:
-        run(RunRequest(logs=(RECORDINGS / "corridor_loop.mcap",), resume=first[1], read=ReadOptions(end_s=40.0)))
+        run(RunRequest(logs=(RECORDINGS / "corridor_loop.mcap",), resume=first[1], read=ReadOptions(end_s=25.0)))
     assert "\n" not in str(error.value)
 
 

@@ -10,20 +10,20 @@ import numpy as np
 
 from hsloc.errors import MapError
 from hsloc.model.occupancy_grid import OccupancyGrid
-from hsloc.model.pose2 import Pose2, relative_poses, wrap_angles
+from hsloc.model.pose2 import Pose2, relative_poses
 from hsloc.slam.calibration import OdometryCalibration
 from hsloc.slam.displaced import mended
 from hsloc.slam.evidence import Recorded, nothing_seen, weigh
-from hsloc.slam.joint_registration import Registration, moved_scans, refine
 from hsloc.slam.loop_closer import TORN, loop_edges
 from hsloc.slam.map_extension import connect, unconnected
 from hsloc.slam.map_session import LEFT_THE_MAP
 from hsloc.slam.map_state import MapState, fingerprint
-from hsloc.slam.marginals import all_edges, marginal_covariances, observed_terms
+from hsloc.slam.marginals import CommonErrors, all_edges, marginal_covariances, observed_terms
 from hsloc.slam.occupancy_mapper import build_grid
 from hsloc.slam.open_joints import close_and_join
 from hsloc.slam.plan_alignment import find_on_plan
 from hsloc.slam.pose_graph import Edges, PoseGraph, compose_steps, edge_errors
+from hsloc.slam.refinement import near_the_end, refine_map, refine_with_calibration
 from hsloc.slam.result import MappingQuality, MappingResult
 from hsloc.slam.slips import compare_with_odometry, held_by_the_rest, known_by_scans, without_slips
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from hsloc.kernels.normal_equations import PairTerms
     from hsloc.kernels.point_to_line import ScanArrays
+    from hsloc.slam.joint_registration import Registration
     from hsloc.slam.keyscans import KeyScans
     from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_session import MapSession, Tie
@@ -45,8 +46,6 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
-_UNSETTLED_M = 0.01
-"""Another pass is made if 1 of 100 keyscans moved farther than this [m] in the last round: a fifth of a cell."""
 _CONTRADICTED = 3.0
 """Residual [standard deviations] in the finished map from which on a loop contradicts it."""
 _MOST_REPAIRS = 3
@@ -85,8 +84,7 @@ def solve(gathered: MapSession, parameters: GraphMapperParameters, rng: Generato
     arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
     gathered = mended(gathered, arrays)
     gathered, poses, loops, edges = close_and_join(gathered, parameters, rng, _silent)
-    edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), edges])
-    refined, _ = _refine(poses, arrays, edges, parameters, _silent)
+    gathered, refined, _ = refine_with_calibration(poses, arrays, gathered, edges, parameters, _silent)
     return replace(gathered, poses=refined.poses, known=tuple(loops))
 
 
@@ -108,18 +106,20 @@ def finish_session(
     gathered, poses, loops, loop_edges = close_and_join(gathered, parameters, rng, lambda part: report(0.5 * part))
     if extended is not None and not any(loop.accepted and _connects(loop, gathered) for loop in loops):
         raise MapError(unconnected(extended))
-    edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), loop_edges])
-    refined, passes = _refine(poses, arrays, edges, parameters, lambda part: report(0.5 + 0.4 * part))
+    gathered, refined, passes = refine_with_calibration(
+        poses, arrays, gathered, loop_edges, parameters, lambda part: report(0.5 + 0.4 * part)
+    )
     fit = None
     if plan is not None:
         fit = find_on_plan(plan, build_grid(refined.poses, gathered.scans, parameters.occupancy), refined.poses)
         if fit.is_certain:
-            refined, more = _refine(fit.moved(refined.poses), arrays, edges, _near_the_end(parameters), _silent)
+            edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), loop_edges])
+            refined, more = refine_map(fit.moved(refined.poses), arrays, edges, near_the_end(parameters), _silent)
             passes += more
     repaired = _without_slips(refined, gathered, loop_edges, arrays, parameters)
     refined, observed, edges = repaired.refined, repaired.observed, repaired.edges
     gathered, passes = replace(gathered, steps=repaired.steps), passes + repaired.passes
-    covariances = marginal_covariances(refined, observed, edges)
+    covariances = marginal_covariances(refined, observed, edges, _common(gathered))
     grid = build_grid(refined.poses, gathered.scans, parameters.occupancy)
     report(1.0)
     of_log = refined.poses[gathered.first :]
@@ -175,8 +175,7 @@ def _without_slips(
     for repairs_left in range(_MOST_REPAIRS if parameters.use_odometry else 0, -1, -1):
         edges = Edges.concatenate([steps, loop_edges])
         if known is not None:
-            near_the_end = _near_the_end(parameters)
-            refined, more = _refine(refined.poses, scans, edges, near_the_end, _silent, refined)
+            refined, more = refine_map(refined.poses, scans, edges, near_the_end(parameters), _silent, refined)
             passes += more
         motions = compare_with_odometry(refined, gathered.steps if known is None else steps)
         if known is not None:
@@ -194,6 +193,12 @@ def _without_slips(
         slipped = more_slipped
         steps = without_slips(gathered.steps, slipped)
     return _Repaired(refined, observed, edges, steps, stretches, held, passes)
+
+
+def _common(gathered: MapSession) -> CommonErrors | None:
+    """What the steps of the odometry have in common and is not known."""
+    errors = gathered.systematic
+    return None if errors is None else CommonErrors(errors.changes(gathered.steps.measured), errors.covariance)
 
 
 def _recorded(
@@ -271,37 +276,6 @@ def _state(
         grid=grid,
         fingerprint=fingerprint(parameters),
     )
-
-
-def _refine(
-    poses: F64,
-    scans: ScanArrays,
-    edges: Edges,
-    parameters: GraphMapperParameters,
-    progress: Callable[[float], None],
-    previous: Registration | None = None,
-) -> tuple[Registration, int]:
-    """Passes over the whole log, each with partners chosen again, until nothing moves."""
-    most, p = parameters.passes, parameters.joint_registration
-    later = _near_the_end(parameters).joint_registration
-    refined = refine(poses, scans, edges, p, lambda part: progress(part / most), previous)
-    passes = 1
-    while passes < most and refined.moved >= _UNSETTLED_M:
-        begin = refined.poses
-        done = passes
-        refined = refine(begin, scans, edges, later, lambda part: progress((done + part) / most), refined)  # noqa: B023
-        passes += 1
-        change = refined.poses - begin
-        change[:, 2] = wrap_angles(change[:, 2])
-        if moved_scans(change) < p.convergence_tolerance:
-            break
-    return refined, passes
-
-
-def _near_the_end(parameters: GraphMapperParameters) -> GraphMapperParameters:
-    """Without the wide gates of the first rounds."""
-    registration = parameters.joint_registration
-    return replace(parameters, joint_registration=replace(registration, gates=registration.gates[-1:]))
 
 
 def _quality(

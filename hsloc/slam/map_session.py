@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from hsloc.slam.keyscans import KeyScan
     from hsloc.slam.map_state import MapState
     from hsloc.slam.parameters import GraphMapperParameters
+    from hsloc.slam.systematic_errors import SystematicErrors
     from hsloc.slam.trajectory_correction import EventLog
 
     F64 = NDArray[np.float64]
@@ -80,6 +81,8 @@ class MapSession:
     """Keyscans before steps in which the wheels slipped, as the scans around them show."""
     joints: tuple[int, ...] = ()
     """Keyscans at which a piece of the path begins that was found on the map of the others alone."""
+    systematic: SystematicErrors | None = None
+    """What was added to the steps; None before the map was refined."""
 
     @property
     def slipped(self) -> NDArray[np.bool_]:

@@ -7,10 +7,11 @@ modelled is not in it: stamps that are wrong, lidars that tilt, walls that moved
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from hsloc.kernels.normal_equations import Equations, add_edges
 from hsloc.model.pose2 import relative_poses, wrap_angles
 from hsloc.slam.joint_registration import normal_equations
 from hsloc.slam.pose_graph import Edges, anchored, edge_errors
@@ -43,19 +44,53 @@ _UNOBSERVED = 1e-6
 """Part of a pair's information below which a direction counts as not measured. Internal: makes it invertible."""
 
 
-def marginal_covariances(refined: Registration, terms: PairTerms, edges: Edges) -> F64:
+class CommonErrors(NamedTuple):
+    """Errors (k,) that the first m edges have in common: their covariance (k, k), and what they change (k, m, 3)."""
+
+    changes: F64
+    covariance: F64
+
+
+def marginal_covariances(
+    refined: Registration, terms: PairTerms, edges: Edges, common: CommonErrors | None = None
+) -> F64:
     """Covariance (n, 3, 3) of each pose over (x, y, theta), relative to the first pose, in its frame, the map's.
 
-    `terms` are those of `observed_terms`.
+    `terms` are those of `observed_terms`. Errors that the first edges have in `common` move all poses together, and are
+    added.
     """
+    poses = refined.linearised_at
     pairs = np.concatenate((refined.pairs, edges.pairs))
-    system = BlockSystem(len(refined.poses), pairs[:, 0], pairs[:, 1])
-    diagonal, off_diagonal, _ = normal_equations(
-        refined.linearised_at, refined.pairs, terms, information_of_a_point(refined), edges
-    )
+    system = BlockSystem(len(poses), pairs[:, 0], pairs[:, 1])
+    of_a_point = information_of_a_point(refined)
+    diagonal, off_diagonal, _ = normal_equations(poses, refined.pairs, terms, of_a_point, edges)
     covariances = system.inverse_blocks(anchored(diagonal), off_diagonal)
+    if common is not None:
+        rights = _right_sides(poses, edges[: common.changes.shape[1]], common.changes)
+        moved = system.solve_each(anchored(diagonal), off_diagonal, rights)
+        covariances = covariances + np.einsum("kni,kl,lnj->nij", moved, common.covariance, moved)
     covariances[0] = 0.0
     return covariances
+
+
+def _right_sides(poses: F64, edges: Edges, changes: F64) -> F64:
+    """Right sides (k, n, 3) of the equations by changes (k, m, 3) of what the edges measure."""
+    information = edges.information * _robust_weights(poses, edges)[:, None, None]
+    found = np.zeros((len(changes), len(poses), 3))
+    relative, trusted = relative_poses(poses[edges.pairs[:, 0]], poses[edges.pairs[:, 1]]), np.full(len(edges), np.inf)
+    diagonal, off_diagonal = np.zeros((len(poses), 3, 3)), np.empty((len(edges), 3, 3))
+    for change, right in zip(changes, found, strict=True):
+        equations = Equations(diagonal, off_diagonal, right)
+        add_edges(poses, edges.pairs, relative - change, information, trusted, equations)
+    return found
+
+
+def _robust_weights(poses: F64, edges: Edges) -> F64:
+    """Weights (m,) of the edges in the equations."""
+    _, _, chi = edge_errors(poses, edges)
+    finite = np.isfinite(edges.scale)
+    scale2 = np.where(finite, edges.scale, 1.0) ** 2
+    return np.where(finite, scale2 / (scale2 + chi**2), 1.0)
 
 
 def observed_terms(refined: Registration) -> PairTerms:
@@ -79,14 +114,11 @@ def all_edges(refined: Registration, terms: PairTerms, edges: Edges) -> Edges:
 
     What a pair measures is the pose at which its own points agree best, to second order, brought nearer to the solved
     one as far as its information is larger than its weight in the solution: so other solvers find the same poses, and
-    the same covariances. All edges are trusted, for their robust weights are in their information. `terms` are those
-    of `observed_terms`.
+    the same covariances, but for errors that edges have in common. All edges are trusted, for their robust weights are
+    in their information. `terms` are those of `observed_terms`.
     """
     before, poses = refined.linearised_at, refined.poses
-    _, _, chi = edge_errors(before, edges)
-    finite = np.isfinite(edges.scale)
-    scale2 = np.where(finite, edges.scale, 1.0) ** 2
-    weights = np.where(finite, scale2 / (scale2 + chi**2), 1.0)
+    weights = _robust_weights(before, edges)
     # A pair without a paired point holds nothing.
     of_pairs = refined.counts[:, 0] > 0.0
     pairs, hessian = refined.pairs[of_pairs], terms.information[of_pairs]

@@ -36,6 +36,9 @@ class Edges:
     def __len__(self) -> int:
         return len(self.pairs)
 
+    def __getitem__(self, part: slice) -> Edges:
+        return Edges(self.pairs[part], self.measured[part], self.information[part], self.scale[part])
+
     @staticmethod
     def none() -> Edges:
         """No edges."""

@@ -247,8 +247,8 @@ def held_by_the_rest(
     covariances: F64 = np.asarray(np.linalg.inv(steps.information), dtype=np.float64)
     composed_motions(steps.measured, covariances, ends, driven, driven_covariance)
     for k, (first, last) in enumerate(ends.tolist()):
-        own = slice(first, last)
-        chain = Edges(edges.pairs[own] - first, edges.measured[own], edges.information[own], edges.scale[own])
+        own = edges[first:last]
+        chain = replace(own, pairs=own.pairs - first)
         # The other information on these poses is what is known of them less what their own odometry says.
         known = np.linalg.inv(_joint(blocks[begins[k] : begins[k + 1]], last + 1 - first))
         local, matrix, gradient = poses[first : last + 1], *_dense(poses[first : last + 1], chain)

@@ -45,11 +45,17 @@ class BlockSystem:
 
     def solve(self, diagonal: F64, off_diagonal: F64, right: F64) -> F64:
         """The x (n, 3) of `A x = right`."""
+        solution: F64 = self.solve_each(diagonal, off_diagonal, right[None])[0]
+        return solution
+
+    def solve_each(self, diagonal: F64, off_diagonal: F64, rights: F64) -> F64:
+        """The x (k, n, 3) of `A x = right` for each of the right sides (k, n, 3)."""
         elimination = self._eliminated()
         if elimination.blocks > MOST_BLOCKS_A_COLUMN * self._size:
-            solution: F64 = self._factor(diagonal, off_diagonal).solve(np.ascontiguousarray(right.reshape(-1)))
-            return solution.reshape(-1, 3)
-        return elimination.solve(self._summed(diagonal, off_diagonal), right)
+            columns = np.ascontiguousarray(rights.reshape(len(rights), -1).T)
+            solutions: F64 = self._factor(diagonal, off_diagonal).solve(columns).T.reshape(rights.shape)
+            return solutions
+        return elimination.solve_each(self._summed(diagonal, off_diagonal), rights)
 
     def inverse_blocks(self, diagonal: F64, off_diagonal: F64) -> F64:
         """The blocks (n, 3, 3) on the diagonal of the inverse: covariances, where the matrix is an information."""
@@ -102,14 +108,15 @@ class _Elimination:
         self._start_of_factor = start
         self._factor: Factor | None = None
 
-    def solve(self, blocks: F64, right: F64) -> F64:
-        """The x (n, 3) of the matrix with these blocks, in the order of the pattern."""
+    def solve_each(self, blocks: F64, rights: F64) -> F64:
+        """The x (k, n, 3) of the matrix with these blocks, in the order of the pattern."""
         factor = self._factorised(blocks)
-        x = np.ascontiguousarray(right[self._order], dtype=np.float64)
-        solve_factor(factor, x)
-        solution = np.empty_like(x)
-        solution[self._order] = x
-        return solution
+        solutions = np.empty(rights.shape)
+        for right, solution in zip(rights, solutions, strict=True):
+            x = np.ascontiguousarray(right[self._order], dtype=np.float64)
+            solve_factor(factor, x)
+            solution[self._order] = x
+        return solutions
 
     def inverse_at(self, blocks: F64, places: I64) -> F64:
         """The blocks (k, 3, 3) of the inverse in the rows and columns `places` (k, 2) of the matrix with these."""

@@ -27,8 +27,11 @@ def test_a_sparse_system_is_that_of_its_dense_matrix(monkeypatch: pytest.MonkeyP
     system = BlockSystem(4, rows, columns)
     np.testing.assert_allclose(system.solve(diagonal, off, right), expected, rtol=1e-9)
     np.testing.assert_allclose(system.solve(2.0 * diagonal, 2.0 * off, right), 0.5 * expected, rtol=1e-9)
+    both = np.stack((expected, -2.0 * expected))
+    np.testing.assert_allclose(system.solve_each(diagonal, off, np.stack((right, -2.0 * right))), both, rtol=1e-9)
     monkeypatch.setattr(sparse_solver, "MOST_BLOCKS_A_COLUMN", 0)  # as with much fill: by SuperLU
     np.testing.assert_allclose(system.solve(diagonal, off, right), expected, rtol=1e-9)
+    np.testing.assert_allclose(system.solve_each(diagonal, off, np.stack((right, -2.0 * right))), both, rtol=1e-9)
 
 
 @pytest.mark.parametrize("chords", [0, 3, 20])

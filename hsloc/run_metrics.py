@@ -17,7 +17,7 @@ from hsloc.evaluation import RelationsResult
 from hsloc.evaluation.error_metrics import ErrorMetrics
 from hsloc.evaluation.maps import Crispness, MapComparison
 from hsloc.model.verdict import Verdict, VerdictReason
-from hsloc.slam.result import MappingQuality
+from hsloc.slam.result import MappingQuality, OdometryErrors
 from hsloc.warnings import RunWarning
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from hsloc.log import LaserSummary
 
-SCHEMA_VERSION = "1.1"
+SCHEMA_VERSION = "1.2"
 """Major number: a key was removed, renamed or changed its meaning. Minor number: a key was added."""
 
 
@@ -243,6 +243,8 @@ class MapMetrics:
     """Consistency of the map and its loops; only of a map built by the graph mapper."""
     comparison: MapComparison | None = None
     """Comparison with the map in the log; only of a map that this run built, where the log has a map and truth."""
+    odometry: OdometryErrors | None = None
+    """Systematic errors of the odometry; only of a map built by the graph mapper with odometry, over 50 m and more."""
     plan: PlanMetrics | None = None
     """Its place on a floor plan; left out where none was given."""
     scale: ScaleMetrics | None = None

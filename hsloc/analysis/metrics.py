@@ -164,6 +164,7 @@ def map_metrics(result: Result, residuals: ResidualMetrics, comparison: Comparis
         mapping=None if result.mapping is None else result.mapping.quality,
         comparison=compared,
         comparison_error=error_text,
+        odometry=None if result.mapping is None else result.mapping.odometry_errors,
         plan=_plan_metrics(result),
     )
 

@@ -283,6 +283,12 @@ def _map_rows(found: MapMetrics) -> list[Row]:
         if isfinite(mapping.conflict):
             values = format_share(mapping.conflict)
             rows.append(Row("points seen through", (values,), _CONFLICT, ("map/mapping/conflict",)))
+    if found.odometry is not None:
+        errors = found.odometry
+        way = f"{100.0 * errors.translation:+.1f} ± {100.0 * errors.translation_sigma:.1f} % of the way"
+        turns = f"{100.0 * errors.rotation:+.1f} ± {100.0 * errors.rotation_sigma:.1f} % of turns"
+        sources = ("map/odometry/translation", "map/odometry/rotation")
+        rows.append(Row("added to the odometry", (f"{way}, {turns}",), _ODOMETRY_ERRORS, sources))
     if found.crispness is not None and isfinite(found.crispness.wall_thickness_median):
         values = format_length(found.crispness.wall_thickness_median)
         rows.append(Row("wall thickness", (values,), _THICKNESS, ("map/crispness/wall_thickness_median",)))
@@ -342,6 +348,10 @@ _LOOPS = (
 _SIGMA = (
     "How well the positions of the scans are known relative to the first one, by the walls, steps and loops that hold "
     "them; wrong stamps and moved walls are not in it. covariances.csv has it for each pose."
+)
+_ODOMETRY_ERRORS = (
+    "Parts of each translation and rotation by which the odometry was corrected, as the scans show: the size of the "
+    "wheels and their distance."
 )
 _CONFLICT = (
     "Part of the points of the map where another scan looked through. Below 5 % is usual; more means that walls are "

@@ -142,6 +142,7 @@ def finish_session(
         calibration=calibration,
         state=_state(gathered, refined.poses, loop_edges, grid, parameters),
         evidence=weigh(_recorded(gathered, refined, loops, repaired, parameters.use_odometry)),
+        odometry_errors=None if gathered.systematic is None else gathered.systematic.summary(),
         plan=None if plan is None or fit is None else fit.compared(grid, plan),
     )
 

@@ -62,7 +62,7 @@ def refine_with_calibration(
     if parameters.use_odometry:
         errors = find_systematic_errors(refined, gathered.steps, gathered.first)
         gathered = replace(gathered, steps=errors.added_to(gathered.steps), systematic=errors)
-        if errors.values.any():
+        if errors.are_found:
             edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), loop_edges])
             refined = replace(refined, moved=np.inf)
     return gathered, *_settled(refined, scans, edges, parameters, progress)

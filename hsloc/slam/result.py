@@ -63,6 +63,24 @@ class MappingQuality:
     """Distance that 99 of 100 keyscans moved less than in the last round [m; a rad counts as 5 m]."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryErrors:
+    """Systematic errors of the odometry by the scans: what was added to it, and how well that is known."""
+
+    translation: float
+    """Part of each translation that was added [m/m]."""
+    translation_sigma: float
+    """Its standard deviation [m/m]."""
+    rotation: float
+    """Part of each rotation that was added [rad/rad]."""
+    rotation_sigma: float
+    """Its standard deviation [rad/rad]."""
+    drift: float
+    """Rotation that was added for each metre [rad/m]."""
+    drift_sigma: float
+    """Its standard deviation [rad/m]."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MappingResult:
     """The map, and the whole trajectory as it is known at the end.
@@ -94,6 +112,8 @@ class MappingResult:
     """What is saved to go on from; None if no scan had a return."""
     evidence: Evidence
     """Whether the map is right, as far as what was recorded shows."""
+    odometry_errors: OdometryErrors | None = None
+    """Systematic errors of the odometry that were taken out; None where the drive was too short to show any."""
     plan: PlanFit | None = None
     """Where the map lies on the floor plan that was given."""
 

@@ -18,6 +18,7 @@ from hsloc.kernels.registration import composed_motions, window_motions
 from hsloc.localisation.mounting_error import without_each_part
 from hsloc.model.pose2 import wrap_angles
 from hsloc.slam.marginals import FLAT_IN_A_STRETCH_M, information_of_a_point, observed_terms
+from hsloc.slam.result import OdometryErrors
 from hsloc.slam.slips import STRETCHES_DEEP, stretch_ends
 
 if TYPE_CHECKING:
@@ -54,6 +55,26 @@ class SystematicErrors:
     values: F64
     covariance: F64
     first: int = 0
+
+    @property
+    def are_found(self) -> bool:
+        """Whether the log was long enough to show any."""
+        return bool(self.values.any())
+
+    def summary(self) -> OdometryErrors | None:
+        """The three by their names; None where none is found."""
+        if not self.are_found:
+            return None
+        translation, rotation, drift = self.values.tolist()
+        sigmas = np.sqrt(np.diag(self.covariance)).tolist()
+        return OdometryErrors(
+            translation=translation,
+            translation_sigma=sigmas[0],
+            rotation=rotation,
+            rotation_sigma=sigmas[1],
+            drift=drift,
+            drift_sigma=sigmas[2],
+        )
 
     def added_to(self, steps: Edges) -> Edges:
         """The odometry's steps from keyscan to keyscan with them."""

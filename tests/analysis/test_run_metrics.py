@@ -111,7 +111,7 @@ def test_what_cannot_be_measured_is_null_and_reads_back_as_nan() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"schema_version": "2.0"}, "schema version is '2.0', not 1.1; run the replay again"),
+        ({"schema_version": "2.0"}, "schema version is '2.0', not 1.2; run the replay again"),
         ({"schema_version": None}, "an earlier one"),
         ({"scans": {"total": 3}}, r"RunMetrics\.scans\.used is missing"),
         ({"fitness": {"median": "high", "p05": None}}, r"RunMetrics\.fitness\.median is 'high'"),

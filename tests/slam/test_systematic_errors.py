@@ -56,6 +56,10 @@ def test_a_map_does_not_get_the_size_that_the_wheels_count(loop: Any, monkeypatc
     sigma = np.sqrt(np.diag(errors.covariance))
     np.testing.assert_array_less(np.abs(errors.values - expected), 4.0 * sigma)
     np.testing.assert_array_less(sigma, (0.005, 0.02, 0.002))
+    assert result.odometry_errors == errors.summary()
+    assert result.odometry_errors is not None
+    assert result.odometry_errors.translation == errors.values[0]
+    assert result.odometry_errors.drift_sigma == sigma[2]
     assert abs(result.calibration.way - 1.0 / way) < 0.01
 
 
@@ -82,6 +86,7 @@ def straight(n: int) -> tuple[Registration, Edges]:
 def test_of_a_short_drive_nothing_is_found_and_little_is_known() -> None:
     errors = find_systematic_errors(*straight(30))
     assert not errors.values.any()
+    assert errors.summary() is None
     assert (np.sqrt(np.diag(errors.covariance)) >= (0.05, 0.1, 0.02)).all()
 
 

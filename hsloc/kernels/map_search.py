@@ -150,11 +150,11 @@ def _add(totals: I32, row: U8, stride: int, weight: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _bound_row(by_phase: U8, offsets: I32, weights: I64, n: int, y: int, side: int, totals: I32) -> None:
+def _bound_row(by_phase: U8, skipped: int, offsets: I32, weights: I64, n: int, y: int, side: int, totals: I32) -> None:
     """255 times the bounds of a whole row of boxes of places of `side` entries.
 
-    `by_phase[k, p, q, j, i]` is entry (j step + p, i step + q) of table k, and `side` is a multiple of the step: boxes
-    side by side look up neighbours in memory, or those `stride` apart.
+    `by_phase[k, p, q, j, i]` is entry (j step + p, i step + q) of table k + `skipped`, and `side` is a multiple of the
+    step: boxes side by side look up neighbours in memory, or those `stride` apart.
     """
     step = by_phase.shape[1]
     rows = by_phase.shape[3]
@@ -172,7 +172,7 @@ def _bound_row(by_phase: U8, offsets: I32, weights: I64, n: int, y: int, side: i
         if begin < end:
             _add(
                 totals[begin:end],
-                by_phase[offsets[i, 0], v - row * step, u - column * step, row, column + begin * stride :],
+                by_phase[offsets[i, 0] - skipped, v - row * step, u - column * step, row, column + begin * stride :],
                 stride,
                 weights[i],
             )
@@ -201,12 +201,15 @@ def fit_boxes(
     """The boxes of the finest level whose bound exceeds `needed` (a sum of scores).
 
     `half_thetas[k]` is half the interval of headings at level k, that of the coarsest level divides the turn.
+    `by_phase` are the last of the tables, those of squares that are larger than its step; the coarsest level needs no
+    others.
     Returns rows (x, y, theta, half, half, half_theta, bound) in cells, the boxes bounded, and whether it came to its
     end within `max_boxes` and `max_results`.
     """
     is_open, open_starts, open_widths = open_squares
     coarsest = len(half_thetas) - 1
     step = 1 << pyramid.shift
+    skipped = len(pyramid.tables) - len(by_phase)
     limit = floor(255.0 * needed)
     largest = 0
     for k in range(coarsest + 1):
@@ -245,7 +248,7 @@ def fit_boxes(
             if level == coarsest:
                 for y in range(coarsest_height):
                     totals[:] = rest[n]
-                    _bound_row(by_phase, offsets, weights, n, y, 1 << level, totals)
+                    _bound_row(by_phase, skipped, offsets, weights, n, y, 1 << level, totals)
                     boxes += width
                     for x in range(width):
                         if totals[x] > limit and is_open[open_starts[level] + y * width + x]:

@@ -134,7 +134,11 @@ class WholeMapSearch:
         self._pyramid = score_pyramid(field)
         self._usual = max(round(log2(_SQUARE / field.resolution)) - self._pyramid.shift, 1)
         self._coarsest = self._usual + _COARSER
-        self._by_phase = _by_phase(self._pyramid.tables, 1 << self._usual)
+        # A box of the coarsest level has the side of the step or more, and its points lie in more entries than that.
+        side = 1 << self._usual
+        smallest = self._pyramid.smallest
+        first = int(smallest[min(side + 1, len(smallest) - 1)])
+        self._by_phase = _by_phase(self._pyramid.tables[first:], side)
         is_open = _open_entries(grid, field, self._pyramid.shift)
         self._open_squares = _open_squares(is_open, self._coarsest)
         self._sample = _places(is_open, _SAMPLE)

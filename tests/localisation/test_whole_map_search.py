@@ -45,6 +45,16 @@ def test_a_scan_from_anywhere_is_found_and_nothing_else_within_the_margin(buildi
         assert mode.fitness == pytest.approx(field.fitness(points, mode.pose), abs=1e-5)
 
 
+def test_a_scan_is_found_where_no_table_is_larger_than_the_squares_that_the_search_begins_with() -> None:
+    world = floor(40.0, 3)
+    grid = world.occupancy_grid(0.01)
+    rng = np.random.default_rng(0)
+    true = random_pose(grid, rng)
+    result = WholeMapSearch(grid, LikelihoodField.from_grid(grid)).search(scan_at(world, true, rng))
+    assert result.is_complete
+    assert is_near(result.modes[0], true)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_no_pose_of_a_dense_search_contradicts_the_proof(building: Any, seed: Any) -> None:
     """Random poses all over the floor, and around the modes: above the bound only in the radius of a mode."""

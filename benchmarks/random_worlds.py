@@ -5,6 +5,7 @@ A seed gives a world. Bare stretches, long halls and look-alikes are among them 
 
 from __future__ import annotations
 
+from itertools import pairwise
 from math import cos, hypot, pi, sin
 from typing import TYPE_CHECKING
 
@@ -129,6 +130,42 @@ def grid(random: Generator) -> World:
 
 
 KINDS: tuple[Callable[[Generator], World], ...] = (loop, rooms, tee, hall, twins, grid)
+
+
+def building(random: Generator, metres: float) -> World:
+    """Crossing corridors of 28 to 150 m with rooms, in half of the buildings evenly apart, driven at random so far."""
+    columns, rows = int(random.integers(3, 5)), int(random.integers(2, 5))
+    xs = np.cumsum([0.0, *random.uniform(14.0, 50.0, columns - 1)])
+    ys = np.cumsum([0.0, *random.uniform(14.0, 40.0, rows - 1)])
+    if random.random() < 0.5:
+        xs, ys = np.linspace(0.0, xs[-1], columns), np.linspace(0.0, ys[-1], rows)
+    half = 0.5 * random.uniform(1.7, 3.0)
+    boxes: list[Box] = [(xs[0] - half, y - half, xs[-1] + half, y + half) for y in ys]
+    boxes += [(x - half, ys[0] - half, x + half, ys[-1] + half) for x in xs]
+    recesses, blocks = _irregular(boxes, random, random.uniform(2.0, 7.0))
+    for y, above, below in zip(ys, [*np.diff(ys), np.inf], [np.inf, *np.diff(ys)], strict=True):
+        for start, end in pairwise(xs):
+            at = start + half + 0.5
+            while at < end - half - 4.0:
+                side = 1.0 if random.random() < 0.5 else -1.0
+                size, depth = random.uniform(3.0, 6.0), random.uniform(3.0, 4.5)
+                last = min(at + size, end - half - 0.3)
+                if random.random() < 0.5 and (above if side > 0.0 else below) > 2.0 * half + 6.0:
+                    wall, near, far = (y + side * (half + out) for out in (0.0, 0.12, 0.12 + depth))
+                    door = random.uniform(at + 0.3, last - 1.3)
+                    boxes.append((at, min(near, far), last, max(near, far)))
+                    boxes.append((door, min(wall, near), door + 0.95, max(wall, near)))
+                at = last + 0.15
+    place, before, path, way = (0, 0), None, [(float(xs[0]), float(ys[0]))], 0.0
+    while way < metres:
+        i, j = place
+        near_by = [(i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)]
+        ways = [(a, b) for a, b in near_by if 0 <= a < columns and 0 <= b < rows and (a, b) != before]
+        before, place = place, ways[random.integers(len(ways))]
+        path.append((float(xs[place[0]]), float(ys[place[1]])))
+        way += abs(path[-1][0] - path[-2][0]) + abs(path[-1][1] - path[-2][1])
+    walls = floor_plan([*boxes, *recesses], blocks)
+    return World("building", np.round(walls, 6), np.round(path, 6), closed=False)
 
 
 def random_world(random: Generator) -> World:

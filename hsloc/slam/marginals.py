@@ -34,6 +34,10 @@ Of 100 simulated drives in random worlds (benchmarks/README.md), with noise of 1
 squared is near 3 for each noise with it; with 14 mm it was 2.0 for the best lidars, and 3.1 for the others."""
 FLAT_IN_A_STRETCH_M = 0.014
 """The same where few scans are compared, which see the same walls: it does not average out there as over a map."""
+_SCALE = 0.001
+"""Standard deviation of the scale of a map that scans hold: what they get wrong of motions along walls they get wrong
+alike everywhere, as corners look rounder from afar. In eight simulated buildings of 60 to 120 m the scale is off by
+0.13 %, in which the noise of the poses is, too."""
 _LEAST_REAL = 0.02
 """Part of the information of a pair, in any direction, that is kept at least: so that it can be inverted."""
 _NOISES = np.geomspace(0.003, 0.1, 60)
@@ -57,7 +61,7 @@ def marginal_covariances(
     """Covariance (n, 3, 3) of each pose over (x, y, theta), relative to the first pose, in its frame, the map's.
 
     `terms` are those of `observed_terms`. Errors that the first edges have in `common` move all poses together, and are
-    added.
+    added, as is that of the map's scale.
     """
     poses = refined.linearised_at
     pairs = np.concatenate((refined.pairs, edges.pairs))
@@ -66,16 +70,18 @@ def marginal_covariances(
     diagonal, off_diagonal, _ = normal_equations(poses, refined.pairs, terms, of_a_point, edges)
     covariances = system.inverse_blocks(anchored(diagonal), off_diagonal)
     if common is not None:
-        rights = _right_sides(poses, edges[: common.changes.shape[1]], common.changes)
+        rights = right_sides(poses, edges[: common.changes.shape[1]], common.changes)
         moved = system.solve_each(anchored(diagonal), off_diagonal, rights)
         covariances = covariances + np.einsum("kni,kl,lnj->nij", moved, common.covariance, moved)
+    way = poses[:, :2] - poses[0, :2]
+    covariances[:, :2, :2] += _SCALE**2 * way[:, :, None] * way[:, None, :]
     covariances[0] = 0.0
     return covariances
 
 
-def _right_sides(poses: F64, edges: Edges, changes: F64) -> F64:
+def right_sides(poses: F64, edges: Edges, changes: F64) -> F64:
     """Right sides (k, n, 3) of the equations by changes (k, m, 3) of what the edges measure."""
-    information = edges.information * _robust_weights(poses, edges)[:, None, None]
+    information = edges.information * robust_weights(poses, edges)[:, None, None]
     found = np.zeros((len(changes), len(poses), 3))
     relative, trusted = relative_poses(poses[edges.pairs[:, 0]], poses[edges.pairs[:, 1]]), np.full(len(edges), np.inf)
     diagonal, off_diagonal = np.zeros((len(poses), 3, 3)), np.empty((len(edges), 3, 3))
@@ -85,7 +91,7 @@ def _right_sides(poses: F64, edges: Edges, changes: F64) -> F64:
     return found
 
 
-def _robust_weights(poses: F64, edges: Edges) -> F64:
+def robust_weights(poses: F64, edges: Edges) -> F64:
     """Weights (m,) of the edges in the equations."""
     _, _, chi = edge_errors(poses, edges)
     finite = np.isfinite(edges.scale)
@@ -118,7 +124,7 @@ def all_edges(refined: Registration, terms: PairTerms, edges: Edges) -> Edges:
     in their information. `terms` are those of `observed_terms`.
     """
     before, poses = refined.linearised_at, refined.poses
-    weights = _robust_weights(before, edges)
+    weights = robust_weights(before, edges)
     # A pair without a paired point holds nothing.
     of_pairs = refined.counts[:, 0] > 0.0
     pairs, hessian = refined.pairs[of_pairs], terms.information[of_pairs]

@@ -17,8 +17,7 @@ from hsloc.evaluation.alignment import Alignment, align, parse_alignment
 from hsloc.evaluation.association import AssociationMethod, associate
 from hsloc.evaluation.rpe import Delta, rpe
 from hsloc.evaluation.statistics import PoseErrors, PoseStatistics
-from hsloc.model import wrap_angles
-from hsloc.model.pose2 import compose_poses
+from hsloc.model.pose2 import compose_poses, pose_differences
 from hsloc.trajectory_io.tum import NS_PER_S
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -157,20 +156,13 @@ class Comparison:
 
 def ape(reference: Floats, estimate: Floats) -> PoseErrors:
     """Absolute pose errors (evo's `evo_ape`) of poses (n, 3) against reference poses (n, 3), row by row."""
-    return PoseErrors.of(_axis_errors(reference, estimate))
+    return PoseErrors.of(pose_differences(estimate, reference))
 
 
 def axis_rmse(reference: Floats, estimate: Floats) -> tuple[float, float, float]:
     """RMSE of x (m), y (m) and theta (rad, wrapped): the figures of [P]'s experiments, which did not wrap."""
-    x, y, theta = np.sqrt(np.square(_axis_errors(reference, estimate)).mean(axis=0))
+    x, y, theta = np.sqrt(np.square(pose_differences(estimate, reference)).mean(axis=0))
     return float(x), float(y), float(theta)
-
-
-def _axis_errors(reference: Floats, estimate: Floats) -> Floats:
-    """Estimate minus reference, (n, 3): x and y in metres along the map's axes, theta in radians, wrapped."""
-    errors = estimate - reference
-    errors[:, 2] = wrap_angles(errors[:, 2])
-    return errors
 
 
 def compare(

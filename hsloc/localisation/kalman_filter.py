@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hsloc.model.pose2 import Pose2, compose_poses, rotated, wrap_angle, wrap_angles
+from hsloc.model.pose2 import Pose2, compose_poses, pose_differences, rotated, wrap_angle, wrap_angles
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -280,12 +280,10 @@ def between_matches(
     rows, first, second, share, _ = _between(odometry, anchors)
     ahead = compose_poses(T_map_odom[first], odometry[rows])
     back = compose_poses(T_map_odom[second], odometry[rows])
-    off = back - ahead
-    off[:, 2] = wrap_angles(off[:, 2])
     smoothed = poses.copy()
     begin = anchors[0].count if leads_to_first else 0
     smoothed[:begin] = compose_poses(T_map_odom[0], odometry[:begin])
-    smoothed[rows] = ahead + share * off
+    smoothed[rows] = ahead + share * pose_differences(back, ahead)
     smoothed[rows, 2] = wrap_angles(smoothed[rows, 2])
     return smoothed
 

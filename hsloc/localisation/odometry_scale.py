@@ -17,14 +17,14 @@ standard deviation of 5 % it doubted 27 % of a Wean Hall log, 9 % before (benchm
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import cos, hypot, sin
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.localisation.kalman_filter import MAX_SQUARED
-from hsloc.model.events import Odometry
+from hsloc.model.calibration import corrected_odometry
 from hsloc.model.pose2 import Pose2
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -98,19 +98,12 @@ class OdometryScale:
 
     def applied(self, events: Iterable[Event]) -> Iterator[Event]:
         """Events whose odometry counts rightly; it begins where it did."""
-        last, now = None, None
-        for event in events:
-            if not isinstance(event, Odometry):
-                yield event
-                continue
-            if last is None or now is None:
-                now = event.T_odom_base
-            else:
-                step = last.between(event.T_odom_base)
-                way, turn = 1.0 + self.of_way * self.way, 1.0 + self.of_turn * self.turn
-                now = now @ Pose2(way * step.x, way * step.y, turn * step.theta)
-            last = event.T_odom_base
-            yield replace(event, T_odom_base=now)
+        return corrected_odometry(events, self)
+
+    def step(self, step: Pose2) -> Pose2:
+        """A step between two messages as it should have been counted."""
+        way, turn = 1.0 + self.of_way * self.way, 1.0 + self.of_turn * self.turn
+        return Pose2(way * step.x, way * step.y, turn * step.theta)
 
 
 class OdometryScaleEstimator:

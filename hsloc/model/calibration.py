@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -75,7 +75,15 @@ class OdometryCorrection:
 NO_CORRECTION = OdometryCorrection()
 
 
-def corrected_odometry(events: Iterable[Event], correction: OdometryCorrection) -> Iterator[Event]:
+class StepCorrection(Protocol):
+    """What corrects an odometry step by step."""
+
+    def step(self, step: Pose2) -> Pose2:
+        """A corrected step between two messages."""
+        ...
+
+
+def corrected_odometry(events: Iterable[Event], correction: StepCorrection) -> Iterator[Event]:
     """Events whose odometry is corrected step by step; the first pose stays."""
     before: Pose2 | None = None
     pose = IDENTITY

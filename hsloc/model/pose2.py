@@ -122,6 +122,13 @@ def relative_poses(first: Array, second: Array) -> Array:
     return np.column_stack((c * dx + s * dy, -s * dx + c * dy, wrap_angles(second[:, 2] - first[:, 2])))
 
 
+def pose_differences(poses: Array, others: Array) -> Array:
+    """`poses` less `others`, number by number, for arrays of shape (n, 3) in one frame; theta is wrapped."""
+    apart = poses - others
+    apart[:, 2] = wrap_angles(apart[:, 2])
+    return apart
+
+
 def compose_poses(first: Array, second: Array) -> Array:
     """`first @ second` row by row, for arrays of poses of shape (n, 3), either may be (3,); theta is wrapped."""
     first, second = np.atleast_2d(first), np.atleast_2d(second)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.model.pose2 import compose_poses, relative_poses, wrap_angles
+from hsloc.model.pose2 import compose_poses, pose_differences, relative_poses, wrap_angles
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -138,8 +138,7 @@ def odometry_chi(motions: F64, found: F64, covariances: F64) -> F64:
 
     `covariances` (n, 3, 3) are those of the noise that is assumed.
     """
-    errors = found - motions
-    errors[:, 2] = wrap_angles(errors[:, 2])
+    errors = pose_differences(found, motions)
     weighed = np.linalg.solve(covariances + FLOOR, errors[:, :, None])[:, :, 0]
     return np.asarray(np.sqrt((errors * weighed).sum(axis=1)), dtype=np.float64)
 

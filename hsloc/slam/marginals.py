@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hsloc.kernels.normal_equations import Equations, add_edges
-from hsloc.model.pose2 import relative_poses, wrap_angles
+from hsloc.model.pose2 import pose_differences, relative_poses, wrap_angles
 from hsloc.slam.joint_registration import normal_equations
 from hsloc.slam.pose_graph import Edges, anchored, edge_errors
 from hsloc.slam.sparse_solver import BlockSystem
@@ -130,8 +130,7 @@ def all_edges(refined: Registration, terms: PairTerms, edges: Edges) -> Edges:
     pairs, hessian = refined.pairs[of_pairs], terms.information[of_pairs]
     first, second = pairs[:, 0], pairs[:, 1]
     relative = relative_poses(poses[first], poses[second])
-    moved = relative - relative_poses(before[first], before[second])
-    moved[:, 2] = wrap_angles(moved[:, 2])
+    moved = pose_differences(relative, relative_poses(before[first], before[second]))
     solved = refined.terms.information[of_pairs]
     gradient = refined.terms.gradient[of_pairs] + np.einsum("mij,mj->mi", solved, moved)
     # The gradient lies in the span of the information: what is added hardly moves the pose that solves for it.

@@ -10,7 +10,7 @@ import numpy as np
 
 from hsloc.errors import LogFormatError, OutputError, not_written
 from hsloc.kernels.normal_equations import Equations, add_edges
-from hsloc.model.pose2 import wrap_angles
+from hsloc.model.pose2 import pose_differences, relative_poses, wrap_angles
 from hsloc.slam.sparse_solver import BlockSystem
 
 if TYPE_CHECKING:
@@ -184,13 +184,10 @@ def apply_increment(poses: F64, step: F64) -> F64:
 
 def edge_errors(poses: F64, edges: Edges) -> tuple[F64, F64, F64]:
     """Of each edge: distance (m) and angle (rad) between what was measured and what is, and chi."""
-    from hsloc.model.pose2 import relative_poses
-
     if len(edges) == 0:
         return np.zeros(0), np.zeros(0), np.zeros(0)
     actual = relative_poses(poses[edges.pairs[:, 0]], poses[edges.pairs[:, 1]])
-    error = actual - edges.measured
-    error[:, 2] = wrap_angles(error[:, 2])
+    error = pose_differences(actual, edges.measured)
     chi2 = np.einsum("mi,mij,mj->m", error, edges.information, error)
     return np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2]), np.sqrt(np.maximum(chi2, 0.0))
 

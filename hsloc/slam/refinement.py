@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.model.pose2 import wrap_angles
+from hsloc.model.pose2 import pose_differences
 from hsloc.slam.joint_registration import moved_scans, refine
 from hsloc.slam.pose_graph import Edges
 from hsloc.slam.slips import without_slips
@@ -84,9 +84,7 @@ def _settled(
         done = passes
         refined = refine(begin, scans, edges, later, lambda part: progress((done + part) / most), refined)  # noqa: B023
         passes += 1
-        change = refined.poses - begin
-        change[:, 2] = wrap_angles(change[:, 2])
-        if moved_scans(change) < p.convergence_tolerance:
+        if moved_scans(pose_differences(refined.poses, begin)) < p.convergence_tolerance:
             break
     return refined, passes
 

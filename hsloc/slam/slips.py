@@ -19,7 +19,7 @@ import numpy as np
 
 from hsloc.kernels.normal_equations import Equations, add_edges
 from hsloc.kernels.registration import composed_motions, displaced_agreement, window_motions
-from hsloc.model.pose2 import relative_poses, wrap_angles
+from hsloc.model.pose2 import pose_differences, relative_poses
 from hsloc.slam.joint_registration import normal_equations
 from hsloc.slam.marginals import FLAT_IN_A_STRETCH_M, information_of_a_point
 from hsloc.slam.pose_graph import Edges, anchored
@@ -115,23 +115,32 @@ def compare_with_odometry(refined: Registration, steps: Edges) -> Motions:
     """Hold the scans of each stretch against the odometry's `steps` (n - 1) along it."""
     covariances: F64 = np.asarray(np.linalg.inv(steps.information), dtype=np.float64)
     ends = stretch_ends(steps, covariances)
-    seen, driven = np.empty((2, len(ends), 3))
-    seen_covariance, driven_covariance = np.empty((2, len(ends), 3, 3))
-    of_a_point = information_of_a_point(refined, FLAT_IN_A_STRETCH_M)
-    window_motions(refined.linearised_at, refined.pairs, refined.terms, of_a_point, ends, seen, seen_covariance)
-    composed_motions(steps.measured, covariances, ends, driven, driven_covariance)
-    difference = seen - driven
-    difference[:, 2] = wrap_angles(difference[:, 2])
+    seen, seen_covariance = motions_by_scans(refined, refined.terms, ends)
+    driven, driven_covariance = motions_by_odometry(steps.measured, covariances, ends)
+    difference = pose_differences(seen, driven)
     weighed = np.linalg.solve(seen_covariance + driven_covariance, difference[:, :, None])[:, :, 0]
     return Motions(ends, difference, np.sqrt(np.maximum((difference * weighed).sum(axis=1), 0.0)))
+
+
+def motions_by_scans(refined: Registration, terms: PairTerms, ends: I64) -> tuple[F64, F64]:
+    """Motions (m, 3) between `ends` (m, 2) by the `terms` of the pairs alone, and their covariances (m, 3, 3)."""
+    motions, covariances = np.empty((len(ends), 3)), np.empty((len(ends), 3, 3))
+    of_a_point = information_of_a_point(refined, FLAT_IN_A_STRETCH_M)
+    window_motions(refined.linearised_at, refined.pairs, terms, of_a_point, ends, motions, covariances)
+    return motions, covariances
+
+
+def motions_by_odometry(steps: F64, of_steps: F64, ends: I64) -> tuple[F64, F64]:
+    """The same by steps (n - 1, 3) with covariances `of_steps` (n - 1, 3, 3)."""
+    motions, covariances = np.empty((len(ends), 3)), np.empty((len(ends), 3, 3))
+    composed_motions(steps, of_steps, ends, motions, covariances)
+    return motions, covariances
 
 
 def known_by_scans(motions: Motions, refined: Registration, scans: ScanArrays, observed: PairTerms) -> Stretches:
     """The stretches with what the scans know of them; `observed` are the terms of `marginals.observed_terms`."""
     ends = motions.ends
-    seen, covariance = np.empty((len(ends), 3)), np.empty((len(ends), 3, 3))
-    of_a_point = information_of_a_point(refined, FLAT_IN_A_STRETCH_M)
-    window_motions(refined.linearised_at, refined.pairs, observed, of_a_point, ends, seen, covariance)
+    _, covariance = motions_by_scans(refined, observed, ends)
     variances, axes = np.linalg.eigh(covariance[:, :2, :2])
     sigma = np.sqrt(np.maximum(variances[:, -1], 0.0))
     headings = refined.poses[ends[:, 0], 2]
@@ -243,9 +252,8 @@ def held_by_the_rest(
     moved = system.solve(held, off_diagonal, -right)
     blocks = system.inverse_at(held, off_diagonal, np.concatenate(wanted))
     begins = np.concatenate(([0], np.cumsum([len(each) for each in wanted])))
-    driven, driven_covariance = np.empty((len(ends), 3)), np.empty((len(ends), 3, 3))
     covariances: F64 = np.asarray(np.linalg.inv(steps.information), dtype=np.float64)
-    composed_motions(steps.measured, covariances, ends, driven, driven_covariance)
+    driven, driven_covariance = motions_by_odometry(steps.measured, covariances, ends)
     for k, (first, last) in enumerate(ends.tolist()):
         own = edges[first:last]
         chain = replace(own, pairs=own.pairs - first)

@@ -14,19 +14,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.registration import composed_motions, window_motions
-from hsloc.model.pose2 import relative_poses, wrap_angles
+from hsloc.model.pose2 import pose_differences, relative_poses
 from hsloc.slam.joint_registration import normal_equations
-from hsloc.slam.marginals import (
-    FLAT_IN_A_STRETCH_M,
-    information_of_a_point,
-    observed_terms,
-    right_sides,
-    robust_weights,
-)
+from hsloc.slam.marginals import information_of_a_point, observed_terms, right_sides, robust_weights
 from hsloc.slam.pose_graph import anchored
 from hsloc.slam.result import OdometryErrors
-from hsloc.slam.slips import STRETCHES_DEEP, Motions, stretch_ends, without_slips
+from hsloc.slam.slips import (
+    STRETCHES_DEEP,
+    Motions,
+    motions_by_odometry,
+    motions_by_scans,
+    stretch_ends,
+    without_slips,
+)
 from hsloc.slam.sparse_solver import BlockSystem
 
 if TYPE_CHECKING:
@@ -48,6 +48,7 @@ _SMALL = np.array((1e-3, 1e-3, 1e-4))
 _SURPRISE = 3.0
 """Scale of the Cauchy weight on a stretch's normalised difference: slips are none of these errors."""
 _ROUNDS = 10
+"""Of the robust weights. Internal: they are settled by then."""
 _STEADIER = 16.0
 """The information of a step for this, as a multiple of that in the graph, whose noise of 1 cm and more allows for what
 is not modelled. That of wheels is 2 to 3 mm in a step of 10 cm, 1 cm in a metre, as their errors add up. Chosen by 13
@@ -133,17 +134,13 @@ def _by_stretches(
     refined: Registration, terms: PairTerms, steps: Edges, covariances: F64, ends: I64
 ) -> tuple[F64, Motions]:
     """The errors (3,) that stretches show, robustly, and what the motions differ by without them."""
-    seen, driven = np.empty((2, len(ends), 3))
-    seen_covariance, driven_covariance = np.empty((2, len(ends), 3, 3))
-    of_a_point = information_of_a_point(refined, FLAT_IN_A_STRETCH_M)
-    window_motions(refined.linearised_at, refined.pairs, terms, of_a_point, ends, seen, seen_covariance)
-    composed_motions(steps.measured, covariances, ends, driven, driven_covariance)
-    rows, ignored = np.empty((len(ends), 3, 3)), np.empty((len(ends), 3, 3))
+    seen, seen_covariance = motions_by_scans(refined, terms, ends)
+    driven, driven_covariance = motions_by_odometry(steps.measured, covariances, ends)
+    rows = np.empty((len(ends), 3, 3))
     for k, derivative in enumerate(_derivatives(steps.measured)):
-        moved = np.empty((len(ends), 3))
-        composed_motions(steps.measured + _SMALL[k] * derivative, covariances, ends, moved, ignored)
-        rows[:, :, k] = _difference(moved, driven) / _SMALL[k]
-    apart = _difference(seen, driven)
+        moved, _ = motions_by_odometry(steps.measured + _SMALL[k] * derivative, covariances, ends)
+        rows[:, :, k] = pose_differences(moved, driven) / _SMALL[k]
+    apart = pose_differences(seen, driven)
     weights = np.linalg.inv(seen_covariance + driven_covariance)
     values = np.zeros(3)
     for _ in range(_ROUNDS):
@@ -171,13 +168,13 @@ def _with_all_poses(
     response, offset = moved[:3], moved[3]
     weighed = odometry.information * robust_weights(poses, odometry)[:, None, None]
     along = np.einsum("kni,nij->knj", changes, weighed)
-    apart = _difference(relative_poses(poses[:-1], poses[1:]), odometry.measured)
+    apart = pose_differences(relative_poses(poses[:-1], poses[1:]), odometry.measured)
     # The poses are eliminated (Schur complement): what is left are equations of the errors alone.
     own = np.einsum("kni,lni->kl", along, changes) - np.einsum("kni,lni->kl", rights, response) + prior
     gradient = np.einsum("kni,ni->k", along, apart) + np.einsum("kni,ni->k", rights, offset) - prior @ known.values
     more = np.linalg.solve(own, gradient)
     found = poses + offset + np.tensordot(more, response, 1)
-    left = _difference(relative_poses(found[:-1], found[1:]), odometry.measured + np.tensordot(more, changes, 1))
+    left = pose_differences(relative_poses(found[:-1], found[1:]), odometry.measured + np.tensordot(more, changes, 1))
     # The noise by parts of the building, not of the time: what scans get wrong of a corridor, they do each time.
     row, column = np.floor(poses[:-1, :2] / _PLACE_M).T
     scores = np.einsum("kni,ni->nk", along, left)[np.lexsort((column, row))]
@@ -187,9 +184,3 @@ def _with_all_poses(
     # And what is left of the prior where nothing shows an error.
     covariance = inverse @ (_PARTS / (_PARTS - 1) * sums.T @ sums + prior) @ inverse
     return replace(known, values=known.values + more, covariance=np.asarray(covariance, dtype=np.float64))
-
-
-def _difference(ends: F64, begins: F64) -> F64:
-    found = ends - begins
-    found[:, 2] = wrap_angles(found[:, 2])
-    return found

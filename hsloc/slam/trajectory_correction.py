@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.localisation.kalman_filter import predict_covariance
-from hsloc.model.pose2 import Pose2, compose_poses, relative_poses, wrap_angles
+from hsloc.model.pose2 import Pose2, compose_poses, pose_differences, relative_poses, wrap_angles
 from hsloc.slam.calibration import OdometryCalibration, apply, calibrate
 
 if TYPE_CHECKING:
@@ -83,9 +83,7 @@ class EventLog:
         before, after, fraction = self._between(odometry, keys)
         from_before = compose_poses(key_poses[before], relative_poses(odometry[keys[before]], odometry))
         from_after = compose_poses(key_poses[after], relative_poses(odometry[keys[after]], odometry))
-        apart = from_after - from_before
-        apart[:, 2] = wrap_angles(apart[:, 2])
-        poses = from_before + fraction[:, None] * apart
+        poses = from_before + fraction[:, None] * pose_differences(from_after, from_before)
         poses[:, 2] = wrap_angles(poses[:, 2])
         return poses[~is_scan], poses[is_scan]
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hsloc.model import IDENTITY, Pose2, wrap_angle, wrap_angles
-from hsloc.model.pose2 import compose_poses, relative_poses
+from hsloc.model.pose2 import compose_poses, pose_differences, relative_poses
 
 coordinates = st.floats(-100.0, 100.0)
 angles = st.floats(-10.0, 10.0)
@@ -90,3 +90,7 @@ def test_rows_are_poses(pairs: Any) -> None:
         assert close(Pose2.from_array(row), A.between(B))
     for row, (A, B) in zip(compose_poses(first, second), pairs, strict=True):
         assert close(Pose2.from_array(row), A @ B)
+    for row, (A, B) in zip(pose_differences(first, second), pairs, strict=True):
+        assert (row[0], row[1]) == (A.x - B.x, A.y - B.y)
+        assert abs(wrap_angle(row[2] - (A.theta - B.theta))) < 1e-9
+        assert -pi < row[2] <= pi

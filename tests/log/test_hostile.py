@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given, settings
@@ -66,27 +66,47 @@ def read_all(path: Path) -> int:
     return count
 
 
+LENGTHS = (0, 1, 9, 1 << 16, 1 << 31, (1 << 32) - 1, 1 << 62, (1 << 64) - 1)
+MUTATIONS = st.one_of(
+    st.tuples(st.just("byte"), st.integers(0, 255)),
+    st.tuples(st.just("length"), st.sampled_from(LENGTHS)),
+    st.tuples(st.just("delete"), st.integers(1, 64)),
+    st.tuples(st.just("insert"), st.binary(min_size=1, max_size=64)),
+    st.tuples(st.just("copy"), st.integers(0, 1 << 20)),
+)
+"""What is done at a place of a file. Places are drawn without regard to the file and taken modulo its length."""
+
+
+def mutate(content: bytearray, place: int, kind: str, value: Any) -> None:
+    """The first eight bytes say what the file is: they stay."""
+    at = 8 + place % (len(content) - 8)
+    if kind == "byte":
+        content[at] = value
+    elif kind == "length":
+        content[at : at + 8] = struct.pack("<Q", value)
+    elif kind == "delete":
+        del content[at : at + value]
+    elif kind == "insert":
+        content[at:at] = value
+    else:
+        source = value % len(content)
+        content[at:at] = content[source : source + 200]
+
+
 @settings(max_examples=EXAMPLES)
-@given(data=st.data())
-def test_mutated_bytes(tmp_path_factory: pytest.TempPathFactory, seeds: list[bytes], data: st.DataObject) -> None:
-    content = bytearray(data.draw(st.sampled_from(seeds)))
-    for _ in range(data.draw(st.integers(1, 6))):
-        at = data.draw(st.integers(8, len(content) - 1))
-        kind = data.draw(st.sampled_from(["byte", "length", "delete", "insert", "copy"]))
-        if kind == "byte":
-            content[at] = data.draw(st.integers(0, 255))
-        elif kind == "length":
-            value = data.draw(st.sampled_from([0, 1, 9, 1 << 16, 1 << 31, (1 << 32) - 1, 1 << 62, (1 << 64) - 1]))
-            content[at : at + 8] = struct.pack("<Q", value)
-        elif kind == "delete":
-            del content[at : at + data.draw(st.integers(1, 64))]
-        elif kind == "insert":
-            content[at:at] = data.draw(st.binary(min_size=1, max_size=64))
-        else:
-            source = data.draw(st.integers(0, len(content) - 1))
-            content[at:at] = content[source : source + 200]
-        if len(content) < 20:
-            break
+@given(
+    seed=st.integers(0, 7),
+    mutations=st.lists(st.tuples(st.integers(0, 1 << 20), MUTATIONS), min_size=1, max_size=6),
+)
+def test_mutated_bytes(
+    tmp_path_factory: pytest.TempPathFactory,
+    seeds: list[bytes],
+    seed: int,
+    mutations: list[tuple[int, tuple[str, Any]]],
+) -> None:
+    content = bytearray(seeds[seed])
+    for place, (kind, value) in mutations:
+        mutate(content, place, kind, value)
     path = tmp_path_factory.mktemp("mutated") / "log.mcap"
     path.write_bytes(content)
     read_all(path)

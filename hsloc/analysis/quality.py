@@ -287,6 +287,8 @@ def _map_remedy(code: str, result: Result) -> str:
         return _RANGES_REMEDY
     if code == "relocated":
         return "look at the places on the map; where it is wrong, --forbid-loop T1,T2, or cut the log (--start, --end)"
+    if code == "uncertain":
+        return "add a drive that joins far places another way (hsloc merge), or hold the map to a plan (--align-to)"
     without_odometry = "" if result.lidar_only else " --no-odom,"
     return f"look at the places on the map; try another --seed,{without_odometry} or a cut of the log (--start, --end)"
 

@@ -24,8 +24,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.localisation.kalman_filter import MAX_SQUARED
-from hsloc.model.calibration import corrected_odometry
-from hsloc.model.pose2 import Pose2
+from hsloc.model.calibration import OdometryCorrection, corrected_odometry
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.model.events import Event
+    from hsloc.model.pose2 import Pose2
 
     F64 = NDArray[np.float64]
 
@@ -98,12 +98,8 @@ class OdometryScale:
 
     def applied(self, events: Iterable[Event]) -> Iterator[Event]:
         """Events whose odometry counts rightly; it begins where it did."""
-        return corrected_odometry(events, self)
-
-    def step(self, step: Pose2) -> Pose2:
-        """A step between two messages as it should have been counted."""
-        way, turn = 1.0 + self.of_way * self.way, 1.0 + self.of_turn * self.turn
-        return Pose2(way * step.x, way * step.y, turn * step.theta)
+        correction = OdometryCorrection(1.0 + self.of_way * self.way, 1.0 + self.of_turn * self.turn)
+        return corrected_odometry(events, correction)
 
 
 class OdometryScaleEstimator:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.model.events import Odometry
-from hsloc.model.pose2 import IDENTITY, Pose2, relative_poses, wrap_angles
+from hsloc.model.pose2 import IDENTITY, Pose2, relative_poses
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -37,28 +37,24 @@ class OdometryCorrection:
 
     def __call__(self, poses: F64) -> F64:
         """The corrected poses of odometry poses, both (n, 3); the first one stays. The last heading is unwrapped."""
-        steps = relative_poses(poses[:-1], poses[1:])
-        turned, chord = self._steps(steps)
+        along, aside, turned = self.steps(relative_poses(poses[:-1], poses[1:])).T
         theta = poses[0, 2] + np.concatenate(([0.0], np.cumsum(turned)))
         c, s = np.cos(theta[:-1]), np.sin(theta[:-1])
-        x = poses[0, 0] + np.concatenate(([0.0], np.cumsum(c * chord[:, 0] - s * chord[:, 1])))
-        y = poses[0, 1] + np.concatenate(([0.0], np.cumsum(s * chord[:, 0] + c * chord[:, 1])))
+        x = poses[0, 0] + np.concatenate(([0.0], np.cumsum(c * along - s * aside)))
+        y = poses[0, 1] + np.concatenate(([0.0], np.cumsum(s * along + c * aside)))
         return np.column_stack((x, y, theta))
 
     def step(self, step: Pose2) -> Pose2:
         """A corrected step between two messages."""
-        turned, chord = self._steps(step.to_array()[None])
-        return Pose2(float(chord[0, 0]), float(chord[0, 1]), float(wrap_angles(turned)[0]))
+        return Pose2.from_array(self.steps(step.to_array()[None])[0])
 
-    def _steps(self, steps: F64) -> tuple[F64, F64]:
-        """Rotations (n,) and translations (n, 2) of corrected steps (n, 3)."""
-        half = 0.5 * steps[:, 2]
-        driven = np.cos(half) * steps[:, 0] + np.sin(half) * steps[:, 1]
-        turned = self.rotation_scale * steps[:, 2] + self.turn_per_metre * driven
+    def steps(self, steps: F64) -> F64:
+        """Corrected steps of steps, both (n, 3). Turns are as long as they are: they are not wrapped."""
+        turned = self.rotation_scale * steps[:, 2] + self.turn_per_metre * _driven(steps)
         # A chord points along the middle of its turn.
         bend = 0.5 * (turned - steps[:, 2])
         c, s = self.scale * np.cos(bend), self.scale * np.sin(bend)
-        return turned, np.column_stack((c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]))
+        return np.column_stack((c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1], turned))
 
     def inverse(self) -> OdometryCorrection:
         """The correction that undoes this one."""
@@ -75,15 +71,25 @@ class OdometryCorrection:
 NO_CORRECTION = OdometryCorrection()
 
 
-class StepCorrection(Protocol):
-    """What corrects an odometry step by step."""
+def step_derivatives(steps: F64) -> F64:
+    """Derivatives (3, n, 3) of corrected steps by the three values of a correction, at no correction; steps (n, 3)."""
+    found = np.zeros((3, len(steps), 3))
+    found[0, :, :2] = steps[:, :2]
+    found[1, :, 2] = steps[:, 2]
+    found[2, :, 2] = _driven(steps)
+    for of_turn in found[1:]:
+        of_turn[:, 0] = -0.5 * of_turn[:, 2] * steps[:, 1]
+        of_turn[:, 1] = 0.5 * of_turn[:, 2] * steps[:, 0]
+    return found
 
-    def step(self, step: Pose2) -> Pose2:
-        """A corrected step between two messages."""
-        ...
+
+def _driven(steps: F64) -> F64:
+    """What steps (n, 3) drive forwards (m), shape (n,): negative where the robot drives backwards."""
+    half = 0.5 * steps[:, 2]
+    return np.asarray(np.cos(half) * steps[:, 0] + np.sin(half) * steps[:, 1], dtype=np.float64)
 
 
-def corrected_odometry(events: Iterable[Event], correction: StepCorrection) -> Iterator[Event]:
+def corrected_odometry(events: Iterable[Event], correction: OdometryCorrection) -> Iterator[Event]:
     """Events whose odometry is corrected step by step; the first pose stays."""
     before: Pose2 | None = None
     pose = IDENTITY

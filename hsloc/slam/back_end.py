@@ -141,7 +141,7 @@ def finish_session(
         quality=_quality(refined, covariances, passes, loops, loop_edges, grid, gathered.scans, track.anchored),
         calibration=calibration,
         state=_state(gathered, refined.poses, loop_edges, grid, parameters),
-        evidence=weigh(_recorded(gathered, refined, loops, repaired, parameters.use_odometry)),
+        evidence=weigh(_recorded(gathered, loops, repaired, covariances, parameters.use_odometry)),
         odometry_errors=None if gathered.systematic is None else gathered.systematic.summary(),
         plan=None if plan is None or fit is None else fit.compared(grid, plan),
     )
@@ -204,12 +204,12 @@ def _common(gathered: MapSession) -> CommonErrors | None:
 
 def _recorded(
     gathered: MapSession,
-    refined: Registration,
     loops: list[Loop],
     repaired: _Repaired,
+    covariances: F64,
     use_odometry: bool,
 ) -> Recorded:
-    reference = gathered.places.reference
+    reference, refined = gathered.places.reference, repaired.refined
     ends = np.array([(reference[loop.first], reference[loop.second]) for loop in loops], dtype=np.int64).reshape(-1, 2)
     accepted = ends[[loop.accepted and loop.reason != LEFT_THE_MAP for loop in loops]]
     motions, steps = gathered.motions, gathered.steps.measured
@@ -240,6 +240,7 @@ def _recorded(
         no_return_share=float(np.isposinf(ranges).sum()) / measured,
         stretches=repaired.stretches,
         held=repaired.held,
+        pose_covariances=covariances,
     )
 
 

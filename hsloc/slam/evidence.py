@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import erfc
+from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,7 +41,8 @@ class Recorded:
     `loops` (k, 2) are pairs of keyscans that accepted loops join, `torn` (j, 2) those of loops that were contradicted
     by the others, and are by the finished map. `joints` are keyscans at which pieces begin that were found on the map
     of the others. `no_return_share` is the part of the beams that met nothing. `stretches` are what the scans alone say
-    of the motion along short parts of the path, `held` what the rest of the map does.
+    of the motion along short parts of the path, `held` what the rest of the map does. `pose_covariances` (n, 3, 3) are
+    those of the final poses.
     """
 
     stamps_ns: I64
@@ -57,6 +59,7 @@ class Recorded:
     no_return_share: float
     stretches: Stretches
     held: Held
+    pose_covariances: F64
 
     def lengths(self) -> F64:
         """Metres to each keyscan from the one before."""
@@ -118,6 +121,8 @@ _SLIPS_M = np.linspace(_HARM_M, 1.0, 16)
 _LIKELY = 0.01
 """Expected number of slips that nothing shows, in the whole map, from which on it has to be looked at: a map that is
 called good has a hidden slip in one case of a hundred at most, if slips are as frequent there as where they show."""
+_UNCERTAIN_M = _HARM_M / NormalDist().inv_cdf(0.9)
+"""Standard deviation [m] of a position with which one in five maps is wrong there, though nothing contradicts it."""
 _BLIND_M = 2.0
 """A step longer than this [m], and than five times the usual one, was driven without enough returns."""
 _BLIND_SHARE = 0.1
@@ -139,6 +144,7 @@ def weigh(recorded: Recorded) -> Evidence:
         _against_odometry(recorded, bridged),
         _slips(recorded),
         _unobserved(recorded),
+        _uncertain(recorded),
         _torn_loops(recorded),
         _jumps(recorded),
         _blind(recorded),
@@ -281,6 +287,19 @@ def _unobserved(r: Recorded) -> Reason | None:
         "the position along them rests on the odometry, and a slip would not be noticed"
     )
     return _reason(r, "unobserved", text, runs, failed=False)
+
+
+def _uncertain(r: Recorded) -> Reason | None:
+    """Poses that are known so little as a whole: far from where a map of a large building begins."""
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(r.pose_covariances[:, :2, :2])[:, 1], 0.0))
+    uncertain = sigma > _UNCERTAIN_M
+    if not uncertain.any():
+        return None
+    text = (
+        f"positions are known to {sigma.max():.2f} m only (standard deviation, relative to the first pose): "
+        f"more than one in five such maps is off by more than {_HARM_M} m there"
+    )
+    return _reason(r, "uncertain", text, spans_of(uncertain), failed=False)
 
 
 def _off(sigma: F64) -> F64:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.model.calibration import OdometryCorrection, step_derivatives
 from hsloc.model.pose2 import pose_differences, relative_poses
 from hsloc.slam.joint_registration import normal_equations
 from hsloc.slam.marginals import information_of_a_point, observed_terms, right_sides, robust_weights
@@ -95,21 +96,16 @@ class SystematicErrors:
 
     def added_to(self, steps: Edges) -> Edges:
         """The odometry's steps from keyscan to keyscan with them."""
-        return replace(steps, measured=steps.measured + np.tensordot(self.values, self.changes(steps.measured), 1))
+        translation, rotation, drift = self.values.tolist()
+        measured = OdometryCorrection(1.0 + translation, 1.0 + rotation, drift).steps(steps.measured)
+        measured[: self.first] = steps.measured[: self.first]
+        return replace(steps, measured=measured)
 
     def changes(self, steps: F64) -> F64:
         """Derivatives (3, n - 1, 3) of steps (n - 1, 3) by the three; zero before `first`."""
-        found = _derivatives(steps)
+        found = step_derivatives(steps)
         found[:, : self.first] = 0.0
         return found
-
-
-def _derivatives(steps: F64) -> F64:
-    found = np.zeros((3, len(steps), 3))
-    found[0, :, :2] = steps[:, :2]
-    found[1, :, 2] = steps[:, 2]
-    found[2, :, 2] = np.hypot(steps[:, 0], steps[:, 1])
-    return found
 
 
 def find_systematic_errors(refined: Registration, steps: Edges, first: int = 0) -> SystematicErrors:
@@ -137,7 +133,7 @@ def _by_stretches(
     seen, seen_covariance = motions_by_scans(refined, terms, ends)
     driven, driven_covariance = motions_by_odometry(steps.measured, covariances, ends)
     rows = np.empty((len(ends), 3, 3))
-    for k, derivative in enumerate(_derivatives(steps.measured)):
+    for k, derivative in enumerate(step_derivatives(steps.measured)):
         moved, _ = motions_by_odometry(steps.measured + _SMALL[k] * derivative, covariances, ends)
         rows[:, :, k] = pose_differences(moved, driven) / _SMALL[k]
     apart = pose_differences(seen, driven)

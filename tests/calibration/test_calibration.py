@@ -15,7 +15,13 @@ from hsloc.errors import ConfigError
 from hsloc.log import LogWriter, ReadOptions, Transform3, open_log, read_calibration
 from hsloc.maps import save_map
 from hsloc.model import Odometry, Pose2, Scan
-from hsloc.model.calibration import Calibration, LidarCalibration, OdometryCorrection, corrected_odometry
+from hsloc.model.calibration import (
+    Calibration,
+    LidarCalibration,
+    OdometryCorrection,
+    corrected_odometry,
+    step_derivatives,
+)
 from hsloc.model.pose2 import compose_poses
 from hsloc.simulation.scenario import Scenario
 from hsloc.simulation.sensors import Lidar
@@ -107,6 +113,13 @@ def test_a_correction_and_its_inverse() -> None:
         event.T_odom_base.to_array() for event in corrected_odometry(uncorrected, TRUTH) if isinstance(event, Odometry)
     ]
     np.testing.assert_allclose(streamed, TRUTH(poses), atol=1e-12)
+
+
+def test_derivatives_of_corrected_steps(rng: np.random.Generator) -> None:
+    steps, small = rng.normal(size=(20, 3)), 1e-6
+    for found, by in zip(step_derivatives(steps), small * np.eye(3), strict=True):
+        more, less = (OdometryCorrection(1.0 + v[0], 1.0 + v[1], v[2]).steps(steps) for v in (by, -by))
+        np.testing.assert_allclose(found, (more - less) / (2.0 * small), atol=1e-8)
 
 
 def write_log(path: Path) -> Path:

@@ -39,6 +39,7 @@ def lap() -> Recorded:
         no_return_share=0.1,
         stretches=stretches(np.full(3, 0.01), np.ones(3)),
         held=held(),
+        pose_covariances=np.tile(np.diag((0.1, 0.1, 0.01)) ** 2, (N, 1, 1)),
     )
 
 
@@ -72,6 +73,17 @@ def test_slips_and_stretches_in_which_none_would_be_detected_are_named(lap: Reco
     assert codes(replace(firm, held=held((0, 0.05, 0.2), (1, 0.05, 0.2))))[1] == ["unobserved"], "and a slip is likely"
     assert codes(replace(firm, odometry=None)) == ("good", [])
     assert codes(replace(weak, odometry=None))[1] == ["unobserved"]
+
+
+def test_places_of_a_right_map_that_are_hardly_known_are_named(lap: Recorded) -> None:
+    covariances = lap.pose_covariances.copy()
+    covariances[0] = 0.0
+    covariances[50:70, :2, :2] = ((0.05, 0.04), (0.04, 0.05))  # 0.3 m along a diagonal, 0.1 m across
+    (reason,) = weigh(replace(lap, pose_covariances=covariances)).reasons
+    assert (reason.code, reason.verdict, reason.times_s) == ("uncertain", "check", ((49.0, 69.0),))
+    assert "0.30 m" in reason.text
+    covariances[50:70, :2, :2] = np.eye(2) * 0.19**2
+    assert codes(replace(lap, pose_covariances=covariances)) == ("good", [])
 
 
 def test_what_loops_say_of_a_stretch_leaves_out_its_own_odometry_and_the_scans_of_a_bare_corridor() -> None:

@@ -63,13 +63,26 @@ def test_a_map_does_not_get_the_size_that_the_wheels_count(loop: Any, monkeypatc
     assert abs(result.calibration.way - 1.0 / way) < 0.01
 
 
+def arc(driven: float, turned: float, parts: int = 1000) -> Pose2:
+    """Where a robot is that drives and turns evenly."""
+    pose = Pose2(0.0, 0.0, 0.0)
+    for _ in range(parts):
+        pose @= Pose2(driven / parts, 0.0, turned / parts)
+    return pose
+
+
 def test_errors_are_added_from_the_first_step_of_the_log_that_was_read(rng: Any) -> None:
-    steps = Edges.chain(rng.normal(size=(6, 3)), np.tile(np.eye(3), (6, 1, 1)))
-    added = SystematicErrors(np.array((0.1, -0.2, 0.05)), np.eye(3), 2).added_to(steps)
+    """A step with them is where wheels would have counted that have none, forwards or backwards."""
+    arcs = rng.uniform((-0.5, -1.5), (0.5, 1.5), size=(6, 2))
+    measured = np.array([arc(*values).to_array() for values in arcs])
+    steps = Edges.chain(measured, np.tile(np.eye(3), (6, 1, 1)))
+    way, turn, drift = 0.01, -0.02, 0.005
+    added = SystematicErrors(np.array((way, turn, drift)), np.eye(3), 2).added_to(steps)
     np.testing.assert_array_equal(added.measured[:2], steps.measured[:2])
-    x, y, turn = steps.measured[2:].T
-    expected = np.column_stack((1.1 * x, 1.1 * y, 0.8 * turn + 0.05 * np.hypot(x, y)))
-    np.testing.assert_allclose(added.measured[2:], expected)
+    expected = [arc((1 + way) * driven, (1 + turn) * turned + drift * driven).to_array() for driven, turned in arcs[2:]]
+    np.testing.assert_allclose(added.measured[2:], expected, atol=1e-3)
+    off = np.abs(steps.measured[2:] - expected)
+    assert (off.max(axis=0) > (3e-3, 1e-3, 1e-2)).all()
     np.testing.assert_array_equal(added.information, steps.information)
 
 

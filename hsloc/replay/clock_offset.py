@@ -219,8 +219,8 @@ def offsets_of_mapping(
     """The offsets (s) by topic that a log shows which has been matched, before its map is solved.
 
     Raises LateScans where one is certain and the user has given none, if these are to be corrected: from
-    `MAPS_CORRECTED_FROM_S` on; and SweptScans where there is none from the middle of the sweeps, which is as certainly
-    another time than that of the stamps.
+    `MAPS_CORRECTED_FROM_S` on; and SweptScans where the scans are of the middle of their sweeps (`is_of_sweep`), which
+    is as certainly another time than that of the stamps.
     """
     if reading.stamps != "header":
         return {}
@@ -233,7 +233,7 @@ def offsets_of_mapping(
         found = {log.summary.scan_topic or "": offset}
         is_free = offset.is_certain and not _is_given(request)
         option = as_option(found, own_odometry(log.summary), deskew=deskew) if is_free else None
-    if correct and offset is not None and not (offset.is_significant or _is_given(request)):
+    if correct and offset is not None and offset.is_of_sweep and not _is_given(request):
         of_stamps = offset._replace(seconds=-offset.half_sweep_s)
         if of_stamps.is_certain:
             raise SweptScans(request, offset.half_sweep_s, history.mean_fitness())

@@ -97,6 +97,15 @@ class Offset(NamedTuple):
         """Whether it may be removed without being asked for: it is far from chance, and the same all the time."""
         return self.is_significant and abs(self.seconds) > _CERTAIN * self.sigma and not self.drift_s
 
+    @property
+    def is_of_sweep(self) -> bool:
+        """Whether an offset from the middle of the sweeps, if there is one, may be that of scans in which robots moved.
+
+        They show the time at which the lidar looked at what fixes the heading, the middle only where walls are all
+        round. What is nearer to the ends of the sweep than to its middle is an offset of the clocks.
+        """
+        return not self.is_significant or abs(self.seconds) < 0.5 * self.half_sweep_s
+
 
 UNKNOWN = Offset(0.0, float("inf"))
 """What is known of a robot that does not turn."""

@@ -84,6 +84,14 @@ def test_only_offsets_far_from_chance_are_removed_unasked() -> None:
     assert not UNKNOWN.is_certain
 
 
+def test_an_offset_within_a_sweep_is_one_of_the_sweep() -> None:
+    # Of robots that turn on the spot in flats, with lidars of 5 and 6 Hz.
+    assert Offset(0.024, 0.002, half_sweep_s=0.1).is_of_sweep
+    assert Offset(0.022, 0.002, half_sweep_s=0.083).is_of_sweep
+    assert not Offset(0.09, 0.002, half_sweep_s=0.1).is_of_sweep
+    assert not Offset(0.024, 0.002).is_of_sweep
+
+
 def test_a_robot_that_does_not_turn_does_not_determine_it() -> None:
     found = find_offset(*headings(1, 0.2, 0.0005, turns=False))
     assert not found.is_significant

@@ -1,21 +1,25 @@
-"""Closing loops, and once more without those that tear the path.
+"""Closing loops, and once more without those that tear the path, or bend it as no other loop does.
 
 Between corridors that look alike many loops agree with each other and are wrong together. The path is then torn at one
-step that the front end had doubts of, a slip, by more than the robot can drive.
+step that the front end had doubts of, a slip, by more than the robot can drive. Or it is bent evenly over a stretch in
+which the scans agreed at each step: how well such stretches are known the other loops show.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from hsloc.model.pose2 import pose_differences
 from hsloc.slam.jumps import jumps, tears
 from hsloc.slam.loop_closer import LoopCloser, loop_edges
 from hsloc.slam.pose_graph import Edges, compose_steps, solve_edges
+from hsloc.slam.slips import motions_by_odometry
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    import numpy as np
     from numpy.random import Generator
     from numpy.typing import NDArray
 
@@ -27,6 +31,14 @@ if TYPE_CHECKING:
 
 _MOST_ROUNDS = 4
 """Times that loops are closed: what is torn then is a failed map."""
+_LEAST_LOOPS = 10
+"""Loops that show how well the path is known."""
+_UNUSUAL = 8.0
+"""Factor to the median distance of the loops from the path, in its standard deviations, from which on one is wrong. Two
+distances of three degrees of freedom, as of loops that all span the same stretch and one that spans another, differ by
+so much in 1 of 300 cases (F distribution); how large the standard deviations are does not matter."""
+_BEYOND_SLIPS_M = 2.0
+"""Distance [m] of such a loop from the path: beyond two slips."""
 
 
 def close_loops(
@@ -46,6 +58,8 @@ def close_loops(
         found = [] if session.ties or rounds_left == 0 else jumps(session.stamps_ns, poses, odometry)
         torn = tears(found, poses, odometry)
         across = _across(closer.accepted, places.reference, torn)
+        if rounds_left > 0:
+            across += unusual(closer.accepted, session)
         believed = {*session.asserted, *((loop.first, loop.second) for loop in session.known)}
         tearing = [pair for pair in across if pair not in believed]
         if not tearing:
@@ -61,3 +75,22 @@ def _across(loops: list[Loop], reference: NDArray[np.int64], torn: list[tuple[in
         for loop in loops
         if any(reference[loop.first] <= first and last <= reference[loop.second] for first, last in torn)
     ]
+
+
+def unusual(loops: list[Loop], session: MapSession) -> list[tuple[int, int]]:
+    """The pairs of places of the loops that lie far farther from the path than the others.
+
+    Only stretches in which no scan refused a step: elsewhere a slip may be as large.
+    """
+    reference, doubts = session.places.reference, np.cumsum(session.refused)
+    ends = np.array([(reference[loop.first], reference[loop.second]) for loop in loops], dtype=np.int64).reshape(-1, 2)
+    certain = (ends[:, 0] < ends[:, 1]) & (doubts[ends[:, 1]] == doubts[ends[:, 0]])
+    loops, ends = [loop for loop, is_certain in zip(loops, certain, strict=True) if is_certain], ends[certain]
+    if len(loops) < _LEAST_LOOPS:
+        return []
+    motions, covariances = motions_by_odometry(session.motions[1:], session.covariances[1:], ends)
+    off = pose_differences(np.array([loop.T_first_second.to_array() for loop in loops]), motions)
+    covariances += np.array([loop.covariance for loop in loops])
+    sigmas = np.sqrt(np.einsum("li,li->l", off, np.linalg.solve(covariances, off[:, :, None])[:, :, 0]))
+    is_far = (sigmas > _UNUSUAL * np.median(sigmas)) & (np.hypot(off[:, 0], off[:, 1]) > _BEYOND_SLIPS_M)
+    return [(loop.first, loop.second) for loop, far in zip(loops, is_far, strict=True) if far]

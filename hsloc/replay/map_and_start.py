@@ -281,7 +281,8 @@ class ScaleEvidence:
     @property
     def hints(self) -> bool:
         """Whether map and lidar differ beyond doubt, so that it is worth while to replay on a corrected map."""
-        return self.scale is not None and self.scale.is_significant and not self.is_lost
+        scale = self.scale
+        return scale is not None and scale.is_significant and (scale.by_fit or not self.is_lost)
 
     def fits_as(self, before: ScaleEvidence) -> bool:
         """Whether the scans of this run fit as well as those of one before, but for noise."""

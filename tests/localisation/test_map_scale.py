@@ -76,6 +76,16 @@ def test_a_few_scans_give_no_scale() -> None:
     assert estimator(1.02, PLACES[:5]).estimate() is None
 
 
+def test_two_scans_that_fit_at_another_scale_alone_show_it() -> None:
+    # At 1.08 the walls are up to 0.4 m behind the points: the nearest ones are others, or none.
+    found = estimator(1.08, PLACES[:2]).estimate()
+    assert found is not None
+    assert (found.by_fit, found.is_significant) == (True, True)
+    assert found.value == pytest.approx(1.08, abs=3.0 * found.sigma)
+    assert estimator(1.0, PLACES[:2]).estimate() is None
+    assert estimator(1.08, PLACES[:1]).estimate() is None
+
+
 def test_scans_of_one_place_count_once() -> None:
     found = estimator(1.02, PLACES[:5])
     for place in PLACES[5:]:

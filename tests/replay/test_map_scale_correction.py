@@ -48,14 +48,21 @@ def test_on_a_map_that_is_too_large_poses_are_right_in_metres(tmp_path: Path) ->
     assert f"set resolution: {found.grid.resolution:.5g} in the map's YAML (it is 0.051)" in warning.remedy
 
 
-def evidence(by_odometry: float, scale: MapScale = LARGER, fitness: float = 0.8) -> ScaleEvidence:
+def evidence(
+    by_odometry: float, scale: MapScale = LARGER, fitness: float = 0.8, status: Status = Status.MATCHED
+) -> ScaleEvidence:
     """Of a robot that drives 30 m along the odometry, and `by_odometry` times that on the map."""
     x = np.linspace(0.0, 30.0, 301)
     poses = np.column_stack((x, np.zeros(301), np.zeros(301)))
     stamps = np.arange(301, dtype=np.int64) * 100_000_000
-    status = (Status.MATCHED.value,) * 301
     scans = ScanDiagnostics(
-        stamps, status, np.full(301, fitness), np.zeros((301, 3)), stamps, ("",) * 301, np.zeros((301, 3, 3))
+        stamps,
+        (status.value,) * 301,
+        np.full(301, fitness),
+        np.zeros((301, 3)),
+        stamps,
+        ("",) * 301,
+        np.zeros((301, 3, 3)),
     )
     return ScaleEvidence.of(scale, scans, Trajectory(stamps, poses), Trajectory(stamps, poses * (by_odometry, 1, 1)))
 
@@ -72,6 +79,11 @@ def test_the_odometry_decides_whether_map_or_lidar_is_wrong(by_odometry: float, 
 def test_a_scale_that_may_be_right_is_not_corrected() -> None:
     assert evidence(1.02).hints
     assert not evidence(1.02, replace(LARGER, sigma=0.007)).hints
+
+
+def test_where_most_scans_find_no_match_only_a_scale_at_which_they_fit_is_tried() -> None:
+    assert not evidence(1.02, status=Status.REJECTED).hints
+    assert evidence(1.02, replace(LARGER, by_fit=True), status=Status.REJECTED).hints
 
 
 def test_a_correction_is_kept_where_scans_fit_better_and_nothing_is_left() -> None:

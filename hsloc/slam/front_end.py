@@ -330,23 +330,28 @@ class FrontEnd:
             found = self._recent.register(scans, start, predicted, covariance)
             fits = local.fitness(points, found.pose)
             better = found.agreement > best.agreement + _BETTER or fits > fitness + _BETTER
-            if (better or best.refusal()) and not found.refusal() and self._is_credible(found, fits, predicted):
+            credible = not found.refusal() and self._is_credible(found, fits, predicted, best.is_contradicted())
+            if (better or best.refusal()) and credible:
                 best, fitness = found, fits
             if not best.refusal():
                 break
         return best, evaluations
 
-    def _is_credible(self, found: ScanRegistration, fitness: float, predicted: Pose2) -> bool:
+    def _is_credible(self, found: ScanRegistration, fitness: float, predicted: Pose2, refuted: bool) -> bool:
         """Whether a pose is evidence against the prediction, where it contradicts it.
 
         Along a direction that no wall fixes another pose is none: the score of HIDE prefers the pose at which the scans
-        overlap most.
+        overlap most. Nor is another heading from one direction of walls, unless the scans have `refuted` the
+        prediction: a camera that turns in a corner sees one wall after the other, and each fits the one before.
         """
         p = self._parameters
         if found.chi * self._odometry.scale <= SURPRISE:
             return True
         offset = np.array((found.pose.x - predicted.x, found.pose.y - predicted.y))
         if np.hypot(*offset) > p.window_min and found.observed(offset) < _OBSERVED:
+            return False
+        turned = abs(wrap_angle(found.pose.theta - predicted.theta))
+        if turned > p.window_min_angle and not refuted and found.least_observed() < _OBSERVED:
             return False
         agrees = found.paired >= _CONVINCING_PAIRED and found.consistency >= _CONVINCING
         return agrees and not self._match_gate.refusal(fitness)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import radians
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,9 +11,12 @@ from room_scans import room_scan
 
 from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.model import Odometry, PairedScan, Pose2
-from hsloc.model.pose2 import relative_poses
+from hsloc.model.pose2 import relative_poses, wrap_angle
+from hsloc.simulation.floor_plan import floor_plan
 from hsloc.simulation.odometer import Slip
 from hsloc.simulation.presets import preset
+from hsloc.simulation.sensors import Lidar, SensorNoise
+from hsloc.simulation.world import World
 from hsloc.slam.calibration import odometry_chi, odometry_scale
 from hsloc.slam.mapper import Mapper
 from hsloc.slam.parameters import GraphMapperParameters
@@ -79,3 +83,25 @@ def test_after_a_gap_in_the_scans_another_room_is_not_taken_for_the_last_one() -
     poses = mapper.finish().scan_poses
     step = relative_poses(poses[:1], poses[-1:])[0]
     assert step[:2] == pytest.approx((-5.0 + back[-1].x - there[0].x, 8.0 + 1.0), abs=0.1)
+
+
+def test_a_camera_that_turns_at_a_dead_end_does_not_take_one_wall_for_another() -> None:
+    """It saw a side wall only, which fits the end wall before it: a map was turned by 90 deg, and 43 m wide."""
+    world = World("end", floor_plan([(0.0, 0.0, 8.0, 1.85)]), np.empty((0, 2)))
+    camera = Lidar(
+        beams=160, field_of_view=radians(70.0), range_min=0.4, range_max=4.0, range_noise=0.02,
+        mounting=Pose2(0.213, 0.031, 0.0),
+    )  # fmt: skip
+    random, mapper = np.random.default_rng(2), Mapper(GraphMapperParameters(), np.random.default_rng(0))
+    there = [Pose2(x, 0.925, 0.0) for x in np.arange(4.0, 7.2, 0.1).tolist()]
+    turn = [Pose2(7.2, 0.925, -angle) for angle in np.arange(0.08, np.pi, 0.15).tolist()]
+    back = [Pose2(x, 0.925, np.pi) for x in np.arange(7.2, 5.2, -0.1).tolist()]
+    for k, pose in enumerate((*there, *turn, *back)):
+        at = pose.to_array()[None]
+        scan = camera.measure(world, k * 100_000_000, 0.1, at, np.empty((0, 3)), SensorNoise(random, random))
+        mapper.update(PairedScan(scan, pose))
+    poses = mapper.finish().scan_poses
+    step = relative_poses(poses[:1], poses[-1:])[0]
+    expected = there[0].between(back[-1])
+    assert np.hypot(step[0] - expected.x, step[1] - expected.y) < 0.1
+    assert abs(wrap_angle(step[2] - expected.theta)) < radians(3.0)

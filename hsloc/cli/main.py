@@ -192,14 +192,15 @@ def program() -> None:
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     sys.unraisablehook = interrupt_again
     warnings.formatwarning = lambda message, *_, **__: f"hsloc: warning: {message}\n"
+    # To the very end: with Python's own limit all objects would be looked at once more, just before they are left.
     with rarely_collected():
         status = main()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        sys.stdout.flush()
-    except OSError:  # Reported already; Python itself would report what is left again, with another exit code.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    _leave(status)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            sys.stdout.flush()
+        except OSError:  # Reported already; Python itself would report what is left again, with another exit code.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _leave(status)
 
 
 def _leave(status: int) -> NoReturn:

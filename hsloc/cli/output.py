@@ -25,6 +25,24 @@ def default_folder(name: str) -> Path:
     return Path("results") / f"{name}-{stamp}"
 
 
+def import_matplotlib() -> None:
+    """Import it without the docstrings that it writes for each class while it is imported: 0.1 s of each command.
+
+    For programs only: where hsloc is a library, others may look at these docstrings.
+    """
+    from matplotlib import artist
+
+    names = ((artist, "kwdoc"), (artist.Artist, "_update_set_signature_and_docstring"))
+    before = [(owner, name, vars(owner)[name]) for owner, name in names if name in vars(owner)]
+    for owner, name, _ in before:
+        setattr(owner, name, lambda *_: "")
+    try:
+        import hsloc.report.png  # noqa: F401
+    finally:
+        for owner, name, value in before:
+            setattr(owner, name, value)
+
+
 def refuse_early(folder: Path, overwrite: bool) -> None:
     """Raise OutputError for a folder that cannot be written, before the work and not after it."""
     from hsloc.errors import OutputError

@@ -53,10 +53,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Run, write the results, print the table; 4 where a limit is not kept, else 3 where part of the input was lost."""
     from hsloc.analysis.quality import exceeded_limits
     from hsloc.cli.main import EXIT_BELOW_LIMIT, EXIT_DATA_LOST, EXIT_OK
-    from hsloc.cli.output import print_summary
+    from hsloc.cli.output import import_matplotlib, print_summary
     from hsloc.evaluation.metrics import format_json
-    from hsloc.export.results_folder import write_results
     from hsloc.replay.run import run as run_replay
+
+    import_matplotlib()
+    from hsloc.export.results_folder import write_results
 
     request = run_request(arguments)
     folder = arguments.out or default_folder(arguments.log[0].name.split(".")[0] or "run")

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numba
-from numba.core import caching, config, event
+from numba.core import caching, config, environment, event
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime.nrt import rtsys
 
@@ -78,8 +78,22 @@ def load_without_compiler() -> None:
         with self._guard_against_spurious_io_errors():
             return self._load_overload(signature, target_context)
 
+    def rebuild_environment(module: str, constants: list[Any], name: str) -> Any:
+        # Compiled code without Python objects uses the constants alone. numba imports the module for its globals: for
+        # a sum in a kernel those of all array functions, and SciPy's linear algebra.
+        known: Any = environment.Environment._memo
+        found = known.get(name)
+        if found is None:
+            found = environment.Environment({"__name__": module})
+            found.consts[:] = constants
+            found.env_name = name
+            known[name] = found
+        return found
+
     if hasattr(caching.Cache, "_load_overload"):
         setattr(caching.Cache, "load_overload", load_overload)  # noqa: B010
+    if hasattr(environment, "_rebuild_env") and hasattr(environment.Environment, "_memo"):
+        setattr(environment, "_rebuild_env", rebuild_environment)  # noqa: B010
 
 
 @cache

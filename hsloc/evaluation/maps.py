@@ -105,7 +105,7 @@ def compare_maps(
         raise EvaluationError("the true map holds no occupied cell: nothing to compare with")
     if len(ours) == 0:
         return MapComparison(nan, 0.0, 0.0, nan, nan, tolerance, 0, len(theirs))
-    to_truth, from_truth = _nearest_distances(ours, theirs), _nearest_distances(theirs, ours)
+    to_truth, from_truth = truth.wall_distances(ours), grid.wall_distances(T_truth_map.inverse() @ theirs)
     # Cell centres on a common grid lie at exact multiples: rounding must not decide whether 0.1 is within 0.1.
     limit = tolerance * (1.0 + 1e-9) + 1e-12
     precision, recall = float((to_truth <= limit).mean()), float((from_truth <= limit).mean())
@@ -139,13 +139,6 @@ def crispness(grid: OccupancyGrid, *, radius: float = 0.3) -> Crispness:
         radius=radius,
         occupied_cells=count,
     )
-
-
-def _nearest_distances(points: Floats, others: Floats) -> Floats:
-    """Distance of each point (n, 2) to the nearest of others (m, 2), shape (n,)."""
-    from scipy.spatial import cKDTree
-
-    return np.asarray(cKDTree(others).query(points)[0], dtype=np.float64)
 
 
 def _disc(radius_cells: float) -> NDArray[np.int64]:

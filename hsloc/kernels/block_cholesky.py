@@ -36,6 +36,125 @@ class Factor(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
+def minimum_degree(start: I64, columns: I64, order: I64) -> None:
+    """Write an order of elimination with little fill to `order` (n,): always a node with the fewest neighbours.
+
+    `start` (n + 1,) and `columns` are the symmetric pattern row by row; its diagonal does not count. What is eliminated
+    is kept as an element, the list of its neighbours, and the number of a node's neighbours is bounded by its elements
+    (Amestoy, Davis and Duff 1996, "An approximate minimum degree ordering algorithm").
+    """
+    n = len(order)
+    # The row of a node holds the elements at it, then the nodes beside it: of them there are never more than at first.
+    row = columns.copy()
+    elements = np.zeros(n, dtype=np.int64)
+    nodes = np.zeros(n, dtype=np.int64)
+    first = np.full(n + 1, -1, dtype=np.int64)
+    before = np.full(n, -1, dtype=np.int64)
+    after = np.full(n, -1, dtype=np.int64)
+    degree = np.empty(n, dtype=np.int64)
+    for i in range(n):
+        for p in range(start[i], start[i + 1]):
+            if columns[p] != i:
+                row[start[i] + nodes[i]] = columns[p]
+                nodes[i] += 1
+        degree[i] = nodes[i]
+    for i in range(n - 1, -1, -1):
+        _enlist(i, degree[i], first, before, after)
+    # Members of element e: pool[begin[e] : begin[e] + size[e]]. Of no size is one that is part of another.
+    pool = np.empty(2 * len(columns) + n, dtype=np.int64)
+    begin = np.zeros(n, dtype=np.int64)
+    size = np.zeros(n, dtype=np.int64)
+    used = 0
+    marked = np.full(n, -1, dtype=np.int64)
+    outside = np.zeros(n, dtype=np.int64)
+    counted = np.full(n, -1, dtype=np.int64)
+    least = 0
+    for step in range(n):
+        while first[least] < 0:
+            least += 1
+        k = first[least]
+        _delist(k, degree[k], first, before, after)
+        order[step] = k
+        marked[k] = step
+        if used + n > len(pool):
+            larger = np.empty(2 * len(pool) + n, dtype=np.int64)
+            larger[:used] = pool[:used]
+            pool = larger
+        begin[k] = used
+        for p in range(start[k], start[k] + elements[k]):
+            e = row[p]
+            for q in range(begin[e], begin[e] + size[e]):
+                if marked[pool[q]] != step:
+                    marked[pool[q]] = step
+                    pool[used] = pool[q]
+                    used += 1
+            size[e] = 0
+        for p in range(start[k] + elements[k], start[k] + elements[k] + nodes[k]):
+            if marked[row[p]] != step:
+                marked[row[p]] = step
+                pool[used] = row[p]
+                used += 1
+        size[k] = used - begin[k]
+        for q in range(begin[k], used):
+            i = pool[q]
+            for p in range(start[i], start[i] + elements[i]):
+                e = row[p]
+                if counted[e] != step:
+                    counted[e] = step
+                    outside[e] = size[e]
+                outside[e] -= 1
+        for q in range(begin[k], used):
+            i = pool[q]
+            kept = 0
+            neighbours = size[k] - 1
+            last_element = start[i] + elements[i]
+            for p in range(start[i], last_element):
+                e = row[p]
+                if size[e] > 0 and outside[e] > 0:
+                    row[start[i] + kept] = e
+                    kept += 1
+                    neighbours += outside[e]
+                else:
+                    size[e] = 0
+            # Nodes of the new element are its neighbours by it; at least one entry is free for the element itself.
+            beside = 0
+            for p in range(last_element, last_element + nodes[i]):
+                if marked[row[p]] != step:
+                    row[start[i] + kept + beside] = row[p]
+                    beside += 1
+            if beside > 0:
+                row[start[i] + kept + beside] = row[start[i] + kept]
+            row[start[i] + kept] = k
+            elements[i] = kept + 1
+            nodes[i] = beside
+            _delist(i, degree[i], first, before, after)
+            degree[i] = min(neighbours + beside, degree[i] + size[k] - 1, n - step - 2)
+            _enlist(i, degree[i], first, before, after)
+            least = min(least, degree[i])
+
+
+@njit(cache=True, nogil=True)
+def _enlist(node: int, degree: int, first: I64, before: I64, after: I64) -> None:
+    """Put a node at the head of the list of those with its degree."""
+    before[node] = -1
+    after[node] = first[degree]
+    if first[degree] >= 0:
+        before[first[degree]] = node
+    first[degree] = node
+
+
+@njit(cache=True, nogil=True)
+def _delist(node: int, degree: int, first: I64, before: I64, after: I64) -> None:
+    """Take a node out of the list of those with its degree."""
+    if before[node] >= 0:
+        after[before[node]] = after[node]
+    else:
+        first[degree] = after[node]
+    if after[node] >= 0:
+        before[after[node]] = before[node]
+
+
+@njit(cache=True, nogil=True)
 def factor_columns(start: I64, rows: I64, parent: I64, counts: I64) -> None:
     """Write the elimination tree to `parent` (n,), -1 at its roots, and the `counts` (n,) of blocks of L by column.
 

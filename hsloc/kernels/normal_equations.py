@@ -252,6 +252,7 @@ def add_edges(poses: F64, edges: I64, measured: F64, information: F64, scale: F6
     right = equations.right
     rel = np.empty(3)
     error = np.empty(3)
+    gradient = np.empty(3)
     ha = np.empty((3, 3))
     total = 0.0
     for m in range(len(edges)):
@@ -262,8 +263,13 @@ def add_edges(poses: F64, edges: I64, measured: F64, information: F64, scale: F6
         for k in range(3):
             error[k] = rel[k] - measured[m, k]
         error[2] -= 2.0 * pi * np.round(error[2] / (2.0 * pi))
-        gradient = information[m] @ error
-        chi2 = error @ gradient
+        # Not by `@`: for BLAS numba imports SciPy's linear algebra, 0.2 s of a command.
+        chi2 = 0.0
+        for a in range(3):
+            gradient[a] = 0.0
+            for b in range(3):
+                gradient[a] += information[m, a, b] * error[b]
+            chi2 += error[a] * gradient[a]
         weight = 1.0
         if scale[m] < np.inf:
             weight = scale[m] ** 2 / (scale[m] ** 2 + chi2)

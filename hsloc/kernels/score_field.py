@@ -63,6 +63,32 @@ def column_distances(occupied: B, margin: int, far: int, distances: Integers) ->
 
 
 @njit(cache=True, nogil=True)
+def wall_distances(occupied: B, points: F64, distances: F64) -> None:
+    """Write the distance in cells from each point (n, 2) to the nearest centre of an occupied cell to `distances` (n,).
+
+    Points are (column, row), whole numbers being the centres of cells. Infinite where no cell is occupied.
+    """
+    height, width = occupied.shape
+    for k in range(len(points)):
+        x = points[k, 0]
+        y = points[k, 1]
+        # Square rings around the cell of the grid that is nearest to the point.
+        u = int(min(max(np.floor(x + 0.5), 0.0), width - 1.0))
+        v = int(min(max(np.floor(y + 0.5), 0.0), height - 1.0))
+        best = np.inf
+        for ring in range(max(u, width - 1 - u, v, height - 1 - v) + 1):
+            # No centre in the ring is nearer than this.
+            if ring - 0.5 > best:
+                break
+            for row in range(max(v - ring, 0), min(v + ring, height - 1) + 1):
+                step = 1 if abs(row - v) == ring else max(2 * ring, 1)
+                for column in range(u - ring, u + ring + 1, step):
+                    if 0 <= column < width and occupied[row, column]:
+                        best = min(best, hypot(column - x, row - y))
+        distances[k] = best
+
+
+@njit(cache=True, nogil=True)
 def squared_distances(distances: Integers) -> I64:
     """Squared distance in cells to the nearest occupied cell, from rows (k, w) of the column distances."""
     rows, width = distances.shape

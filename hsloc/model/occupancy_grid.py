@@ -49,6 +49,15 @@ class OccupancyGrid:
         local = np.column_stack((columns + 0.5, rows + 0.5)) * self.resolution
         return self.origin @ local
 
+    def wall_distances(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distances (m) of points (n, 2) in the map frame to the nearest occupied cell's centre; infinite without."""
+        # Imported where it is used: reading a map does without numba.
+        from hsloc.kernels.score_field import wall_distances
+
+        distances = np.empty(len(points))
+        wall_distances(self.occupied(), (self.origin.inverse() @ points) / self.resolution - 0.5, distances)
+        return distances * self.resolution
+
     def bounds(self) -> tuple[float, float, float, float]:
         """(x_min, y_min, x_max, y_max) in metres of the whole grid in the map frame."""
         height, width = self.cells.shape

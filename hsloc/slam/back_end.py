@@ -318,16 +318,11 @@ def _quality(
 
 def _residuals(poses: F64, scans: KeyScans, grid: OccupancyGrid) -> F64:
     """Distances (m) of points to the nearest occupied cell's centre, of scans evenly chosen."""
-    from scipy.spatial import cKDTree
-
-    walls = grid.centres(grid.occupied())
-    if len(walls) == 0:
+    if not grid.occupied().any():
         return np.zeros(0)
-    tree = cKDTree(walls)
     chosen = np.unique(np.linspace(0, len(scans) - 1, _RESIDUAL_SCANS).astype(np.int64))
     parts = [Pose2.from_array(poses[k]) @ scans.hits(int(k)).astype(np.float64) for k in chosen]
-    distances: F64 = np.asarray(tree.query(np.concatenate(parts))[0], dtype=np.float64)
-    return distances
+    return grid.wall_distances(np.concatenate(parts))
 
 
 def _empty(track: EventLog) -> MappingResult:

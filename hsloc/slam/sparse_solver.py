@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.kernels.block_cholesky import Factor, factor_columns, factorise, selected_inverse, solve_factor, sum_blocks
+from hsloc.kernels.block_cholesky import (
+    Factor,
+    factor_columns,
+    factorise,
+    minimum_degree,
+    selected_inverse,
+    solve_factor,
+    sum_blocks,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -91,7 +99,8 @@ class _Elimination:
 
     def __init__(self, indptr: I64, indices: I64) -> None:
         size = len(indptr) - 1
-        order = _minimum_degree(indptr, indices)
+        order = np.empty(size, dtype=np.int64)
+        minimum_degree(indptr, indices, order)
         place = np.empty(size, dtype=np.int64)
         place[order] = np.arange(size)
         rows, columns = place[np.repeat(np.arange(size), np.diff(indptr))], place[indices]
@@ -139,17 +148,3 @@ class _Elimination:
             self._factor = Factor(self._start_of_factor, rows, lower, np.empty((len(self._order), 3, 3)))
         factorise(self._start, self._rows, blocks[self._upper], blocks[self._diagonal], self._parent, self._factor)
         return self._factor
-
-
-def _minimum_degree(indptr: I64, indices: I64) -> I64:
-    """An order of elimination (n,) with little fill, of a symmetric pattern whose diagonal is full."""
-    from scipy.sparse import csc_array
-    from scipy.sparse.linalg import splu
-
-    size = len(indptr) - 1
-    # SuperLU orders by the pattern alone; the values only have to be factorised without pivoting.
-    values = np.ones(len(indices))
-    values[np.repeat(np.arange(size), np.diff(indptr)) == indices] = 2.0 * size
-    matrix = csc_array((values, indices, indptr), shape=(size, size))
-    factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return np.argsort(factor.perm_c).astype(np.int64)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hsloc.kernels.block_cholesky import minimum_degree
 from hsloc.slam import sparse_solver
 from hsloc.slam.sparse_solver import BlockSystem
 
@@ -56,3 +57,36 @@ def test_a_ring_with_chords_that_fill_the_factor_in(rng: Any, chords: int) -> No
     for first, second in ((rows, columns), (columns, rows), (every, every)):  # in either triangle
         got = system.inverse_at(diagonal, off, np.column_stack((first, second)))
         np.testing.assert_allclose(got, inverse[first, :, second], rtol=1e-9, atol=1e-12)
+
+
+def _fill(links: set[tuple[int, int]], order: Any) -> int:
+    """Links that come up while the nodes are eliminated in this order: the neighbours of each are joined."""
+    near: dict[int, set[int]] = {int(k): set() for k in order}
+    for i, j in links:
+        near[i].add(j)
+        near[j].add(i)
+    added = 0
+    for k in map(int, order):
+        for i in near[k]:
+            missing = near[k] - near[i] - {i}
+            added += sum(i < j for j in missing)
+            near[i] = (near[i] | missing) - {k}
+        del near[k]
+    return added
+
+
+@pytest.mark.parametrize("chords", [0, 5, 40])
+def test_the_order_of_elimination_has_each_node_once_and_little_fill(rng: Any, chords: int) -> None:
+    n = 40
+    ends = np.concatenate((np.column_stack((np.arange(n - 1), np.arange(1, n))), rng.integers(0, n, (chords, 2))))
+    links = {(int(min(pair)), int(max(pair))) for pair in ends if pair[0] != pair[1]}
+    places = np.array([*links, *((j, i) for i, j in links), *((k, k) for k in range(n))])
+    places = places[np.lexsort((places[:, 1], places[:, 0]))]
+    order = np.empty(n, dtype=np.int64)
+    minimum_degree(np.searchsorted(places[:, 0], np.arange(n + 1)), places[:, 1].copy(), order)
+    assert sorted(order) == list(range(n))
+    fill = _fill(links, order)
+    if chords == 0:
+        assert fill == 0
+    else:
+        assert fill < 0.8 * np.mean([_fill(links, rng.permutation(n)) for _ in range(5)])

@@ -21,6 +21,7 @@ from hsloc.kernels.score_field import (
     splat,
     squared_distances,
     thinned_cloud,
+    wall_distances,
 )
 from hsloc.model.pose2 import Pose2
 
@@ -92,6 +93,20 @@ def naive_scores(
             if nearest <= radius:
                 scores[v, u] = np.exp(-nearest / sigma)
     return scores
+
+
+@pytest.mark.parametrize("shape", [(12, 17), (1, 20), (20, 1)])
+def test_a_point_anywhere_has_the_distance_to_the_nearest_occupied_cell(rng: Any, shape: tuple[int, int]) -> None:
+    occupied = rng.random(shape) < 0.1
+    occupied[-1, -1] = True
+    points = rng.uniform(-15.0, 30.0, size=(300, 2))
+    distances = np.empty(300)
+    wall_distances(occupied, points, distances)
+    centres = np.argwhere(occupied)[:, ::-1]
+    expected = np.linalg.norm(points[:, None] - centres, axis=2).min(axis=1)
+    np.testing.assert_allclose(distances, expected, rtol=1e-12)
+    wall_distances(np.zeros(shape, dtype=bool), points, distances)
+    assert np.isinf(distances).all()
 
 
 def test_scores_are_the_decay_of_the_distance_to_the_nearest_point() -> None:

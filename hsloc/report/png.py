@@ -85,10 +85,9 @@ def draw_report(path: str | Path, parts: ReportParts) -> None:
         # A letter that the font lacks becomes a box in the picture: the user need not be warned.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         figure = report_figure(parts)
-        # Without the version of matplotlib in the file.
-        write_atomically(
-            Path(path), lambda stream: figure.savefig(stream, format="png", dpi=DPI, metadata={"Software": None})
-        )
+        # Without the version of matplotlib in the file. Level 3 of zlib: 3 % more bytes in two thirds of the time.
+        options: dict[str, Any] = {"metadata": {"Software": None}, "pil_kwargs": {"compress_level": 3}}
+        write_atomically(Path(path), lambda stream: figure.savefig(stream, format="png", dpi=DPI, **options))
 
 
 def report_figure(parts: ReportParts) -> Figure:

@@ -43,9 +43,13 @@ class MotionGate:
     min_angle: float
     """Least rotation that opens the gate [rad], 0 or more."""
 
-    def is_open(self, motion: Pose2) -> bool:
-        """Whether a motion since the last scan that was used reaches one of the limits."""
-        return hypot(motion.x, motion.y) >= self.min_distance or abs(motion.theta) >= self.min_angle
+    def is_open(self, motion: Pose2, unsure: tuple[float, float] = (0.0, 0.0)) -> bool:
+        """Whether a motion since the last scan that was used may reach one of the limits.
+
+        It may be longer than stated by `unsure` (m, rad).
+        """
+        way, turn = unsure
+        return hypot(motion.x, motion.y) + way >= self.min_distance or abs(motion.theta) + turn >= self.min_angle
 
 
 class RestGate:

@@ -9,16 +9,17 @@ variance grows with it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import cos, exp, hypot, log, sin
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from hsloc.localisation.interpolated_odometry import AtStamp, Sides, motion_variances, sides
 from hsloc.model.pose2 import Pose2, compose_poses, pose_differences, rotated, wrap_angle, wrap_angles
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -166,7 +167,7 @@ class Anchor:
 
     `count` odometry messages came before. `begins` says that it does not continue the anchor before. The odometry up
     to here is `noise_scale` times as noisy as assumed (variances).
-    `fits_as_usual` says that the match was as fit as usual.
+    `fits_as_usual` says that the match was as fit as usual. `at` is when the odometry was taken.
     """
 
     count: int
@@ -176,14 +177,19 @@ class Anchor:
     begins: bool
     noise_scale: float = 1.0
     fits_as_usual: bool = True
+    at: AtStamp = field(default_factory=AtStamp)
 
 
 class SmoothedMatches(NamedTuple):
-    """Poses (n, 3) and covariances (n, 3, 3) at the matches, and the variances (n, 3) of the odometry up to each."""
+    """Poses (n, 3) and covariances (n, 3, 3) at the matches, and the variances (n, 3) of the odometry up to each.
+
+    `slips` (n, 3) are the squares of what the wheels slipped before a match, 0 where its innovation is noise.
+    """
 
     poses: F64
     covariances: F64
     motion: F64
+    slips: F64
 
 
 def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> SmoothedMatches:
@@ -195,7 +201,7 @@ def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> Smoo
     """
     poses = np.array([anchor.T_map_base.to_array() for anchor in anchors]).reshape(-1, 3)
     covariances = np.array([anchor.covariance for anchor in anchors]).reshape(-1, 3, 3)
-    variances = np.zeros((len(anchors), 3))
+    variances, slips = np.zeros((2, len(anchors), 3))
     jump = np.zeros((3, 3))
     for k in range(len(anchors) - 2, -1, -1):
         here, following = anchors[k], anchors[k + 1]
@@ -206,12 +212,13 @@ def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> Smoo
         motion = here.T_odom_base.between(following.T_odom_base)
         noise = motion_model.covariance(motion)
         variances[k + 1] = _noise_around(anchors, k + 1) * np.diag(rotated(noise, here.T_map_base.theta))
-        noise = max(following.noise_scale, 1.0) * noise
+        noise = max(following.noise_scale, 1.0) * noise + np.diag(motion_variances(here.at, following.at))
         predicted = here.T_map_base @ motion
         variance = predict_covariance(here.covariance, here.T_map_base, motion, noise) + _NO_NOISE
         off = difference(Pose2.from_array(poses[k + 1]), predicted)
         weighted = np.linalg.solve(variance, off)
         if off @ weighted > MAX_SQUARED:
+            slips[k + 1] = np.maximum(off**2 - np.diag(variance), 0.0)
             if not here.fits_as_usual:
                 jump = np.outer(off, off)
             covariances[k] += jump
@@ -221,7 +228,7 @@ def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> Smoo
         poses[k, 2] = wrap_angles(poses[k, 2:])[0]
         smoothed = here.covariance + gain @ (covariances[k + 1] - variance) @ gain.T
         covariances[k] = 0.5 * (smoothed + smoothed.T) + jump
-    return SmoothedMatches(poses, covariances, variances)
+    return SmoothedMatches(poses, covariances, variances, slips)
 
 
 def _noise_around(anchors: Sequence[Anchor], k: int) -> float:
@@ -232,7 +239,7 @@ def _noise_around(anchors: Sequence[Anchor], k: int) -> float:
 class _Between(NamedTuple):
     """Poses between two matches of a track: rows, anchors before and after, and the share (n, 1) of the motion.
 
-    `steps` (n,) are the motions of `_STEP_M` between the two.
+    `steps` (n,) are the motions of `_STEP_M` between the two. `sides` is what interpolation adds, if it adds anything.
     """
 
     rows: NDArray[np.int64]
@@ -240,9 +247,19 @@ class _Between(NamedTuple):
     second: NDArray[np.int64]
     share: F64
     steps: F64
+    sides: Sides | None
+
+    def weights(self, motion: F64) -> F64:
+        """Weights (n, 3) of what the second match predicts; `motion` (m, 3) are variances up to each anchor."""
+        if self.sides is None:
+            return np.broadcast_to(self.share, (len(self.rows), 3))
+        before = self.share * motion[self.second] + self.sides.before
+        total = motion[self.second] + self.sides.before + self.sides.after
+        weights: F64 = np.divide(before, total, out=np.tile(self.share, 3), where=total > 0.0)
+        return weights
 
 
-def _between(odometry: F64, anchors: Sequence[Anchor]) -> _Between:
+def _between(odometry: F64, anchors: Sequence[Anchor], interpolated: Mapping[int, AtStamp]) -> _Between:
     counts = np.array([anchor.count for anchor in anchors])
     begins = np.array([anchor.begins for anchor in anchors])
     before = np.searchsorted(counts, np.arange(len(odometry)), side="right") - 1
@@ -256,7 +273,10 @@ def _between(odometry: F64, anchors: Sequence[Anchor]) -> _Between:
     at_anchors = moved[last] + np.where(counts > 0, _way(at - odometry[last]), 0.0)
     begin, end = at_anchors[first], at_anchors[second]
     share = np.clip((moved[rows] - begin) / np.maximum(end - begin, 1e-9), 0.0, 1.0)[:, None]
-    return _Between(rows, first, second, share, (end - begin) / _STEP_M)
+    around = None
+    if interpolated or any(anchor.at.interpolation for anchor in anchors):
+        around = sides(rows, (first, second), [anchor.at for anchor in anchors], interpolated)
+    return _Between(rows, first, second, share, (end - begin) / _STEP_M, around)
 
 
 def _way(steps: F64) -> F64:
@@ -266,43 +286,71 @@ def _way(steps: F64) -> F64:
 
 
 def between_matches(
-    poses: F64, odometry: F64, anchors: Sequence[Anchor], matched: F64, *, leads_to_first: bool = False
+    poses: F64,
+    odometry: F64,
+    anchors: Sequence[Anchor],
+    matched: SmoothedMatches,
+    *,
+    leads_to_first: bool = False,
+    interpolated: Mapping[int, AtStamp] | None = None,
 ) -> F64:
     """The poses (n, 3) of a run, those between two matches of a track replaced by the mean of what both predict.
 
     With `leads_to_first` those before the first match lead to it: a start that is given is a guess.
-    `odometry` (n, 3) belongs to the poses, `matched` (m, 3) are the poses at the anchors.
+    `odometry` (n, 3) belongs to the poses, those of its rows that are no messages are `interpolated`.
     """
     if len(anchors) < 2:
         return poses
     at_odometry = np.array([anchor.T_odom_base.inverse().to_array() for anchor in anchors])
-    T_map_odom = compose_poses(matched, at_odometry)
-    rows, first, second, share, _ = _between(odometry, anchors)
+    T_map_odom = compose_poses(matched.poses, at_odometry)
+    between = _between(odometry, anchors, interpolated or {})
+    rows, first, second = between.rows, between.first, between.second
     ahead = compose_poses(T_map_odom[first], odometry[rows])
     back = compose_poses(T_map_odom[second], odometry[rows])
     smoothed = poses.copy()
     begin = anchors[0].count if leads_to_first else 0
     smoothed[:begin] = compose_poses(T_map_odom[0], odometry[:begin])
-    smoothed[rows] = ahead + share * pose_differences(back, ahead)
+    smoothed[rows] = ahead + between.weights(matched.motion) * pose_differences(back, ahead)
     smoothed[rows, 2] = wrap_angles(smoothed[rows, 2])
     return smoothed
 
 
-def bridge_variances(odometry: F64, anchors: Sequence[Anchor], motion: F64, motion_model: MotionModel) -> F64:
+def bridge_variances(
+    odometry: F64,
+    anchors: Sequence[Anchor],
+    matched: SmoothedMatches,
+    motion_model: MotionModel,
+    interpolated: Mapping[int, AtStamp] | None = None,
+) -> tuple[F64, NDArray[np.bool_]]:
     """What the odometry (n, 3) adds to the variances (n, 3) of poses between two matches: a walk whose ends are known.
 
-    `motion` (m, 3) are the variances of the odometry up to each anchor; half-way a quarter of them is left.
+    Of the variances of the odometry up to a match a quarter is left half-way. Where wheels slipped between two matches
+    it is not known when: the slip may lie before or after a pose. Rows of the odometry that are no messages are
+    `interpolated`. Also returns to which poses (n,) interpolation or a slip adds.
     """
+    unsure = np.zeros(len(odometry), dtype=np.bool_)
     variances = np.zeros((len(odometry), 3))
+    for row, at in (interpolated or {}).items():
+        variances[row], unsure[row] = at.variances(), True
     if len(anchors) >= 2:
-        rows, _, second, share, steps = _between(odometry, anchors)
-        motion = motion.copy()
+        between = _between(odometry, anchors, interpolated or {})
+        weights = between.weights(matched.motion)
+        rows, _, second, share, steps, around = between
+        motion = matched.motion.copy()
         for k in np.unique(second[steps > _FEW_STEPS]).tolist():
             way = odometry[max(anchors[k - 1].count - 1, 0) : anchors[k].count]
             turned = anchors[k].T_map_base.theta - anchors[k].T_odom_base.theta
             motion[k] = _noise_around(anchors, k) * _walk_variances(way, turned, motion_model)
-        variances[rows] = share * (1.0 - share) * motion[second]
-    return variances
+        left = (1.0 - weights) ** 2 * share + weights**2 * (1.0 - share)
+        variances[rows] = left * motion[second]
+        if around is not None:
+            variances[rows] += around.mean
+            unsure[rows] = (around.before + around.after).any(axis=1)
+            measured = ~np.isin(rows, list(interpolated or {}))[:, None]
+            variances[rows] += measured * ((1.0 - weights) ** 2 * around.before + weights**2 * around.after)
+        variances[rows] += (1.0 / 3.0 - weights * (1.0 - weights)) * matched.slips[second]
+        unsure[rows] |= matched.slips[second].any(axis=1)
+    return variances, unsure
 
 
 def _walk_variances(way: F64, turned: float, motion_model: MotionModel) -> F64:

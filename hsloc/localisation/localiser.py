@@ -6,13 +6,14 @@ While the pose is unknown the relocaliser decides.
 
 from __future__ import annotations
 
-from math import hypot, radians
+from math import hypot, radians, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.kernels.fitness import fitness_many
 from hsloc.localisation.gates import MatchGate, MotionGate, RestGate
+from hsloc.localisation.interpolated_odometry import AtStamp, motion_variances
 from hsloc.localisation.kalman_filter import Innovations, difference, fuse_match, is_slip, predict_covariance
 from hsloc.localisation.map_scale import MapScale, MapScaleEstimator
 from hsloc.localisation.odometry_scale import OdometryScale, OdometryScaleEstimator
@@ -49,6 +50,8 @@ _MOVED_M, _MOVED_RAD = 0.1, radians(3.0)
 shift the optimum by some centimetres."""
 _MOVED_WINDOW = 2.0
 """Half-width of the window in which it is searched for, by the wide one: two scans of a robot at 2 m/s."""
+_UNSURE = 2.0
+"""Standard deviations by which a motion may be longer than interpolated odometry states, for the motion gate."""
 _MOST_ASTRAY = 0.2
 """Share of beams that end behind walls or where nothing is mapped, at most, while people hide the map around a robot
 that stands; noise of 2.5 % of the range makes 0.15 of them. Assumed."""
@@ -84,6 +87,7 @@ class Localiser:
         self._count = 0
         self._search_began = 0
         self._T_odom_match: Pose2 | None = None
+        self._matched_at = AtStamp()
         self._T_map_odom = IDENTITY
         self._T_map_match = IDENTITY if initial_pose is None else initial_pose
         self._covariance = np.diag(
@@ -163,11 +167,13 @@ class Localiser:
         p = self._parameters
         motion = (self._T_odom_match or T_odom_base).between(T_odom_base)
         predicted = self._T_map_match @ motion
-        if not self._match_gate.is_fresh and not self._motion_gate.is_open(motion):
+        interpolated = motion_variances(self._matched_at, AtStamp(scan.stamp_ns, paired.interpolation))
+        unsure = _UNSURE * sqrt(interpolated[0]), _UNSURE * sqrt(interpolated[2])
+        if not self._match_gate.is_fresh and not self._motion_gate.is_open(motion, unsure):
             if not (self._rest_gate.stands and self._is_moved(paired, predicted)):
                 return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
             self._covariance = self._covariance + self._slip_covariance(_MOVED_WINDOW)
-        propagated = predict_covariance(self._covariance, self._T_map_match, motion, np.zeros((3, 3)))
+        propagated = predict_covariance(self._covariance, self._T_map_match, motion, np.diag(interpolated))
         noise = rotated(self._motion_model.covariance(motion), self._T_map_match.theta)
         covariance = propagated + max(self._innovations.noise_scale, 1.0) * noise
         points = paired.points_base()
@@ -176,7 +182,7 @@ class Localiser:
             if each is not None:
                 each.move(hypot(motion.x, motion.y))
         if len(points) < p.min_points:
-            self._take(predicted, covariance, T_odom_base)
+            self._take(predicted, covariance, paired)
             reason = f"{len(points)} returns"
             evidence = None if self._monitor is None else self._monitor.skipped()
             covariance = self._reported(covariance)
@@ -204,7 +210,7 @@ class Localiser:
         else:
             self._match_gate.accept(match.fitness)
         self._rest_gate.matched(match.fitness)
-        self._take(pose, covariance, T_odom_base)
+        self._take(pose, covariance, paired)
         evidence = None if self._monitor is None else self._monitor.matched(paired, pose, points)
         if self._map_scale is not None:
             self._map_scale.matched(paired, pose)
@@ -321,7 +327,7 @@ class Localiser:
         """The prediction stands; after too many refusals the pose is lost."""
         refusals = self._match_gate.refuse()
         covariance = covariance + self._slip_covariance()
-        self._take(predicted, covariance, paired.T_odom_base)
+        self._take(predicted, covariance, paired)
         status = Status.REJECTED
         if refusals >= self._parameters.max_consecutive_rejections:
             self._lose()
@@ -346,7 +352,7 @@ class Localiser:
             if self._monitor is not None:
                 self._monitor.begin()
             status = Status.RELOCALISED
-        self._take(pose, self._covariance if result.covariance is None else result.covariance, T_odom_base)
+        self._take(pose, self._covariance if result.covariance is None else result.covariance, paired)
         return Estimate(
             scan.stamp_ns,
             pose,
@@ -368,9 +374,10 @@ class Localiser:
         (_, first), *rest = result.track
         return ((self._search_began, first), *rest)
 
-    def _take(self, pose: Pose2, covariance: F64, T_odom_base: Pose2) -> None:
+    def _take(self, pose: Pose2, covariance: F64, paired: PairedScan) -> None:
         self._covariance = covariance
-        self._anchor(pose, T_odom_base)
+        self._matched_at = AtStamp(paired.scan.stamp_ns, paired.interpolation)
+        self._anchor(pose, paired.T_odom_base)
 
     def _anchor(self, T_map_base: Pose2, T_odom_base: Pose2) -> None:
         self._T_map_match = T_map_base

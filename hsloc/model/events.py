@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import lru_cache
 from math import cos, sin
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -15,19 +15,34 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+class Interpolation(NamedTuple):
+    """Of a pose that is interpolated: stamps of the messages around it (ns), and variances halfway (m^2, rad^2)."""
+
+    before_ns: int
+    after_ns: int
+    way: float
+    turn: float
+
+    def variances(self, stamp_ns: int) -> NDArray[np.float64]:
+        """Variances (3,) of x, y and theta at a stamp: none at the messages, as of a speed that changes evenly."""
+        part = (stamp_ns - self.before_ns) / (self.after_ns - self.before_ns)
+        return max(4.0 * part * (1.0 - part), 0.0) ** 2 * np.array((self.way, self.way, self.turn))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Odometry:
     """Dead reckoning: the base's pose in the odometry frame.
 
     `covariance` is the 3 x 3 covariance of (x, y, theta) that the log states (m^2, rad^2), or None where it
     states none (all zero means unknown, not perfect). `has_heading` is False where the log states no orientation
-    (a quaternion of zeros); the heading is then 0.
+    (a quaternion of zeros); the heading is then 0. `interpolation` is set where the pose is no measurement.
     """
 
     stamp_ns: int
     T_odom_base: Pose2
     covariance: NDArray[np.float64] | None = None
     has_heading: bool = True
+    interpolation: Interpolation | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +149,8 @@ class PairedScan:
 
     Of several lasers, scans of about the same time are matched together: `companions` are those that this one carries,
     and a scan that another one will carry `is_held`: nothing is to be matched yet. `heading` is the last one before the
-    scan (rad), where the log has headings and no odometry.
+    scan (rad), where the log has headings and no odometry. `interpolation` is that of `T_odom_base`, if it is between
+    messages that are far apart.
     """
 
     scan: Scan
@@ -142,6 +158,7 @@ class PairedScan:
     companions: tuple[PairedScan, ...] = ()
     is_held: bool = False
     heading: float | None = None
+    interpolation: Interpolation | None = None
 
     def points_base(self) -> NDArray[np.float64]:
         """The hits of the scan and its companions in the base's frame at the scan's stamp, metres, shape (m, 2)."""

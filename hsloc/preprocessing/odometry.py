@@ -13,6 +13,7 @@ soon as it is sure.
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from math import hypot, inf
 from typing import TYPE_CHECKING
 
@@ -85,11 +86,7 @@ class ContinuousOdometry:
                 place = before.T_odom_base if T_joined_odom is None else T_joined_odom @ before.T_odom_base
                 T_joined_odom = place @ event.T_odom_base.inverse()
             before = event
-            yield (
-                event
-                if T_joined_odom is None
-                else Odometry(event.stamp_ns, T_joined_odom @ event.T_odom_base, event.covariance)
-            )
+            yield event if T_joined_odom is None else replace(event, T_odom_base=T_joined_odom @ event.T_odom_base)
 
     def _has_jumped(self, before: Odometry, after: Odometry) -> bool:
         a, b = before.T_odom_base, after.T_odom_base

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from hsloc.log import MAX_SPEED
 from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import wrap_angle
+from hsloc.preprocessing.interpolation import Interpolations
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ class UnstalledOdometry:
     def __init__(self, events: Iterable[Event], topic: str | None = None) -> None:
         self._late = _LateOdometry(events)
         self._topic = topic
+        self._interpolations = Interpolations()
         self._start_ns = 0
         self._found: list[tuple[int, int]] = []
         self._last: Odometry | None = None
@@ -118,6 +120,7 @@ class UnstalledOdometry:
             self._start_ns = event.stamp_ns
         else:
             self._speeds = _speeds(self._last, event)
+        self._interpolations.follow(event)
         self._last, self._held, self._repeated, self._jump, self._is_at_rest = event, [], None, None, False
 
     def _is_stall(self, last: Odometry, repeated: Odometry, event: Odometry) -> bool:
@@ -147,10 +150,12 @@ class UnstalledOdometry:
         last = self._last or after
         whole_ns = after.stamp_ns - last.stamp_ns
         self._found.append((last.stamp_ns, whole_ns))
+        interpolation = self._interpolations.between(last, after)
         for event in self._held:
             if isinstance(event, Odometry) and event is not after:
                 part = min(max((event.stamp_ns - last.stamp_ns) / whole_ns, 0.0), 1.0)
-                event = replace(event, T_odom_base=last.T_odom_base.interpolate(after.T_odom_base, part))
+                pose = last.T_odom_base.interpolate(after.T_odom_base, part)
+                event = replace(event, T_odom_base=pose, interpolation=interpolation)
             yield event
 
     def warnings(self) -> tuple[RunWarning, ...]:

@@ -24,12 +24,13 @@ import numpy as np
 from hsloc.model.events import Heading, Odometry, PairedScan, Scan, Truth
 from hsloc.model.pose2 import IDENTITY, Pose2, relative_poses
 from hsloc.model.trajectory import Trajectory
+from hsloc.preprocessing.interpolation import Interpolations
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from hsloc.model.events import Event
+    from hsloc.model.events import Event, Interpolation
 
     Paired = Odometry | PairedScan | Truth
 
@@ -82,7 +83,13 @@ def pair(
 def _pair(events: Iterable[Event], first: Pose2) -> Iterator[Odometry | PairedScan | Truth]:
     recent: deque[Odometry] = deque(maxlen=_RECENT_ODOMETRY)
     waiting: deque[Scan] = deque()
+    interpolations = Interpolations()
     heading: float | None = None
+
+    def paired(scan: Scan, following: Odometry | None) -> PairedScan:
+        T_odom_base, interpolation = _at(scan.stamp_ns, recent, following, first, interpolations)
+        return PairedScan(scan, T_odom_base, interpolation=interpolation)
+
     for event in events:
         if isinstance(event, Truth):
             yield event
@@ -90,27 +97,28 @@ def _pair(events: Iterable[Event], first: Pose2) -> Iterator[Odometry | PairedSc
             # A log with headings has no odometry that scans would wait for.
             heading = event.theta
             while waiting:
-                yield _paired(waiting.popleft(), recent, None, first)
+                yield paired(waiting.popleft(), None)
         elif isinstance(event, Scan):
             if heading is not None and not recent:
                 yield PairedScan(event, first, heading=heading)
                 continue
             exact = _exact(recent, event.stamp_ns)
             if exact is not None and not waiting:
-                yield PairedScan(event, exact)
+                yield PairedScan(event, exact.T_odom_base, interpolation=exact.interpolation)
                 continue
             waiting.append(event)
             if len(waiting) > _WAITING_SCANS:
-                yield _paired(waiting.popleft(), recent, None, first)
+                yield paired(waiting.popleft(), None)
         else:
             while waiting and _earliest(waiting) < event.stamp_ns:
-                yield _paired(waiting.popleft(), recent, event, first)
+                yield paired(waiting.popleft(), event)
             recent.append(event)
+            interpolations.follow(event)
             yield event
             while waiting and _earliest(waiting) <= event.stamp_ns:
-                yield _paired(waiting.popleft(), recent, None, first)
+                yield paired(waiting.popleft(), None)
     while waiting:
-        yield _paired(waiting.popleft(), recent, None, first)
+        yield paired(waiting.popleft(), None)
 
 
 def _earliest(waiting: deque[Scan]) -> int:
@@ -118,31 +126,30 @@ def _earliest(waiting: deque[Scan]) -> int:
     return min(scan.stamp_ns for scan in waiting)
 
 
-def _paired(scan: Scan, recent: deque[Odometry], following: Odometry | None, first: Pose2) -> PairedScan:
-    return PairedScan(scan, _at(scan.stamp_ns, recent, following, first))
-
-
-def _exact(recent: deque[Odometry], stamp_ns: int) -> Pose2 | None:
+def _exact(recent: deque[Odometry], stamp_ns: int) -> Odometry | None:
     for odometry in reversed(recent):
         if odometry.stamp_ns == stamp_ns:
-            return odometry.T_odom_base
+            return odometry
     return None
 
 
-def _at(stamp_ns: int, recent: deque[Odometry], following: Odometry | None, first: Pose2) -> Pose2:
+def _at(
+    stamp_ns: int, recent: deque[Odometry], following: Odometry | None, first: Pose2, interpolations: Interpolations
+) -> tuple[Pose2, Interpolation | None]:
     """The odometry at a stamp: exact, else between neighbours in the log that enclose it, else the last one."""
     exact = _exact(recent, stamp_ns)
     if exact is not None:
-        return exact
+        return exact.T_odom_base, exact.interpolation
     after = following
     for before in reversed(recent):
         if after is not None and before.stamp_ns < stamp_ns <= after.stamp_ns:
             fraction = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
-            return before.T_odom_base.interpolate(after.T_odom_base, fraction)
+            interpolation = before.interpolation or after.interpolation or interpolations.between(before, after)
+            return before.T_odom_base.interpolate(after.T_odom_base, fraction), interpolation
         after = before
     if recent and (following is None or following.stamp_ns >= stamp_ns):
-        return recent[-1].T_odom_base
-    return following.T_odom_base if following is not None else first
+        return recent[-1].T_odom_base, None
+    return following.T_odom_base if following is not None else first, None
 
 
 def deskewed(events: Iterable[Paired]) -> Iterator[Paired]:

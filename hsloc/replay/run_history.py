@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.interpolated_odometry import AtStamp
 from hsloc.localisation.kalman_filter import (
     Anchor,
     SmoothedMatches,
@@ -74,6 +75,7 @@ class RunHistory:
         self._mapped = array("d")
         self._odometry_stamps = array("q")
         self._odometry = array("d")
+        self._interpolated: dict[int, AtStamp] = {}
         self._poses = array("d")
         self._localised = array("b")
         self._truth_stamps = array("q")
@@ -99,6 +101,8 @@ class RunHistory:
             if estimate is None:
                 return
             pose, place = event.T_odom_base, estimate.T_map_base
+            if event.interpolation is not None:
+                self._interpolated[len(self._odometry_stamps)] = AtStamp(event.stamp_ns, event.interpolation)
             self._odometry_stamps.append(event.stamp_ns)
             self._odometry.extend((pose.x, pose.y, pose.theta))
             self._poses.extend((place.x, place.y, place.theta))
@@ -153,6 +157,7 @@ class RunHistory:
                     begins,
                     estimate.noise_scale,
                     estimate.fits_as_usual,
+                    AtStamp(paired.scan.stamp_ns, paired.interpolation),
                 )
             )
             self._anchor_scans.append(len(self._scan_stamps) - 1)
@@ -218,11 +223,18 @@ class RunHistory:
         """One pose for each odometry message, revised where the estimator knew better later; and which are believed."""
         estimated = _trajectory(self._odometry_stamps, self._poses)
         if self._motion_model is not None and self._anchors:
-            matched = self._smooth().poses
+            matched = self._smooth()
             # Where scans were refused before, the first match may be that of another place.
             is_first = self._anchor_scans[0] == 0
             odometry = self.odometry().poses
-            poses = between_matches(estimated.poses, odometry, self._anchors, matched, leads_to_first=is_first)
+            poses = between_matches(
+                estimated.poses,
+                odometry,
+                self._anchors,
+                matched,
+                leads_to_first=is_first,
+                interpolated=self._interpolated,
+            )
             estimated = Trajectory(estimated.stamps_ns, poses)
         if not self._revisions:
             return estimated, np.array(self._localised, dtype=np.bool_)
@@ -239,7 +251,7 @@ class RunHistory:
     def _smooth(self) -> SmoothedMatches:
         """The smoothed poses at the matches; of none without a motion model."""
         if self._motion_model is None:
-            return SmoothedMatches(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)))
+            return SmoothedMatches(np.empty((0, 3)), np.empty((0, 3, 3)), *np.empty((2, 0, 3)))
         if self._smoothed is None:
             self._smoothed = smooth_matches(self._anchors, self._motion_model)
         return self._smoothed
@@ -263,13 +275,18 @@ class RunHistory:
             self._states.join_tracks(self.odometry().poses, model, grid)
         smoothed = self._smooth()
         covariances = dict(zip(self._anchor_states, smoothed.covariances, strict=True))
-        between = bridge_variances(self.odometry().poses, self._anchors, smoothed.motion, model)
+        odometry = self.odometry().poses
+        between, unsure = bridge_variances(odometry, self._anchors, smoothed, model, self._interpolated)
         rows = self._states.at_odometry(len(self._odometry_stamps), covariances, between)
         if self._motion_model is not None:
             noise, factor = self._motion_model, self._anchors[-1].noise_scale if self._anchors else 1.0
             poses = self.trajectory()[0].poses
             rows = with_odometry_alone(
-                rows, poses, self._states.scanned, self._is_alone(), lambda motion: factor * noise.covariance(motion)
+                rows,
+                poses,
+                self._states.scanned,
+                self._is_alone() | unsure,
+                lambda motion: factor * noise.covariance(motion),
             )
         if scale is not None and scale.moves_poses:
             reason = f"the scale of the map is {scale.of_given_map:.3f} ± {scale.sigma:.3f}"

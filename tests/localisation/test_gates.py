@@ -21,6 +21,7 @@ LIMITS = MatchLimits(min_fitness=0.3, min_fitness_ratio=0.7, recovery_fitness_ra
 )
 def test_a_motion_gate_opens_by_distance_or_by_angle(motion: Pose2, is_open: bool) -> None:
     assert MotionGate(0.2, 0.1).is_open(motion) is is_open
+    assert MotionGate(0.2, 0.1).is_open(motion, (0.2, 0.0))
 
 
 def test_a_fresh_gate_refuses_by_the_least_fitness_alone() -> None:

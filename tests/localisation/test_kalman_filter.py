@@ -11,9 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hsloc.errors import ConfigError
+from hsloc.localisation.interpolated_odometry import AtStamp, motion_variances
 from hsloc.localisation.kalman_filter import (
     Anchor,
     Innovations,
+    SmoothedMatches,
     between_matches,
     bridge_variances,
     fuse,
@@ -22,6 +24,7 @@ from hsloc.localisation.kalman_filter import (
 )
 from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.model import Pose2, wrap_angle
+from hsloc.model.events import Interpolation
 
 angles = st.floats(-3.0, 3.0)
 
@@ -98,6 +101,13 @@ def anchor(
     return Anchor(count, odometry, place, covariance, begins)
 
 
+def as_matched(anchors: list[Anchor]) -> SmoothedMatches:
+    """Matches that are not smoothed."""
+    n = len(anchors)
+    poses = np.array([a.T_map_base.to_array() for a in anchors])
+    return SmoothedMatches(poses, np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)))
+
+
 def straight(n: int, step: float) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     return np.column_stack((step * np.arange(n), np.zeros(n), np.zeros(n)))
 
@@ -108,7 +118,7 @@ def test_between_two_matches_an_error_of_the_odometry_is_shared_out(at: float) -
     true = odometry * (1.2, 1.0, 1.0)
     first = anchor(1, Pose2(), Pose2(), SURE, begins=True)
     last = anchor(5, Pose2(at, 0.0, 0.0), Pose2(1.2 * at, 0.0, 0.0), SURE)
-    matched = np.array([(0.0, 0.0, 0.0), (1.2 * at, 0.0, 0.0)])
+    matched = as_matched([first, last])
     smoothed = between_matches(odometry, odometry, [first, last], matched)
     assert smoothed == pytest.approx(true, abs=1e-6)
 
@@ -118,7 +128,7 @@ def test_poses_before_the_first_match_lead_to_it_where_it_is_that_of_the_start()
     guessed = odometry + np.array((0.0, 0.3, 0.0))
     anchors = [anchor(3, Pose2(0.2, 0.0, 0.0), Pose2(0.2, 0.0, 0.0), SURE, begins=True)]
     anchors.append(anchor(5, Pose2(0.4, 0.0, 0.0), Pose2(0.4, 0.0, 0.0), SURE))
-    matched = np.array([a.T_map_base.to_array() for a in anchors])
+    matched = as_matched(anchors)
     assert between_matches(guessed, odometry, anchors, matched, leads_to_first=True)[:3] == pytest.approx(odometry[:3])
     assert (between_matches(guessed, odometry, anchors, matched)[:3] == guessed[:3]).all()
 
@@ -129,9 +139,9 @@ def test_over_the_begin_of_another_track_nothing_is_shared_out() -> None:
         anchor(1, Pose2(), Pose2(), SURE, begins=True),
         anchor(4, Pose2(0.3, 0.0, 0.0), Pose2(9.0, 0.0, 0.0), SURE, begins=True),
     ]
-    matched = np.array([a.T_map_base.to_array() for a in anchors])
+    matched = as_matched(anchors)
     assert (between_matches(odometry, odometry, anchors, matched) == odometry).all()
-    assert (smooth_matches(anchors, OdometryNoise())[0] == matched).all()
+    assert (smooth_matches(anchors, OdometryNoise())[0] == matched.poses).all()
 
 
 def test_what_the_end_of_a_corridor_shows_corrects_the_poses_before() -> None:
@@ -140,7 +150,7 @@ def test_what_the_end_of_a_corridor_shows_corrects_the_poses_before() -> None:
     places = [Pose2(0.5 * k + 0.05 * k, 0.0, 0.0) for k in range(4)]
     anchors = [anchor(k, Pose2(0.55 * k, 0.0, 0.0), places[k], along, begins=k == 0) for k in range(4)]
     anchors.append(anchor(4, Pose2(2.2, 0.0, 0.0), Pose2(2.0, 0.0, 0.0), SURE))
-    smoothed, covariances, _ = smooth_matches(anchors, OdometryNoise())
+    smoothed, covariances, *_ = smooth_matches(anchors, OdometryNoise())
     before = abs(places[3].x - 1.5)
     assert abs(smoothed[3, 0] - 1.5) < 0.5 * before
     assert np.abs(smoothed[:, 1:]).max() < 1e-9
@@ -195,9 +205,11 @@ def test_between_two_matches_the_odometry_adds_its_noise() -> None:
         anchor(1, Pose2(), Pose2(), SURE, begins=True),
         anchor(5, Pose2(0.4, 0.0, 0.0), Pose2(0.4, 0.0, 0.0), SURE),
     ]
-    motion = smooth_matches(anchors, OdometryNoise()).motion
+    matched = smooth_matches(anchors, OdometryNoise())
+    motion = matched.motion
     assert motion[1, 0] == pytest.approx(0.01 * 0.4**2)
-    found = bridge_variances(odometry, anchors, motion, OdometryNoise())
+    found, unsure = bridge_variances(odometry, anchors, matched, OdometryNoise())
+    assert not unsure.any()
     assert found[2:4].min() > 0.0
     np.testing.assert_allclose(found[2, 0], motion[1, 0] / 4.0)
     assert (found[[0, 5, 6]] == 0.0).all()
@@ -209,7 +221,7 @@ def test_over_a_long_gap_the_errors_of_the_odometry_are_a_walk() -> None:
         anchor(1, Pose2(), Pose2(), SURE, begins=True),
         anchor(21, Pose2(2.0, 0.0, 0.0), Pose2(2.0, 0.0, 0.0), SURE),
     ]
-    found = bridge_variances(odometry, anchors, smooth_matches(anchors, noise).motion, noise)
+    found, _ = bridge_variances(odometry, anchors, smooth_matches(anchors, noise), noise)
     # Ten motions of 0.2 m: half-way a quarter of what they add up to is left, along, and of the heading.
     expected = np.array((0.01, 2.0 * 0.02)) * 10.0 * 0.2**2 / 4.0
     np.testing.assert_allclose(found[10, [0, 2]], expected, rtol=0.1)
@@ -218,3 +230,58 @@ def test_over_a_long_gap_the_errors_of_the_odometry_are_a_walk() -> None:
     ends, middle = np.column_stack((0.2 * walks.sum(axis=1), walks[:, -1])), 0.2 * walks[:, :5].sum(axis=1)
     aside = np.var(middle - ends @ np.linalg.lstsq(ends, middle, rcond=None)[0])
     assert aside < found[10, 1] < 10.0 * aside
+
+
+def test_of_a_slip_between_two_matches_it_is_not_known_when_it_was() -> None:
+    odometry = straight(5, 0.1)
+    first = anchor(1, Pose2(), Pose2(), SURE, begins=True)
+    anchors = [first, anchor(5, Pose2(0.4, 0.0, 0.0), Pose2(1.0, 0.0, 0.0), SURE)]
+    found, unsure = bridge_variances(odometry, anchors, smooth_matches(anchors, OdometryNoise()), OdometryNoise())
+    # 0.6 m, at any time: where half of it is taken, the pose is off by 0.3 m at most.
+    assert np.sqrt(found[2, 0]) == pytest.approx(0.6 / np.sqrt(12.0), abs=0.01)
+    assert 0.6 / np.sqrt(12.0) < np.sqrt(found[3, 0]) < 0.6 / np.sqrt(3.0)
+    assert unsure.tolist() == [False, True, True, True, True]
+
+
+GAP = Interpolation(0, 1_000_000_000, 0.01, 0.04)
+
+
+def test_a_measured_pose_keeps_to_the_match_whose_odometry_was_measured_too() -> None:
+    # The robot began to turn after the message at 0 s; half-way to the next the odometry is off by 0.2 rad.
+    odometry = np.array([(0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.1, 0.0, 0.4)])
+    first = anchor(1, Pose2(), Pose2(), SURE, begins=True)
+    second = replace(anchor(2, Pose2(0.1, 0.0, 0.2), Pose2(0.1, 0.0, 0.0), SURE), at=AtStamp(500_000_000, GAP))
+    matched = smooth_matches([first, second], OdometryNoise())
+    smoothed = between_matches(odometry, odometry, [first, second], matched)
+    assert abs(smoothed[1, 2]) < 0.01
+    variances, unsure = bridge_variances(odometry, [first, second], matched, OdometryNoise())
+    assert unsure.tolist() == [False, True, False]
+    assert np.sqrt(variances[1, 2]) < 0.04
+
+
+def test_an_interpolated_pose_is_as_uncertain_as_the_time_between_matches_makes_it() -> None:
+    odometry, none = straight(11, 0.1), OdometryNoise(alpha1=0.0, alpha2=0.0, alpha3=0.0, alpha4=0.0)
+    stamps = [100_000_000 * k for k in range(11)]
+    interpolated = {k: AtStamp(stamps[k], GAP) for k in range(1, 10)}
+
+    def sigma(last: int) -> float:
+        """Of the heading half-way between matches at the second message and at another one."""
+        anchors = [
+            replace(anchor(k + 1, Pose2(0.1 * k, 0.0, 0.0), Pose2(0.1 * k, 0.0, 0.0), SURE), at=AtStamp(stamps[k], GAP))
+            for k in (1, last)
+        ]
+        variances, unsure = bridge_variances(odometry, anchors, smooth_matches(anchors, none), none, interpolated)
+        assert unsure[1:10].all()
+        return float(np.sqrt(variances[(1 + last) // 2, 2]))
+
+    assert sigma(9) == pytest.approx(0.2 * 0.8**1.5)
+    assert sigma(3) == pytest.approx(0.2 * 0.2**1.5)
+
+
+def test_a_motion_between_two_interpolated_poses_is_off_by_both_errors_or_by_a_wrong_speed() -> None:
+    measured, half = AtStamp(0), AtStamp(500_000_000, GAP)
+    np.testing.assert_allclose(motion_variances(measured, half), (0.01, 0.01, 0.04))
+    other = AtStamp(1_500_000_000, GAP._replace(before_ns=1_000_000_000, after_ns=2_000_000_000))
+    np.testing.assert_allclose(motion_variances(half, other), (0.02, 0.02, 0.08))
+    near = AtStamp(600_000_000, GAP)
+    np.testing.assert_allclose(motion_variances(half, near), np.array((0.01, 0.01, 0.04)) * 0.2**2)

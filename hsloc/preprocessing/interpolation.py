@@ -36,6 +36,9 @@ _ASSUMED = 3.0
 """Poses left out that this assumption counts as."""
 _HARDEST, _HARDEST_TURN = 10.0, 30.0
 """Accelerations (m/s^2, rad/s^2) beyond which the odometry jumped, as in `odometry_stalls`."""
+_MOST, _MOST_TURN = 0.5, 0.35
+"""Standard deviations (m, rad) at most: the localiser's wide window. After a gap of a minute nothing is known, and the
+whole map is searched where a scan does not fit in three of them."""
 _METRES_PER_RADIAN = 0.5
 """Metres that a radian counts for as motion: about the track width of an indoor robot."""
 
@@ -83,6 +86,7 @@ class Interpolations:
         size = np.array((way + _METRES_PER_RADIAN * turn, turn)) ** 2
         usual = found.motion * seconds**2 if found.poses else size
         variances = 0.5 * mean * (1.0 + size / np.maximum(usual, 1e-12))
+        variances = np.minimum(variances, np.array((_MOST, _MOST_TURN)) ** 2)
         return Interpolation(before.stamp_ns, after.stamp_ns, float(variances[0]), float(variances[1]))
 
     def _left_out(self, seconds: float) -> _Errors:
@@ -107,9 +111,8 @@ class Interpolations:
         whole = pose_differences(poses[last][like], poses[first][like])
         off = pose_differences(poses[middle][like], poses[first][like]) - part * whole
         off[:, 2] = wrap_angles(off[:, 2])
-        errors = np.column_stack((np.hypot(off[:, 0], off[:, 1]) / np.sqrt(2.0), off[:, 2])) / (
-            4.0 * part * (1.0 - part)
-        )
+        errors = np.column_stack((np.hypot(off[:, 0], off[:, 1]) / np.sqrt(2.0), off[:, 2]))
+        errors /= 4.0 * part * (1.0 - part)
         possible = (np.abs(errors) < np.array((_HARDEST, _HARDEST_TURN)) * span**2 / 8.0).all(axis=1)
         count = int(possible.sum())
         if count == 0:

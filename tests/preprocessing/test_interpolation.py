@@ -59,6 +59,10 @@ def test_messages_that_are_near_are_as_good_as_their_poses() -> None:
     assert not slow.variances(0).any()
     # Before anything is known accelerations are those of ordinary robots.
     assert np.sqrt(slow.variances(200_000_000)) == pytest.approx(np.array((1.0, 1.0, 2.0)) * 0.4**2 / 8.0)
+    # After a minute without messages nothing is known, but the window stays one that can be searched.
+    gone = found.between(Odometry(0, Pose2()), Odometry(60_000_000_000, Pose2(9.0, 0.0, 0.3)))
+    assert gone is not None
+    assert np.sqrt((gone.way, gone.turn)) == pytest.approx((0.5, 0.35))
 
 
 def test_a_scan_in_a_gap_is_paired_with_how_sure_its_pose_is() -> None:

@@ -37,8 +37,8 @@ _ASSUMED = 3.0
 _HARDEST, _HARDEST_TURN = 10.0, 30.0
 """Accelerations (m/s^2, rad/s^2) beyond which the odometry jumped, as in `odometry_stalls`."""
 _MOST, _MOST_TURN = 0.5, 0.35
-"""Standard deviations (m, rad) at most: the localiser's wide window. After a gap of a minute nothing is known, and the
-whole map is searched where a scan does not fit in three of them."""
+"""Standard deviations (m, rad) at most: the localiser's wide window. After a gap of a minute nothing is known, and
+poses there are doubted with less."""
 _METRES_PER_RADIAN = 0.5
 """Metres that a radian counts for as motion: about the track width of an indoor robot."""
 

@@ -341,8 +341,8 @@ class FrontEnd:
         """Whether a pose is evidence against the prediction, where it contradicts it.
 
         Along a direction that no wall fixes another pose is none: the score of HIDE prefers the pose at which the scans
-        overlap most. Nor is another heading from one direction of walls, unless the scans have `refuted` the
-        prediction: a camera that turns in a corner sees one wall after the other, and each fits the one before.
+        overlap most. Nor is another heading than the odometry's, unless the scans have `refuted` that: a camera that
+        turns in a corner sees one wall after the other, and each fits the one before.
         """
         p = self._parameters
         if found.chi * self._odometry.scale <= SURPRISE:
@@ -351,7 +351,7 @@ class FrontEnd:
         if np.hypot(*offset) > p.window_min and found.observed(offset) < _OBSERVED:
             return False
         turned = abs(wrap_angle(found.pose.theta - predicted.theta))
-        if turned > p.window_min_angle and not refuted and found.least_observed() < _OBSERVED:
+        if self._use_odometry and not refuted and turned > p.window_min_angle:
             return False
         agrees = found.paired >= _CONVINCING_PAIRED and found.consistency >= _CONVINCING
         return agrees and not self._match_gate.refusal(fitness)

@@ -99,21 +99,11 @@ class ScanRegistration:
 
     def observed(self, direction: F64) -> float:
         """Information along a direction (2,) in the map, as a part of that along the best one; theta is left free."""
-        across = self._across()
+        h = self.information
+        across = h[:2, :2] - np.outer(h[:2, 2], h[2, :2]) / max(h[2, 2], 1e-9)
         best = float(np.linalg.eigvalsh(across)[-1])
         unit = direction / max(float(np.hypot(*direction)), 1e-9)
         return float(unit @ across @ unit) / best if best > 0.0 else 0.0
-
-    def least_observed(self) -> float:
-        """The same along the direction in which it is least: about 0 where all walls are parallel."""
-        least, best = np.linalg.eigvalsh(self._across()).tolist()
-        return float(least / best) if best > 0.0 else 0.0
-
-    def _across(self) -> F64:
-        """Information (2, 2) of x and y, theta left free."""
-        h = self.information
-        across: F64 = h[:2, :2] - np.outer(h[:2, 2], h[2, :2]) / max(h[2, 2], 1e-9)
-        return across
 
     def refusal(self) -> str:
         """Why the pose is not believed; empty if it is."""

@@ -86,7 +86,7 @@ def test_after_a_gap_in_the_scans_another_room_is_not_taken_for_the_last_one() -
 
 
 def test_a_camera_that_turns_at_a_dead_end_does_not_take_one_wall_for_another() -> None:
-    """It saw a side wall only, which fits the end wall before it: a map was turned by 90 deg, and 43 m wide."""
+    """It saw a side wall only, which fits the end wall before it: a map was turned by 90 deg, and 43 m off."""
     world = World("end", floor_plan([(0.0, 0.0, 8.0, 1.85)]), np.empty((0, 2)))
     camera = Lidar(
         beams=160, field_of_view=radians(70.0), range_min=0.4, range_max=4.0, range_noise=0.02,

@@ -363,3 +363,29 @@ def selected_inverse(factor: Factor, lower: F64, diagonal: F64) -> None:
                         + below[q, 2, a] * product[row, 2, b]
                     )
             place[row] = -1
+
+
+@njit(cache=True, nogil=True)
+def solve_in_place(matrix: F64, right: F64) -> None:
+    """Write `matrix^-1 right` (n, m) to `right`, of a positive definite matrix (n, n), by `L L^T`, which overwrites it.
+
+    Not by `np.linalg`: for LAPACK numba imports SciPy's linear algebra, 0.2 s of a command.
+    """
+    n = len(matrix)
+    for i in range(n):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = total / matrix[j, j] if j < i else np.sqrt(total)
+        for m in range(right.shape[1]):
+            total = right[i, m]
+            for k in range(i):
+                total -= matrix[i, k] * right[k, m]
+            right[i, m] = total / matrix[i, i]
+    for i in range(n - 1, -1, -1):
+        for m in range(right.shape[1]):
+            total = right[i, m]
+            for k in range(i + 1, n):
+                total -= matrix[k, i] * right[k, m]
+            right[i, m] = total / matrix[i, i]

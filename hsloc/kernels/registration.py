@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numba import njit
 
+from hsloc.kernels.block_cholesky import solve_in_place
 from hsloc.kernels.levenberg_marquardt import solve_damped
 from hsloc.kernels.normal_equations import Blocks, PairTerms, add_relative_term
 from hsloc.kernels.point_to_line import PairTerm, ScanArrays, Term, add_agreement, pair_terms, relative
@@ -239,32 +240,6 @@ def nearest_partners(poses: F64, sorts: I64, known: I64, grid: Grid, most: int, 
 
 
 @njit(cache=True, nogil=True)
-def _solve_in_place(matrix: F64, right: F64) -> None:
-    """Write `matrix^-1 right` (n, m) to `right`, of a positive definite matrix (n, n), by `L L^T`, which overwrites it.
-
-    Not by `np.linalg`: for LAPACK numba imports SciPy's linear algebra, 0.2 s of a command.
-    """
-    n = len(matrix)
-    for i in range(n):
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] = total / matrix[j, j] if j < i else np.sqrt(total)
-        for m in range(right.shape[1]):
-            total = right[i, m]
-            for k in range(i):
-                total -= matrix[i, k] * right[k, m]
-            right[i, m] = total / matrix[i, i]
-    for i in range(n - 1, -1, -1):
-        for m in range(right.shape[1]):
-            total = right[i, m]
-            for k in range(i + 1, n):
-                total -= matrix[k, i] * right[k, m]
-            right[i, m] = total / matrix[i, i]
-
-
-@njit(cache=True, nogil=True)
 def _add_transformed(matrix: F64, covariance: F64, out: F64) -> None:
     """Add `matrix covariance matrix^T`, all (3, 3), to `out`."""
     for a in range(3):
@@ -326,7 +301,7 @@ def window_motions(
                         matrix[i + b, j + a] += ji[a, b]
         for a in range(3):
             right[size - 3 + a, a] = 1.0
-        _solve_in_place(matrix, right)
+        solve_in_place(matrix, right)
         last = poses[end] + right[size - 3 :, 3]
         relative(poses[begin], last, motions[w])
         c = np.cos(poses[begin, 2])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hsloc.kernels.block_cholesky import minimum_degree
+from hsloc.kernels.block_cholesky import minimum_degree, solve_in_place
 from hsloc.slam import sparse_solver
 from hsloc.slam.sparse_solver import BlockSystem
 
@@ -90,3 +90,11 @@ def test_the_order_of_elimination_has_each_node_once_and_little_fill(rng: Any, c
         assert fill == 0
     else:
         assert fill < 0.8 * np.mean([_fill(links, rng.permutation(n)) for _ in range(5)])
+
+
+def test_a_dense_system_is_solved_as_by_lapack(rng: Any) -> None:
+    root, right = rng.normal(size=(12, 12)), rng.normal(size=(12, 4))
+    matrix = root @ root.T + 1e-6 * np.eye(12)
+    expected = np.linalg.solve(matrix, right)
+    solve_in_place(matrix, right)
+    np.testing.assert_allclose(right, expected, rtol=1e-6)

@@ -10,7 +10,7 @@ Odometry plays no part, for its scale is unknown itself.
 
 The same distances, averaged over each row of cells, show how well the walls are drawn: where they lie in the cells.
 
-Where the scale is wrong by so much that the walls are not the nearest ones, scans that do not fit are matched with
+Where the scale is so wrong that other walls are nearest, scans that do not fit are matched with
 their points nearer or farther as well: at the right scale nearly all of them lie on walls.
 """
 

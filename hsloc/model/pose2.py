@@ -129,6 +129,12 @@ def pose_differences(poses: Array, others: Array) -> Array:
     return apart
 
 
+def mahalanobis_distances(differences: Array, covariances: Array) -> Array:
+    """Lengths (n,) of differences of poses (n, 3) in standard deviations, by their covariances (n, 3, 3)."""
+    weighed = np.linalg.solve(covariances, differences[:, :, None])[:, :, 0]
+    return np.asarray(np.sqrt(np.maximum((differences * weighed).sum(axis=1), 0.0)), dtype=np.float64)
+
+
 def compose_poses(first: Array, second: Array) -> Array:
     """`first @ second` row by row, for arrays of poses of shape (n, 3), either may be (3,); theta is wrapped."""
     first, second = np.atleast_2d(first), np.atleast_2d(second)

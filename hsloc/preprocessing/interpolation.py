@@ -28,10 +28,10 @@ _LEAST_NS = 100_000_000
 _REMEMBERED = 3000
 """Messages from which is learned: a minute at 50 Hz."""
 _RENEWED = 16
-"""Messages after which it is learned anew, at most: from a minute of messages that takes a millisecond."""
+"""Messages after which it is learned again, at most: from a minute of messages that takes a millisecond."""
 _USUAL, _USUAL_TURN = 1.0, 2.0
 """Accelerations (m/s^2, rad/s^2) before anything is known; halfway a constant one makes an eighth of its square of the
-time. Ordinary robots reach 2.5 and 5 (`odometry_stalls`), and seldom."""
+time. Ordinary robots reach 2.5 and 5 (`odometry_stalls`), and rarely."""
 _ASSUMED = 3.0
 """Poses left out that this assumption counts as."""
 _HARDEST, _HARDEST_TURN = 10.0, 30.0

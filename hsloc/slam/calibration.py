@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.model.pose2 import compose_poses, pose_differences, relative_poses, wrap_angles
+from hsloc.model.pose2 import compose_poses, mahalanobis_distances, pose_differences, relative_poses, wrap_angles
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -138,9 +138,7 @@ def odometry_chi(motions: F64, found: F64, covariances: F64) -> F64:
 
     `covariances` (n, 3, 3) are those of the noise that is assumed.
     """
-    errors = pose_differences(found, motions)
-    weighed = np.linalg.solve(covariances + FLOOR, errors[:, :, None])[:, :, 0]
-    return np.asarray(np.sqrt((errors * weighed).sum(axis=1)), dtype=np.float64)
+    return mahalanobis_distances(pose_differences(found, motions), covariances + FLOOR)
 
 
 def odometry_scale(chi: F64) -> float:

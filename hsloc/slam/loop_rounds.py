@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.model.pose2 import pose_differences
+from hsloc.model.pose2 import mahalanobis_distances, pose_differences
 from hsloc.slam.jumps import jumps, tears
 from hsloc.slam.loop_closer import LoopCloser, loop_edges
 from hsloc.slam.pose_graph import Edges, compose_steps, solve_edges
-from hsloc.slam.slips import motions_by_odometry
+from hsloc.slam.slips import motions_by_steps
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from hsloc.slam.loop_matcher import Loop
     from hsloc.slam.map_session import MapSession
     from hsloc.slam.parameters import GraphMapperParameters
+    from hsloc.slam.submaps import Submaps
 
     F64 = NDArray[np.float64]
 
@@ -36,7 +37,7 @@ _LEAST_LOOPS = 10
 _UNUSUAL = 8.0
 """Factor to the median distance of the loops from the path, in its standard deviations, from which on one is wrong. Two
 distances of three degrees of freedom, as of loops that all span the same stretch and one that spans another, differ by
-so much in 1 of 300 cases (F distribution); how large the standard deviations are does not matter."""
+this factor in 1 of 300 cases (F distribution); how large the standard deviations are does not matter."""
 _BEYOND_SLIPS_M = 2.0
 """Distance [m] of such a loop from the path: beyond two slips."""
 
@@ -57,14 +58,14 @@ def close_loops(
         # Across the gap between two logs nothing was driven.
         found = [] if session.ties or rounds_left == 0 else jumps(session.stamps_ns, poses, odometry)
         torn = tears(found, poses, odometry)
-        across = _across(closer.accepted, places.reference, torn)
+        wrong = _across(closer.accepted, places.reference, torn)
         if rounds_left > 0:
-            across += unusual(closer.accepted, session)
+            wrong += unusual(closer.accepted, places)
         believed = {*session.asserted, *((loop.first, loop.second) for loop in session.known)}
-        tearing = [pair for pair in across if pair not in believed]
-        if not tearing:
+        wrong = [pair for pair in wrong if pair not in believed]
+        if not wrong:
             break
-        forbidden = (*forbidden, *tearing)
+        forbidden = (*forbidden, *wrong)
     return poses, closer.loops, edges
 
 
@@ -77,20 +78,18 @@ def _across(loops: list[Loop], reference: NDArray[np.int64], torn: list[tuple[in
     ]
 
 
-def unusual(loops: list[Loop], session: MapSession) -> list[tuple[int, int]]:
+def unusual(loops: list[Loop], places: Submaps) -> list[tuple[int, int]]:
     """The pairs of places of the loops that lie far farther from the path than the others.
 
     Only stretches in which no scan refused a step: elsewhere a slip may be as large.
     """
-    reference, doubts = session.places.reference, np.cumsum(session.refused)
-    ends = np.array([(reference[loop.first], reference[loop.second]) for loop in loops], dtype=np.int64).reshape(-1, 2)
-    certain = (ends[:, 0] < ends[:, 1]) & (doubts[ends[:, 1]] == doubts[ends[:, 0]])
-    loops, ends = [loop for loop, is_certain in zip(loops, certain, strict=True) if is_certain], ends[certain]
-    if len(loops) < _LEAST_LOOPS:
+    refused = np.concatenate(([0], np.cumsum(places.uncertain)))
+    certain = [loop for loop in loops if loop.first < loop.second and refused[loop.first] == refused[loop.second]]
+    if len(certain) < _LEAST_LOOPS:
         return []
-    motions, covariances = motions_by_odometry(session.motions[1:], session.covariances[1:], ends)
-    off = pose_differences(np.array([loop.T_first_second.to_array() for loop in loops]), motions)
-    covariances += np.array([loop.covariance for loop in loops])
-    sigmas = np.sqrt(np.einsum("li,li->l", off, np.linalg.solve(covariances, off[:, :, None])[:, :, 0]))
-    is_far = (sigmas > _UNUSUAL * np.median(sigmas)) & (np.hypot(off[:, 0], off[:, 1]) > _BEYOND_SLIPS_M)
-    return [(loop.first, loop.second) for loop, far in zip(loops, is_far, strict=True) if far]
+    pairs = [(loop.first, loop.second) for loop in certain]
+    motions, covariances = motions_by_steps(places.steps, places.covariances, np.array(pairs, dtype=np.int64))
+    off = pose_differences(np.array([loop.T_first_second.to_array() for loop in certain]), motions)
+    distances = mahalanobis_distances(off, covariances + np.array([loop.covariance for loop in certain]))
+    is_far = (distances > _UNUSUAL * np.median(distances)) & (np.hypot(off[:, 0], off[:, 1]) > _BEYOND_SLIPS_M)
+    return [pair for pair, far in zip(pairs, is_far, strict=True) if far]

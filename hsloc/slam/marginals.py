@@ -36,7 +36,7 @@ FLAT_IN_A_STRETCH_M = 0.014
 """The same where few scans are compared, which see the same walls: it does not average out there as over a map."""
 _SCALE = 0.001
 """Standard deviation of the scale of a map that scans hold: what they get wrong of motions along walls they get wrong
-alike everywhere, as corners look rounder from afar. In eight simulated buildings of 60 to 120 m the scale is off by
+alike everywhere; why is not known. In eight simulated buildings of 60 to 120 m the scale is off by
 0.13 %, in which the noise of the poses is, too."""
 _LEAST_REAL = 0.02
 """Part of the information of a pair, in any direction, that is kept at least: so that it can be inverted."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from hsloc.kernels.normal_equations import Equations, add_edges
 from hsloc.kernels.registration import composed_motions, displaced_agreement, window_motions
-from hsloc.model.pose2 import pose_differences, relative_poses
+from hsloc.model.pose2 import mahalanobis_distances, pose_differences, relative_poses
 from hsloc.slam.joint_registration import normal_equations
 from hsloc.slam.marginals import FLAT_IN_A_STRETCH_M, information_of_a_point
 from hsloc.slam.pose_graph import Edges, anchored
@@ -116,10 +116,9 @@ def compare_with_odometry(refined: Registration, steps: Edges) -> Motions:
     covariances: F64 = np.asarray(np.linalg.inv(steps.information), dtype=np.float64)
     ends = stretch_ends(steps, covariances)
     seen, seen_covariance = motions_by_scans(refined, refined.terms, ends)
-    driven, driven_covariance = motions_by_odometry(steps.measured, covariances, ends)
+    driven, driven_covariance = motions_by_steps(steps.measured, covariances, ends)
     difference = pose_differences(seen, driven)
-    weighed = np.linalg.solve(seen_covariance + driven_covariance, difference[:, :, None])[:, :, 0]
-    return Motions(ends, difference, np.sqrt(np.maximum((difference * weighed).sum(axis=1), 0.0)))
+    return Motions(ends, difference, mahalanobis_distances(difference, seen_covariance + driven_covariance))
 
 
 def motions_by_scans(refined: Registration, terms: PairTerms, ends: I64) -> tuple[F64, F64]:
@@ -130,8 +129,8 @@ def motions_by_scans(refined: Registration, terms: PairTerms, ends: I64) -> tupl
     return motions, covariances
 
 
-def motions_by_odometry(steps: F64, of_steps: F64, ends: I64) -> tuple[F64, F64]:
-    """The same by steps (n - 1, 3) with covariances `of_steps` (n - 1, 3, 3)."""
+def motions_by_steps(steps: F64, of_steps: F64, ends: I64) -> tuple[F64, F64]:
+    """Motions (m, 3) between `ends` (m, 2) by steps (n - 1, 3) of covariances `of_steps` (n - 1, 3, 3); theirs."""
     motions, covariances = np.empty((len(ends), 3)), np.empty((len(ends), 3, 3))
     composed_motions(steps, of_steps, ends, motions, covariances)
     return motions, covariances
@@ -253,7 +252,7 @@ def held_by_the_rest(
     blocks = system.inverse_at(held, off_diagonal, np.concatenate(wanted))
     begins = np.concatenate(([0], np.cumsum([len(each) for each in wanted])))
     covariances: F64 = np.asarray(np.linalg.inv(steps.information), dtype=np.float64)
-    driven, driven_covariance = motions_by_odometry(steps.measured, covariances, ends)
+    driven, driven_covariance = motions_by_steps(steps.measured, covariances, ends)
     for k, (first, last) in enumerate(ends.tolist()):
         own = edges[first:last]
         chain = replace(own, pairs=own.pairs - first)

@@ -23,8 +23,8 @@ from hsloc.slam.result import OdometryErrors
 from hsloc.slam.slips import (
     STRETCHES_DEEP,
     Motions,
-    motions_by_odometry,
     motions_by_scans,
+    motions_by_steps,
     stretch_ends,
     without_slips,
 )
@@ -131,10 +131,10 @@ def _by_stretches(
 ) -> tuple[F64, Motions]:
     """The errors (3,) that stretches show, robustly, and what the motions differ by without them."""
     seen, seen_covariance = motions_by_scans(refined, terms, ends)
-    driven, driven_covariance = motions_by_odometry(steps.measured, covariances, ends)
+    driven, driven_covariance = motions_by_steps(steps.measured, covariances, ends)
     rows = np.empty((len(ends), 3, 3))
     for k, derivative in enumerate(step_derivatives(steps.measured)):
-        moved, _ = motions_by_odometry(steps.measured + _SMALL[k] * derivative, covariances, ends)
+        moved, _ = motions_by_steps(steps.measured + _SMALL[k] * derivative, covariances, ends)
         rows[:, :, k] = pose_differences(moved, driven) / _SMALL[k]
     apart = pose_differences(seen, driven)
     weights = np.linalg.inv(seen_covariance + driven_covariance)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from contextlib import suppress
 from math import inf
 from typing import Any
@@ -12,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_builders import START, make_scan
+from memory import at_most_bytes
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hsloc.errors import LogFormatError
@@ -120,10 +120,8 @@ def test_damaged_payloads_raise_bad_payload_or_give_a_value(data: st.DataObject)
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
     payload = payload[: data.draw(st.integers(0, len(payload)))]
     decoder = decoder_for(channel(name))
-    begin = time.perf_counter()
-    with suppress(Undecodable):
+    with at_most_bytes(1 << 20), suppress(Undecodable):
         decoder(memoryview(bytes(payload)))
-    assert time.perf_counter() - begin < 1.0
 
 
 def test_every_cut_of_a_payload_is_detected() -> None:
@@ -272,11 +270,9 @@ def test_other_encodings_are_not_ours() -> None:
         ("my_msgs/A a\n" + "=" * 80 + "\nMSG: my_msgs/A\nmy_msgs/A a", "ros2msg"),
     ],
 )
-def test_hostile_definitions_are_refused_at_once(text: str, encoding: str) -> None:
-    begin = time.perf_counter()
-    with pytest.raises(LogFormatError, match="/topic: "):
+def test_hostile_definitions_are_refused_without_work(text: str, encoding: str) -> None:
+    with at_most_bytes(1 << 20), pytest.raises(LogFormatError, match="/topic: "):
         decoder_for(channel(definitions.LASER_SCAN, text, encoding))
-    assert time.perf_counter() - begin < 1.0
 
 
 def test_the_strongest_echo_of_each_beam() -> None:

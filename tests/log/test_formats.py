@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
-import time
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from memory import at_most_bytes
 from paths import RECORDINGS
 
 from hsloc.cli.main import main
@@ -177,20 +177,17 @@ def test_json_as_people_write_it() -> None:
     ],
     ids=lambda text: text[:24].decode(errors="replace"),
 )
-def test_hostile_json_is_undecodable_at_once(text: bytes) -> None:
-    begin = time.perf_counter()
-    with pytest.raises(Undecodable):
-        decoder_for(channel("foxglove.LaserScan", "json"))(text)
-    assert time.perf_counter() - begin < 1.0
+def test_hostile_json_is_undecodable_without_work(text: bytes) -> None:
+    decode = decoder_for(channel("foxglove.LaserScan", "json"))
+    with at_most_bytes(1 << 20), pytest.raises(Undecodable):
+        decode(text)
 
 
-def test_hostile_protobuf_is_undecodable_at_once() -> None:
+def test_hostile_protobuf_is_undecodable_without_work() -> None:
     decode = decoder_for(channel("foxglove.FrameTransforms"))
     for data in (b"\x0a\x00" * 20_000, b"\x0a\xff", b"\x0a\x00" * 3_000_000, b"\x0a" * 1000):
-        begin = time.perf_counter()
-        with pytest.raises(Undecodable):
+        with at_most_bytes(1 << 20), pytest.raises(Undecodable):
             decode(data)
-        assert time.perf_counter() - begin < 1.0
 
 
 @settings(max_examples=300)

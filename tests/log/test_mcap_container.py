@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-import time
 import zlib
 from typing import TYPE_CHECKING
 
@@ -13,6 +12,7 @@ import pytest
 import zstandard
 from log_builders import SECOND, START, chunk_data_at, chunks_of, flipped, scan_payloads, write_raw, write_run
 from mcap.writer import CompressionType, IndexType
+from memory import at_most_bytes
 from paths import DATA
 
 from hsloc.errors import LogFormatError
@@ -276,14 +276,13 @@ BIG = 600 << 20
     ],
     ids=range(11),
 )
-def test_bombs_and_absurd_lengths_are_refused_at_once(tmp_path: Path, content: bytes, reason: str) -> None:
+def test_bombs_and_absurd_lengths_are_refused_without_work(tmp_path: Path, content: bytes, reason: str) -> None:
     path = tmp_path / "log.mcap"
     path.write_bytes(HEADER + content + record(0x0F, bytes(4)) + record(0x02, bytes(20)) + MAGIC)
-    begin = time.perf_counter()
-    container = McapContainer(path)
-    losses = container.losses_at_opening.copy()
-    assert list(container.messages(range(100), losses)) == []
-    assert time.perf_counter() - begin < 1.0
+    with at_most_bytes(1 << 20):
+        container = McapContainer(path)
+        losses = container.losses_at_opening.copy()
+        assert list(container.messages(range(100), losses)) == []
     assert losses.damaged_chunks == 1
     assert reason in losses.reasons[0]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from math import pi
 from typing import TYPE_CHECKING
 
@@ -11,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from memory import at_most_bytes
 from PIL import Image
 
 from hsloc.errors import MapError, OutputError
@@ -268,9 +268,7 @@ def yaml_bomb(levels: int = 22) -> str:
     return "\n".join([*lines, "image: map.pgm", ""])
 
 
-def test_a_yaml_bomb_is_refused_at_once(tmp_path: Path) -> None:
+def test_a_yaml_bomb_is_refused_without_work(tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text(yaml_bomb())
-    begin = time.monotonic()
-    with pytest.raises(MapError, match="has a YAML alias"):
+    with at_most_bytes(1 << 20), pytest.raises(MapError, match="has a YAML alias"):
         load_map(tmp_path / "map.yaml")
-    assert time.monotonic() - begin < 2.0

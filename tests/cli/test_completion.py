@@ -6,6 +6,7 @@ import shutil
 import subprocess
 
 import pytest
+from waiting import LIMIT_S
 
 from hsloc.cli.main import COMMANDS, main
 
@@ -17,7 +18,7 @@ def test_every_command_is_known_to_every_shell(capsys: pytest.CaptureFixture[str
     assert all(name in script for name in COMMANDS)
     assert "deskew" in script
     if shutil.which(shell):
-        subprocess.run([shell, "-n"], input=script, text=True, check=True, timeout=120)
+        subprocess.run([shell, "-n"], input=script, text=True, check=True, timeout=LIMIT_S)
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
@@ -32,7 +33,7 @@ def test_bash_completes(capsys: pytest.CaptureFixture[str], words: str, expected
         f"{script}\nCOMP_WORDS=({words}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); COMP_LINE='{words}';"
         "f=$(complete -p hsloc | sed 's/.*-F \\([^ ]*\\).*/\\1/'); $f; printf '%s\\n' \"${COMPREPLY[@]}\""
     )
-    done = subprocess.run(["bash", "-c", asked], capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run(["bash", "-c", asked], capture_output=True, text=True, check=True, timeout=LIMIT_S)
     assert expected <= {word.strip() for word in done.stdout.split()}
 
 

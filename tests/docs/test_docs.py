@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from paths import ROOT
+from waiting import LIMIT_S
 
 from hsloc.cli.main import COMMANDS, build_parser, main
 from hsloc.config import Config, to_dict
@@ -45,7 +46,7 @@ def run_line(line: str, capsys: pytest.CaptureFixture[str]) -> int:
     """A line of a shell; commands of ours in this process, as starting it again takes most of the time."""
     words = shlex.split(line, comments=True)
     if words[0] != "hsloc":
-        return subprocess.run(["bash", "-c", line], check=False, timeout=60).returncode
+        return subprocess.run(["bash", "-c", line], check=False, timeout=LIMIT_S).returncode
     target = None
     if ">" in words:
         target = Path(words[words.index(">") + 1])

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from paths import ROOT
 from ruamel.yaml import YAML
+from waiting import LIMIT_S
 
 from hsloc.version import __version__
 
@@ -25,7 +26,11 @@ def test_the_version_is_in_one_place() -> None:
     assert PYPROJECT["project"]["dynamic"] == ["version"]
     assert PYPROJECT["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "hsloc.version.__version__"}
     done = subprocess.run(
-        [sys.executable, "-m", "hsloc.cli.main", "--version"], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-m", "hsloc.cli.main", "--version"],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=LIMIT_S,
     )
     assert done.stdout == f"hsloc {__version__}\n"
 

@@ -11,6 +11,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 from paths import RECORDINGS, ROOT
+from waiting import LIMIT_S
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -61,7 +62,7 @@ def test_own_matcher(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixt
 def test_the_notebook_runs_from_top_to_bottom() -> None:
     notebook = nbformat.read(EXAMPLES / "compare_matchers.ipynb", as_version=4)
     assert all(not cell.get("outputs") for cell in notebook.cells), "commit it without outputs"
-    NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(EXAMPLES)}}).execute()
+    NotebookClient(notebook, timeout=LIMIT_S, resources={"metadata": {"path": str(EXAMPLES)}}).execute()
     pictures = [
         output for cell in notebook.cells for output in cell.get("outputs", []) if "image/png" in output.get("data", {})
     ]

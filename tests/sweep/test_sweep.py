@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from paths import RECORDINGS
+from processes import in_session
+from waiting import LIMIT_S, until
 
 import hsloc.sweep.runs as sweeping
 from hsloc.cli.main import main
@@ -235,22 +237,20 @@ def test_interrupted_sweeps_keep_what_is_finished(tmp_path: Path, capsys: pytest
         # Whoever runs the tests in the background has interrupts ignored, which children inherit.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
-    limit = time.monotonic() + 60
-    while not (tmp_path / "out" / "office-default-seed0" / "sweep_key.json").exists() and time.monotonic() < limit:
-        time.sleep(0.05)
+    until((tmp_path / "out" / "office-default-seed0" / "sweep_key.json").exists, "the first run is finished")
     os.kill(process.pid, signal.SIGINT)
-    _, stderr = process.communicate(timeout=120)
+    _, stderr = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 130
     assert b"Traceback" not in stderr
     finished = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert "office-default-seed0" in finished
-    assert len(finished) < 20
+    assert len(finished) < 31
     assert all((tmp_path / "out" / name / "metrics.json").exists() for name in finished), finished
     code, out, _ = command(capsys, OFFICE, "--out", tmp_path / "out", "--seeds", "0", "--end", "3", "--json")
     assert (code, json.loads(out)[0]["state"]) == (0, "skipped")
 
 
-@pytest.mark.parametrize("after_s", [1.2, 2.2, 3.5])
+@pytest.mark.parametrize("after_s", [0.0, 1.0, 2.3])
 def test_an_interrupt_ends_a_sweep_with_one_line(tmp_path: Path, after_s: Any) -> None:
     """Workers that were still importing ended in tracebacks of 60 to 97 lines."""
     command = [sys.executable, "-m", "hsloc.cli.main", "sweep", str(OFFICE), str(HALL), "--seeds", "0-9", "--jobs", "2"]
@@ -258,8 +258,9 @@ def test_an_interrupt_ends_a_sweep_with_one_line(tmp_path: Path, after_s: Any) -
         [*command, "--out", str(tmp_path / "out")], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         start_new_session=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )  # fmt: skip
+    until(lambda: len(in_session(process.pid)) > 1, "the first worker is started")
     time.sleep(after_s)
     os.killpg(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=120)
+    _, err = process.communicate(timeout=LIMIT_S)
     assert process.returncode in (130, -signal.SIGINT)  # a shell reports 130 for both
     assert err == "hsloc: interrupted\n"

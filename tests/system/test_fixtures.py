@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from paths import RECORDINGS
+from waiting import LIMIT_S
 
 from hsloc.evaluation import evaluate, read_tum
 from hsloc.export.results_folder import write_results
@@ -144,7 +145,7 @@ def test_the_same_command_writes_the_same_bytes(tmp_path: Path, threads: str) ->
     found = write_results(result("slip"), tmp_path / "here")
     environment = {**os.environ, "NUMBA_NUM_THREADS": threads}
     command = [sys.executable, "-m", "hsloc.cli.main", "replay", str(RECORDINGS / "slip.mcap"), "-q"]
-    subprocess.run([*command, "--out", str(tmp_path / "there")], check=True, env=environment, timeout=120)
+    subprocess.run([*command, "--out", str(tmp_path / "there")], check=True, env=environment, timeout=LIMIT_S)
     names = ["trajectory.tum", "metrics.json", "odometry.tum", "config.yaml", "report.png", "report.html", "run.mcap"]
     same, different, missing = filecmp.cmpfiles(tmp_path / "here", tmp_path / "there", names, shallow=False)
     assert (different, missing) == ([], [])

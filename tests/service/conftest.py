@@ -43,8 +43,8 @@ def make_live(tmp_path: Path) -> Iterator[Callable[..., Live]]:
     made: list[Live] = []
 
     def make(**variables: str) -> Live:
-        made.append(Live(tmp_path, **variables).start())
-        return made[-1]
+        made.append(Live(tmp_path, **variables))
+        return made[-1].start()
 
     yield make
     for each in made:

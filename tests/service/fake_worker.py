@@ -44,6 +44,8 @@ def main() -> int:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         spawn_sleeper(new_session=False)
         spawn_sleeper(new_session=True)  # leaves the process group
+    if word == "held" or (word == "held-first" and folder.name.endswith(".1")):
+        hold(folder, emit)
     if word in ("slow", "ignore-term"):
         seconds = float(rest[0])
         begin = time.monotonic()
@@ -83,7 +85,7 @@ def main() -> int:
         return 0  # but there is no output
     elif word == "nonsense":
         os.write(fd, b"\x00\xff not json\n" + b"x" * (1 << 20))
-        time.sleep(60)
+        time.sleep(600)
     elif word == "mad":  # JSON, of which a part cannot be kept, or read by others
         for text in ("[" * 3000, '["done"]', '"failed"', "1" * 5000, "\xff", '{"phase": 1}'):
             os.write(fd, text.encode("latin-1") + b"\n")
@@ -91,7 +93,7 @@ def main() -> int:
             os.write(fd, f'{{"phase": "\\ud800", "part": {part}, "total": 1, "scans": {part}}}\n'.encode())
         os.write(fd, b'{"phase": "replay", "part": 0.5, "total": 1, "scans": 123456789012345678901234567890}\n')
         os.write(fd, b'{"phase": "\\ud800", "part": 0.5, "total": 1, "scans": 7}\n')
-        time.sleep(1.5)
+        hold(folder, lambda _: None)
         os.write(fd, b'{"failed": "mad\\ud800", "message": "NaN: \\udcff"}\n')
         return 1
     elif word == "mad-end":
@@ -104,7 +106,7 @@ def main() -> int:
         return 0
     elif word == "silent":
         os.close(fd)
-        time.sleep(60)
+        time.sleep(600)
     elif word == "kill-self":
         os.kill(os.getpid(), signal.SIGKILL)
     elif word == "bad-input":
@@ -134,6 +136,15 @@ def main() -> int:
     summary = {"metrics": {"verdict": "check"}, "figures": [figure], "warnings": [warning]}
     emit({"done": {**summary, "data_lost": False, "notes": [], "timings": {}}})
     return 0
+
+
+def hold(folder: Path, emit: Callable[[dict[str, object]], None]) -> None:
+    """Go on when a test says so (`live_service.go_on`), with progress meanwhile."""
+    scans = 0
+    while not (folder / "go on").exists():
+        scans += 1
+        emit({"phase": "replay", "part": scans, "total": 10_000, "scans": scans})
+        time.sleep(0.05)
 
 
 def attack(folder: Path, rest: list[str]) -> dict[str, str]:

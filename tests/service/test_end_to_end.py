@@ -8,7 +8,6 @@ import shutil
 import struct
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -65,7 +64,7 @@ def test_the_result_is_that_of_hsloc_replay_byte_for_byte(
     # It comes first: a job keeps nothing that it compiles.
     subprocess.run([*command, "--out", str(tmp_path / "out")], check=True, cwd=tmp_path)
     job = client.post("/v1/jobs", json={"log": file, **request_}).json()["id"]
-    ended = wait(client, job, 120.0)
+    ended = wait(client, job)
     assert ended["state"] == "succeeded", ended
     names = {each["name"] for each in client.get(f"/v1/jobs/{job}/results").json()["assets"]}
     theirs = {path.name for path in (tmp_path / "out").iterdir()}
@@ -124,21 +123,19 @@ HOSTILE: dict[str, Callable[[], bytes]] = {
 
 
 @pytest.mark.unmeasured
-def test_hostile_files_fail_in_seconds_with_a_reason(make_client: Callable[..., TestClient]) -> None:
-    client = make_client(worker_command=REAL, sandbox="none", job_memory_bytes=2 << 30, slots=2, job_wall_s=30.0)
-    begin = time.monotonic()
+def test_hostile_files_fail_with_a_reason_and_little_work(make_client: Callable[..., TestClient]) -> None:
+    client = make_client(worker_command=REAL, sandbox="none", job_memory_bytes=2 << 30, slots=2, job_cpu_s=60.0)
     jobs = {}
     for name, content in HOSTILE.items():
         jobs[name] = client.post("/v1/jobs", json={"log": upload(client, content(), f"{name}.mcap")}).json()["id"]
     for name, job in jobs.items():
-        ended = wait(client, job, 60.0)
+        ended = wait(client, job)
         assert (ended["state"], ended["reason"]) in (("failed", "invalid_input"), ("failed", "out_of_memory")), (
             name,
             ended,
         )
         assert ended["message"], name
         assert "/data/" not in ended["message"], ended["message"]  # the server's folders are its own business
-    assert time.monotonic() - begin < 60.0
     assert client.get("/healthz").status_code == 200
 
 
@@ -181,7 +178,7 @@ def test_a_map_of_two_uploads_and_a_warning_that_names_it_without_the_servers_fo
     chart = {"yaml": upload(client, yaml, "office.yaml"), "image": upload(client, pixels, "other.pgm")}
     log = upload(client, (RECORDINGS / "paper.mcap").read_bytes(), "paper.mcap")
     job = client.post("/v1/jobs", json={"log": log, "map": chart, "read": {"end_s": 1.0}}).json()["id"]
-    ended = wait(client, job, 120.0)
+    ended = wait(client, job)
     assert ended["state"] == "succeeded", ended
     assert ended["summary"]["metrics"]["run"]["map"] == "office.yaml"
     viewer = client.get(f"/v1/jobs/{job}/results/viewer.json").json()

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 from urllib.request import urlopen
 
 import pytest
-from live_service import Worker, free_port, settings, submit, upload, wait
+from live_service import Worker, free_port, go_on, settings, submit, upload, wait
 from paths import ROOT
 from ruamel.yaml import YAML
+from waiting import LIMIT_S, until
 
 from hsloc.cli.main import build_parser, main
 from hsloc_service.errors import ServiceError
@@ -88,9 +89,7 @@ def test_servers_list_each_other_and_the_dashboard_names_metrics_that_are_there(
     rates = {"requests_per_s": 0.01, "heartbeat_s": 0.1}
     one, other = (make_client(data=fleet.folder / name, slots=3, **rates, **fleet.shared) for name in ("a", "b"))
     context: Any = one.app.state.context  # type: ignore[attr-defined]
-    deadline = time.monotonic() + 20.0
-    while context.servers() < 2 and time.monotonic() < deadline:
-        time.sleep(0.05)
+    until(context.servers, "each server knows of the other", lambda count: count == 2)
     text = one.get("/metrics").text
     assert 'hsloc_workers{kind="server"} 2.0' in text
     assert "hsloc_fleet_slots 6.0" in text
@@ -109,11 +108,11 @@ def test_servers_list_each_other_and_the_dashboard_names_metrics_that_are_there(
 def test_jobs_and_cancellations_at_one_server_reach_another_at_once(
     make_client: Callable[..., TestClient], fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hsloc_service.execution.dispatcher.IDLE_S", 60.0)  # it does not look by itself
+    monkeypatch.setattr("hsloc_service.execution.dispatcher.IDLE_S", 6000.0)  # it does not look by itself
     takes = make_client(data=fleet.folder / "a", slots=0, **fleet.shared)
-    runs = make_client(data=fleet.folder / "b", slots=1, heartbeat_s=30.0, lease_s=60.0, **fleet.shared)
+    runs = make_client(data=fleet.folder / "b", slots=1, heartbeat_s=3000.0, lease_s=6000.0, **fleet.shared)
     wait(runs, submit(runs))  # it listens by now, and has looked for a job in vain
-    job = submit(takes, b"slow 60")
+    job = submit(takes, b"slow 600")
     wait(takes, job, states=("running",))
     takes.post(f"/v1/jobs/{job}/cancel")
     assert wait(takes, job)["state"] == "cancelled"
@@ -130,7 +129,7 @@ def test_an_upload_begun_at_one_server_goes_on_at_the_other_and_a_worker_runs_th
     job = other.post("/v1/jobs", json={"log": file["id"]}).json()["id"]
     port = free_port()
     worker = fleet.worker("--slots", "2", "--metrics", str(port))
-    assert wait(one, job, 60.0)["state"] == "succeeded"
+    assert wait(one, job)["state"] == "succeeded"
     results = [client.get(f"/v1/jobs/{job}/results/trajectory.tum") for client in servers]
     assert results[0].status_code == 200
     assert results[0].content == results[1].content
@@ -140,26 +139,27 @@ def test_an_upload_begun_at_one_server_goes_on_at_the_other_and_a_worker_runs_th
     assert (found["slots"], found["pid"], found["alive"]) == (2, worker.process.pid, True)
 
     # Asked to stop, it begins nothing more, and ends what it runs.
-    job = submit(other, b"slow 1.5")
+    job = submit(other, b"held")
     wait(one, job, states=("running",))
     assert workers_of(one)[0]["jobs"] == [job]
     monkeypatch.setattr("hsloc.client.Client.workers", lambda _: one.get("/v1/workers").json()["workers"])
     assert main(["workers"]) == 0
     line = next(each for each in capsys.readouterr().out.splitlines() if each.startswith("| worker"))
     assert [word.strip() for word in line.split("|")][3:6] == [str(worker.process.pid), "2", "1"]
-    with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10.0) as answer:
+    with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=LIMIT_S) as answer:
         measured = answer.read().decode()
     expected = {'hsloc_jobs_ended_total{state="succeeded"} 1.0', "hsloc_slots 2.0", "hsloc_slots_busy 1.0"}
     assert expected <= set(measured.splitlines())
     assert "hsloc_fleet_slots" not in measured  # which only servers have
     worker.process.send_signal(signal.SIGTERM)
     later = submit(other)
-    assert worker.process.wait(30.0) == 0
+    until(lambda: '"event": "drain"' in worker.log.read_text(), "it has heard that")
+    go_on(worker.log.parent / "data", job)
+    assert worker.process.wait(LIMIT_S) == 0
     assert one.get(f"/v1/jobs/{job}").json()["attempt"] == 1
     assert wait(one, job)["state"] == "succeeded"
     assert one.get(f"/v1/jobs/{later}").json()["state"] == "queued"
     assert workers_of(one) == []
-    assert '"event": "drain"' in worker.log.read_text()
 
     # Deleted, its parts go from the store.
     one.post(f"/v1/jobs/{later}/cancel")
@@ -171,39 +171,35 @@ def test_an_upload_begun_at_one_server_goes_on_at_the_other_and_a_worker_runs_th
 
 def test_a_worker_that_is_killed_or_stands_still_does_not_keep_its_job(servers: list[TestClient], fleet: Fleet) -> None:
     one, other = servers
-    first = fleet.worker(HSLOC_LEASE_S="2")
-    job = submit(one, b"slow 3")
-    wait(other, job, 60.0, states=("running",))
-    second = fleet.worker(HSLOC_LEASE_S="2")
+    first = fleet.worker()
+    job = submit(one, b"held-first")
+    wait(other, job, states=("running",))
+    second = fleet.worker()
     first.process.send_signal(signal.SIGSTOP)  # cut off for longer than its lease
-    ended = wait(other, job, 60.0)
+    ended = wait(other, job)
     assert (ended["state"], ended["attempt"]) == ("succeeded", 2)
     first.process.send_signal(signal.SIGCONT)
     job = submit(one, b"slow 1")
-    assert wait(other, job, 60.0)["state"] == "succeeded"
+    assert wait(other, job)["state"] == "succeeded"
     assert one.get(f"/v1/jobs/{job}/events").text.count('"succeeded"') == 1
-    deadline = time.monotonic() + 20.0
-    while '"state": "lost"' not in first.log.read_text():  # it came back, and threw its work away
-        assert time.monotonic() < deadline, first.log.read_text()
-        time.sleep(0.1)
+    until(lambda: '"state": "lost"' in first.log.read_text(), "it came back, and threw its work away")
     for worker in (first, second):
         assert worker.end() == 0
 
 
 def test_a_job_outlives_a_restart_of_the_database(servers: list[TestClient], fleet: Fleet, postgresql: Server) -> None:
     one, _ = servers
-    worker = fleet.worker(HSLOC_LEASE_S="20")
-    job = submit(one, b"slow 2")
-    wait(one, job, 60.0, states=("running",))
+    worker = fleet.worker(HSLOC_LEASE_S="100")
+    job = submit(one, b"held")
+    wait(one, job, states=("running",))
     postgresql.stop("immediate")
     answer = one.get(f"/v1/jobs/{job}")
     assert (answer.status_code, answer.json()["code"]) == (503, "database")
     time.sleep(1.0)
     postgresql.start()
-    deadline = time.monotonic() + 20.0
-    while (answer := one.get(f"/v1/jobs/{job}")).status_code == 503:
-        assert time.monotonic() < deadline, answer.text
-    ended = wait(one, job, 60.0)
+    until(lambda: one.get(f"/v1/jobs/{job}").status_code, "the database is back", lambda status: status != 503)
+    go_on(worker.log.parent / "data", job)
+    ended = wait(one, job)
     assert (ended["state"], ended["attempt"]) == ("succeeded", 1), worker.log.read_text()
 
 
@@ -344,7 +340,7 @@ def test_uploads_and_results_in_s3(bucket: str, make_client: Callable[..., TestC
     assert len(context.files.parts.of(file)) == 6
     job = other.post("/v1/jobs", json={"log": file}).json()["id"]
     worker = fleet.worker()
-    assert wait(one, job, 60.0)["state"] == "succeeded", worker.log.read_text()
+    assert wait(one, job)["state"] == "succeeded", worker.log.read_text()
     manifest = one.get(f"/v1/jobs/{job}/results").json()["assets"]
     for asset in manifest:
         answer = other.get(f"/v1/jobs/{job}/results/{asset['name']}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from live_service import settings, submit, wait
-from sqlalchemy import insert
+from sqlalchemy import func, insert, select
 from sqlalchemy.exc import OperationalError
 
 from hsloc_service.db.tables import EventRow, FileRow, IdempotencyRow, JobRow
@@ -31,7 +31,7 @@ def test_old_jobs_go_with_results_and_uploads_but_active_ones_stay(make_client: 
     client = make_client(retention_s=100.0)
     old = submit(client)
     wait(client, old)
-    active = submit(client, b"slow 30")
+    active = submit(client, b"slow 600")
     context = client.app.state.context  # type: ignore[attr-defined]
     tidy = Housekeeping(context.database, context.storage, context.settings, context.deletions).tidy
     tidy(time.time() + 50.0)
@@ -132,19 +132,16 @@ def test_retention_of_many_jobs_does_not_delay_requests(make_client: Callable[..
         session.execute(insert(IdempotencyRow), [{"key": each, "job_id": each, **key} for each in ids])
     tidy = Housekeeping(context.database, context.storage, context.settings, context.deletions).tidy
     thread = threading.Thread(target=tidy, args=(time.time(),))
-    waits = []
-    start = time.monotonic()
+    left = set()
     thread.start()
     while thread.is_alive():
-        begin = time.monotonic()
-        with context.database.write():
-            waits.append(time.monotonic() - begin)
+        with context.database.write() as session:
+            left.add(session.scalar(select(func.count()).select_from(JobRow)))
         time.sleep(0.02)
     thread.join()
-    took = time.monotonic() - start
     assert client.get("/v1/jobs").json()["jobs"] == []
     assert client.get("/v1/files").json()["files"] == []
-    assert max(waits) < took / 3  # some 60 batches; as one transaction the longest wait is all of it
+    assert len(left) > 5  # others wrote between its 60 batches
 
 
 @pytest.mark.parametrize(

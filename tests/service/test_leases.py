@@ -8,8 +8,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from live_service import settings, submit, wait
+from live_service import go_on, settings, submit, wait
 from sqlalchemy import text, update
+from waiting import LIMIT_S, until
 
 from hsloc_service.auth import ANYBODY, Principal
 from hsloc_service.db.database import open_database
@@ -182,16 +183,17 @@ def test_tenants_take_turns_in_a_single_slot(parts: Parts) -> None:
 
 
 def test_a_lease_that_a_clock_ended_is_not_taken_from_the_worker_that_runs_the_job(
-    make_client: Callable[..., TestClient],
+    make_client: Callable[..., TestClient], tmp_path: Path
 ) -> None:
     client = make_client(slots=2)
-    job = submit(client, b"slow 3")
+    job = submit(client, b"held")
     wait(client, job, states=("running",))
     database = client.app.state.context.database  # type: ignore[attr-defined]
     for _ in range(10):  # the other slot looks for work all the while
         with database.write() as session:  # what a clock that is set forward does to every lease
             session.execute(update(JobRow).values(lease_until=1.0))
         time.sleep(0.2)
+    go_on(tmp_path / "data", job)
     ended = wait(client, job)
     assert (ended["state"], ended["attempt"]) == ("succeeded", 1)
 
@@ -279,7 +281,7 @@ def test_a_worker_that_stops_while_the_database_is_away_gives_its_job_back(tmp_p
         time.sleep(0.3)
         assert not released.done()
         postgresql.start()
-        released.result(20.0)
+        released.result(LIMIT_S)
     assert parts.jobs.get(ANYBODY, job).state == "queued"
     parts.database.close()
     parts.storage.close()
@@ -352,11 +354,8 @@ def test_a_claim_that_waits_for_a_tenants_share_holds_no_other(tmp_path: Path, p
     leases, database = replace(parts.leases(), max_running=1), parts.database
 
     def wait_for_a_waiting_claim(session: Session) -> None:
-        for _ in range(1000):
-            if session.execute(text("SELECT count(*) FROM pg_locks WHERE NOT granted")).scalar_one():
-                return
-            time.sleep(0.005)
-        pytest.fail("no claim waits")
+        query = text("SELECT count(*) FROM pg_locks WHERE NOT granted")
+        until(lambda: session.execute(query).scalar_one(), "a claim waits")
 
     with ThreadPoolExecutor(1) as executor, database.write() as second:
         database.lock(second, f"running {OTHER.tenant}")
@@ -377,9 +376,9 @@ def test_a_claim_that_waits_for_a_tenants_share_holds_no_other(tmp_path: Path, p
 
 def test_a_reason_is_retried_by_the_policy(parts: Parts) -> None:
     job = parts.submit()
-    policy = RetryPolicy(3, {"signal": 3}, wait_s=0.15)
+    policy = RetryPolicy(3, {"signal": 3}, wait_s=600.0)
     leases = replace(parts.leases(), retries=policy)
-    assert [policy.retried_after_s("signal", k) for k in (1, 2, 3)] == [0.15, 0.3, None]
+    assert [policy.retried_after_s("signal", k) for k in (1, 2, 3)] == [600.0, 1200.0, None]
     assert policy.retried_after_s("exit", 1) is None
     claim = leases.claim("a")
     assert claim is not None
@@ -387,7 +386,8 @@ def test_a_reason_is_retried_by_the_policy(parts: Parts) -> None:
     assert leases.claim("a") is None
     waiting = parts.jobs.get(ANYBODY, job)
     assert (waiting.state, waiting.attempt) == ("queued", 1)
-    time.sleep(0.2)
+    with parts.database.write() as session:  # and now as if that time had passed
+        session.execute(update(JobRow).values(not_before=JobRow.not_before - 600.0))
     claim = leases.claim("a")
     assert claim is not None
     assert claim.attempt == 2

@@ -379,7 +379,7 @@ def test_on_a_phone_in_the_dark_by_keyboard_and_cancel(
 ) -> None:
     live = make_live()
     with live.client() as client:
-        file = upload(client, b"slow 60", NASTY)
+        file = upload(client, b"slow 300", NASTY)
         client.post("/v1/jobs", json={"log": file})
     options = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "color_scheme": "dark"}
     page = open_page(live.url, **options)

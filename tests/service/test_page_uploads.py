@@ -42,7 +42,7 @@ def test_an_upload_survives_a_server_that_drops_it(
     page.goto(live.url)
     page.set_input_files("#log", str(log))
     page.click("#go")
-    page.wait_for_selector("#job-state .succeeded", timeout=60_000)
+    page.wait_for_selector("#job-state .succeeded", timeout=120_000)
     with live.client() as client:
         file = client.get("/v1/files").json()["files"][0]
     assert file["sha256"] == hashlib.sha256(log.read_bytes()).hexdigest()
@@ -83,7 +83,7 @@ def test_an_upload_goes_on_after_a_broken_line_and_after_a_reload(
     page.reload()
     page.set_input_files("#log", str(log))
     page.click("#go")
-    page.wait_for_selector("#job-state .succeeded", timeout=60_000)
+    page.wait_for_selector("#job-state .succeeded", timeout=120_000)
     block = 8 << 20
     assert offsets == [0, block, block, 2 * block, 2 * block, 3 * block, 4 * block]
     with live.client() as client:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 from fastapi.testclient import TestClient
 from live_service import settings, submit, upload, wait
+from waiting import until
 
 from hsloc_service.execution import limits
 from hsloc_service.execution.sandbox import bubblewrap_problem, choose_sandbox
@@ -99,7 +100,7 @@ def digests(folder: Path, kind: str) -> dict[str, str]:
     with TestClient(create_app(settings(folder, sandbox=kind, **changes))) as client:
         log = upload(client, (RECORDINGS / "office.mcap").read_bytes(), "office.mcap")
         job = client.post("/v1/jobs", json={"log": log, "read": {"end_s": 3.0}}).json()["id"]
-        ended = wait(client, job, 120.0)
+        ended = wait(client, job)
         assert ended["state"] == "succeeded", ended
         assets = client.get(f"/v1/jobs/{job}/results").json()["assets"]
     return {asset["name"]: asset["sha256"] for asset in assets if asset["name"] != "timings.json"}
@@ -119,12 +120,9 @@ def test_a_job_in_a_sandbox_computes_the_same(tmp_path: Path, without_sandbox: d
 def test_folders_nested_deeply_end_the_job_and_can_be_removed(tmp_path: Path) -> None:
     with TestClient(create_app(settings(tmp_path, sandbox="none"))) as client:
         job = submit(client, b"nest 3000")
-        ended = wait(client, job, 60.0)
+        ended = wait(client, job)
         assert ended["state"] in ("failed", "succeeded"), ended
-        deadline = time.monotonic() + 60.0
-        while (left := list((tmp_path / "data" / "work").iterdir())) and time.monotonic() < deadline:
-            time.sleep(0.1)
-        assert left == []
+        until(lambda: not list((tmp_path / "data" / "work").iterdir()), "the folder of the attempt is gone")
     deep = tmp_path / "data" / "work" / f"{job}.9"
     deep.mkdir()
     here = os.getcwd()
@@ -169,8 +167,8 @@ def test_where_no_sandbox_can_be_had_the_server_does_not_start(tmp_path: Path, m
 def test_a_job_in_a_sandbox_is_cancelled(make_client: Callable[..., TestClient]) -> None:
     need("bubblewrap")
     client = make_client(sandbox="bubblewrap")
-    job = submit(client, b"ignore-term 60")
+    job = submit(client, b"ignore-term 600")
     wait(client, job, states=("running",))
     time.sleep(0.5)
     client.post(f"/v1/jobs/{job}/cancel")
-    assert wait(client, job, 5.0)["state"] == "cancelled"
+    assert wait(client, job)["state"] == "cancelled"

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from live_service import settings, submit, upload, wait
+from waiting import until
 
 from hsloc.cli.main import main
 from hsloc.sweep.table import COLUMNS
@@ -23,14 +24,12 @@ if TYPE_CHECKING:
     from live_service import Live
 
 
-def ended(client: Any, sweep: str, seconds: float = 30.0) -> dict[str, Any]:
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
+def ended(client: Any, sweep: str) -> dict[str, Any]:
+    def get() -> dict[str, Any]:
         found: dict[str, Any] = client.get(f"/v1/sweeps/{sweep}").json()
-        if found["ended"]:
-            return found
-        time.sleep(0.05)
-    raise AssertionError(f"the sweep goes on: {found}")
+        return found
+
+    return until(get, "the sweep has ended", lambda found: bool(found["ended"]))
 
 
 def test_logs_by_configurations_by_seeds_are_jobs_with_one_table(client: TestClient) -> None:
@@ -79,7 +78,7 @@ def test_logs_by_configurations_by_seeds_are_jobs_with_one_table(client: TestCli
 
 
 def test_a_sweep_is_cancelled_and_deleted_as_a_whole(client: TestClient) -> None:
-    slow = upload(client, b"slow 60")
+    slow = upload(client, b"slow 600")
     sweep = client.post("/v1/sweeps", json={"logs": [slow], "seeds": list(range(5))}).json()["id"]
     wait(client, client.get(f"/v1/sweeps/{sweep}/table").json()["jobs"][0], states=("running",))
     assert client.delete(f"/v1/sweeps/{sweep}").json()["code"] == "active"

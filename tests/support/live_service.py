@@ -9,14 +9,15 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import httpx2 as httpx
 from mcap.reader import make_reader
+from waiting import LIMIT_S, until
 
+from hsloc.client import ENDED
 from hsloc_service.settings import Settings
 
 FAKE = (sys.executable, "-P", str(Path(__file__).parents[1] / "service" / "fake_worker.py"))
@@ -48,19 +49,21 @@ def submit(client: Any, content: bytes = b"ok", **request: Any) -> str:
     return str(answer.json()["id"])
 
 
-def wait(client: Any, job: str, seconds: float = 20.0, states: tuple[str, ...] = ()) -> dict[str, Any]:
-    """The job when it has ended (or is in one of the states).
+def wait(client: Any, job: str, states: tuple[str, ...] = ENDED) -> dict[str, Any]:
+    """The job when it has ended (or is in one of the states)."""
 
-    The longer it takes, the less often it is asked for: a request takes 4 ms of a processor that the job needs.
-    """
-    ends = states or ("succeeded", "failed", "crashed", "cancelled")
-    begin = time.monotonic()
-    while (waited := time.monotonic() - begin) < seconds:
+    def get() -> dict[str, Any]:
         found: dict[str, Any] = client.get(f"/v1/jobs/{job}").json()
-        if found["state"] in ends:
-            return found
-        time.sleep(min(0.03 + 0.1 * waited, 0.5))
-    raise AssertionError(f"job is still {found['state']} after {seconds} s: {found}")
+        return found
+
+    return until(get, f"the job is {' or '.join(states)}", lambda found: found["state"] in states)
+
+
+def go_on(data: Path, job: str) -> None:
+    """Let a job on "held" end: a service on the folder `data` runs it for the first time."""
+    folder = data / "work" / f"{job}.1"
+    until((folder / "job.json").exists, "the job's folder is there")
+    (folder / "go on").touch()
 
 
 def free_port() -> int:
@@ -94,7 +97,7 @@ class Worker:
     def end(self, which: int = signal.SIGTERM) -> int:
         """Send a signal; the exit code."""
         self.process.send_signal(which)
-        return self.process.wait(30.0)
+        return self.process.wait(LIMIT_S)
 
 
 class Live:
@@ -117,27 +120,27 @@ class Live:
                 stdout=log,
                 stderr=log,
             )
-        deadline = time.monotonic() + 60.0  # a machine that runs other tests may be slow
         with self.client() as client:
-            while time.monotonic() < deadline:
-                with contextlib.suppress(httpx.HTTPError):
-                    if client.get("/readyz").status_code == 200:
-                        return self
+
+            def is_ready() -> bool:
+                assert self.process is not None
                 if self.process.poll() is not None:
                     raise RuntimeError(self.log.read_text())
-                time.sleep(0.05)
-        self.process.kill()
-        self.process.wait()
-        raise AssertionError(f"the server did not start: {self.log.read_text()}")
+                with contextlib.suppress(httpx.HTTPError):
+                    return bool(client.get("/readyz").status_code == 200)
+                return False
+
+            until(is_ready, f"the server has started, see {self.log}")
+        return self
 
     def end(self, which: int = signal.SIGTERM) -> int:
         assert self.process is not None
         self.process.send_signal(which)
-        return self.process.wait(20.0)
+        return self.process.wait(LIMIT_S)
 
     def client(self) -> httpx.Client:
         """Without the certificates of authorities, which take longer to load than most tests take."""
-        return httpx.Client(base_url=self.url, timeout=20.0, verify=False)
+        return httpx.Client(base_url=self.url, timeout=LIMIT_S, verify=False)
 
 
 def without_command(name: str, content: bytes) -> Any:

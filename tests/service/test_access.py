@@ -299,7 +299,7 @@ def test_the_address_that_a_client_claims_does_not_count(make_live: Callable[...
     live = make_live(HSLOC_TOKEN="a-token-of-the-operator-0123456789", HSLOC_REFUSALS_PER_S="0.01")
     with live.client() as client:
         statuses = [client.get("/v1/jobs", headers={"X-Forwarded-For": f"10.0.0.{k}"}).status_code for k in range(5)]
-    assert statuses == [401, 401, 429, 429, 429]
+    assert statuses == [401, 429, 429, 429, 429]
 
 
 def test_metrics_and_logs_name_what_operators_ask_for(make_live: Callable[..., Live]) -> None:

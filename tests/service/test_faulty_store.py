@@ -49,6 +49,10 @@ class Faulty(MemoryFileSystem):  # type: ignore[misc]
     """The threads whose call hangs just now."""
     outlasted = False
 
+    @classmethod
+    def _strip_protocol(cls, path: Any) -> Any:
+        return super()._strip_protocol(path.removeprefix("faulty://"))
+
     def _suffer(self, call: str = "") -> None:
         if Faulty.fault == "refuse":
             raise ConnectionError("the bucket does not answer")

@@ -15,6 +15,7 @@ import pytest
 from live_service import Worker, free_port, go_on, settings, submit, upload, wait
 from paths import ROOT
 from ruamel.yaml import YAML
+from sqlalchemy import text
 from waiting import LIMIT_S, until
 
 from hsloc.cli.main import build_parser, main
@@ -111,7 +112,15 @@ def test_jobs_and_cancellations_at_one_server_reach_another_at_once(
     monkeypatch.setattr("hsloc_service.execution.dispatcher.IDLE_S", 6000.0)  # it does not look by itself
     takes = make_client(data=fleet.folder / "a", slots=0, **fleet.shared)
     runs = make_client(data=fleet.folder / "b", slots=1, heartbeat_s=3000.0, lease_s=6000.0, **fleet.shared)
-    wait(runs, submit(runs))  # it listens by now, and has looked for a job in vain
+    database = runs.app.state.context.database  # type: ignore[attr-defined]
+    query = text("SELECT count(*) FROM pg_stat_activity WHERE datname = current_database() AND query LIKE 'LISTEN %'")
+
+    def listening() -> int:
+        with database.read() as session:
+            return int(session.execute(query).scalar_one())
+
+    until(listening, "both servers listen", lambda count: count == 2)
+    wait(runs, submit(runs))  # it has looked for a job in vain
     job = submit(takes, b"slow 600")
     wait(takes, job, states=("running",))
     takes.post(f"/v1/jobs/{job}/cancel")

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 T = TypeVar("T")
-LIMIT_S = 180
+LIMIT_S = 300
 """Far more than anything here takes, also on a machine that is slow and busy. Who passes never waits for it."""
 
 

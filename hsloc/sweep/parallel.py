@@ -25,6 +25,7 @@ from hsloc.sweep.runs import BROKEN, DONE, FAILED, SKIPPED, STOP, Outcome, Sweep
 from hsloc.sweep.table import COLUMNS, rows
 
 if TYPE_CHECKING:
+    import threading
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
@@ -124,10 +125,20 @@ def _start_tracker() -> None:
 class _Pool(ProcessPoolExecutor):
     """Its processes hold back Ctrl-C until `_note_interrupts`: while they import, it would end in a traceback."""
 
+    _manager: threading.Thread | None = None
+
     def submit(self, call: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
         _start_tracker()
         with interrupts_held_back():
             return super().submit(call, *arguments, **named)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Wait also for what an earlier call did not wait for: the executor forgets its thread, and a program that
+        ends while that thread closes its pipe ends in a traceback."""
+        self._manager = getattr(self, "_executor_manager_thread", None) or self._manager
+        super().shutdown(wait, cancel_futures=cancel_futures)
+        if wait and self._manager is not None:
+            self._manager.join()
 
 
 class _OneEach(Executor):

@@ -10,6 +10,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -25,7 +26,7 @@ from hsloc.cli.main import main
 from hsloc.config import Config
 from hsloc.log import ReadOptions
 from hsloc.run_metrics import RunMetrics
-from hsloc.sweep.parallel import sweep_in_processes
+from hsloc.sweep.parallel import _interruptible, _options, _Pool, sweep_in_processes
 from hsloc.sweep.runs import DONE, FAILED, SKIPPED, Outcome, SweepRun, plan, run_key, sweep
 from hsloc.sweep.table import COLUMNS, as_csv, as_json, as_markdown, as_text, rows
 
@@ -248,6 +249,16 @@ def test_interrupted_sweeps_keep_what_is_finished(tmp_path: Path, capsys: pytest
     assert all((tmp_path / "out" / name / "metrics.json").exists() for name in finished), finished
     code, out, _ = command(capsys, OFFICE, "--out", tmp_path / "out", "--seeds", "0", "--end", "3", "--json")
     assert (code, json.loads(out)[0]["state"]) == (0, "skipped")
+
+
+def test_an_interrupted_sweep_ends_with_its_threads() -> None:
+    """One that closed its pipe when the program ended made a traceback now and then."""
+    before = set(threading.enumerate())
+    with pytest.raises(KeyboardInterrupt), _interruptible(_Pool(1, **_options())) as pool:  # noqa: PT012
+        pool.submit(time.sleep, 1.0)
+        raise KeyboardInterrupt
+    left = set(threading.enumerate()) - before
+    assert not [each for each in left if not each.daemon]
 
 
 @pytest.mark.parametrize("after_s", [0.0, 1.0, 2.3])

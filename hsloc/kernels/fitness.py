@@ -103,7 +103,7 @@ def point_scores(packed: F32, points: F32, x: float, y: float, theta: float, sco
 
 
 @njit(cache=True, nogil=True)
-def _median(values: F64) -> float:
+def median(values: F64) -> float:
     """Median of at least one value. With `np.median` a kernel that is loaded from the cache imports SciPy: 0.1 s."""
     ascending = np.sort(values)
     middle: float = 0.5 * (ascending[(len(values) - 1) // 2] + ascending[len(values) // 2])
@@ -168,7 +168,7 @@ def score_with_noise(ranges: F32, range_min: float, range_max: float, increment:
         count += 1
     if count < _FEWEST_TRIPLES:
         return 1.0
-    part = _median(off[:count] / away[:count]) / _NORMAL_QUARTILE
+    part = median(off[:count] / away[:count]) / _NORMAL_QUARTILE
     total, kept = 0.0, 0
     for i in range(count):
         if off[i] < _EDGE * max(part * away[i], _LEAST_NOISE_M):
@@ -196,7 +196,7 @@ def range_noise(ranges: F32, range_min: float, range_max: float, increment: floa
     noise[:] = 0.0
     if count < _FEWEST_TRIPLES:
         return
-    part = _median(parts[:count]) / _NORMAL_QUARTILE
+    part = median(parts[:count]) / _NORMAL_QUARTILE
     for i in range(n):
         if off[i] >= _EDGE * max(part * np.float64(ranges[i]), _LEAST_NOISE_M):
             off[i] = 0.0

@@ -101,7 +101,7 @@ def _improvise(memory: F64, low: F64, high: F64, par: float, bw: F64, hmcr: floa
 
 @njit(cache=True, nogil=True)
 def _least(values: F64) -> int:
-    """Index of the first of the least values, without `np.argmin` for the reason of `fitness._median`."""
+    """Index of the first of the least values, without `np.argmin` for the reason of `fitness.median`."""
     least = 0
     for i in range(1, len(values)):
         if values[i] < values[least]:

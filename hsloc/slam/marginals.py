@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 _VARIANCES = 4.0
 """Variances of a point in the variance of a paired point: a pair compares each wall twice, from either side, with the
 same noise, and the noise of both scans is in it."""
-_FLAT_M = 0.008
+_FLAT_M = 0.0055
 """Standard deviation (m) of a wall from the line that is fitted to it, where it bends or ends, however good the lidar.
-Of 60 simulated drives in random worlds (benchmarks/README.md) with noise of 1, 2 and 3 cm the normalised error squared
-is 2.9, 3.1 and 3.6 with it; with 10 mm it is 2.4, 2.9 and 3.4, and 60 % of the poses are within what 50 % should be."""
+Chosen with `_SCALE`: of 60 simulated drives in random worlds and ten in large buildings (benchmarks/README.md) the
+normalised error squared is 3.1 and 2.6 with 6 mm and 0.07 %, 3.5 and 3.1 with 5 mm and 0.05 %."""
 FLAT_IN_A_STRETCH_M = 0.014
 """The same where few scans are compared, which see the same walls: it does not average out there as over a map."""
-_SCALE = 0.001
+_SCALE = 0.0006
 """Standard deviation of the scale of a map that scans hold: what they get wrong of motions along walls they get wrong
-alike everywhere; why is not known. In eight simulated buildings of 60 to 120 m the scale is off by
-0.13 %, in which the noise of the poses is, too."""
+alike everywhere. In ten simulated buildings of 60 to 120 m the scale is off by 0.08 %, in which the noise of the poses
+is, too."""
 _LEAST_REAL = 0.02
 """Part of the information of a pair, in any direction, that is kept at least: so that it can be inverted."""
 _NOISES = np.geomspace(0.003, 0.1, 60)

@@ -134,7 +134,7 @@ def corridor(noise: float) -> tuple[KeyScans, NDArray[np.float64]]:
     kept = []
     for seed, pose in enumerate(poses):
         scan = room_scan(pose, beams=361, noise=noise, seed=seed)
-        walls = np.abs((pose @ scan.points_base())[:, 1] - 2.0) > 1.9
+        walls = np.abs((pose @ scan.points_base())[:, 1] - 2.0) > 1.999 - 3.0 * noise
         kept.append(KeyScan.of(replace(scan, ranges=np.where(walls, scan.ranges, np.nan).astype(np.float32))))
     return KeyScans.from_scans(kept), poses[0].between(poses[1]).to_array()
 

@@ -26,6 +26,9 @@ _ROUGHEST_M = 0.06
 """Largest standard deviation (m) of hits from their line. Internal: more is a hedge or a heap; twice a poor lidar's."""
 _THICKEST = 0.08
 """Largest variance across a line as a part of that along it. Internal: less says no direction."""
+_ROUGH_M = 0.03
+"""Largest standard deviation (m) of hits from their line where no side is straight. Internal: as of the noise of a poor
+lidar; clutter bends as much, and holds scans together where there is nothing else."""
 _BENT = 2.5
 """Hits that are farther from their line than the noise of ranges makes them, by this factor, are not of one wall.
 Internal: of four hits with Gaussian noise one set in 500."""
@@ -131,9 +134,9 @@ def fit_surfels(
     The neighbours are those within `radius` metres, and at least two on either side, as long as the wall goes on:
     no gap between two beams longer than a wall seen at a grazing angle would leave (`spacing` is the angle between
     beams in rad). Where they are not straight within the noise of the ranges, which the scan itself shows, those on
-    one side are taken, three at least; a hit without a straight neighbourhood gets the normal (0, 0). A line around a
-    corner, with its few hits on either side, lies elsewhere from each place: steps along corridors came out 0.3 mm too
-    long by it, with ranges without any noise.
+    one side are taken, three at least, and in clutter, where these are not straight either, all as long as they are
+    near the line; else the hit gets the normal (0, 0). A line around a corner, with its few hits on either side, lies
+    elsewhere from each place: steps along corridors came out millimetres too long by it, whatever the noise.
     """
     n = len(points)
     line = Line(np.empty(2), np.empty(2), np.empty(3))
@@ -157,7 +160,8 @@ def fit_surfels(
         if spread[i, 0] <= _limit(spread[i], constant, slope):
             continue
         best = np.inf
-        normals[i] = np.float32(0.0)
+        if not spread[i, 0] <= _ROUGH_M**2:  # NaN: there is no line
+            normals[i] = np.float32(0.0)
         for side in range(2):
             if not _fit_line(points, beams, i, (3 - 3 * side, 3 * side), spacing, radius, origin, line):
                 continue

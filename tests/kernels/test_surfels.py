@@ -111,7 +111,7 @@ def test_a_line_is_of_one_wall_also_beside_corners(noise: float, within_deg: flo
     cosines = (normals * true).sum(axis=1)[inside]
     assert cosines.min() > np.cos(np.radians(within_deg))
     off = ((points - centroids) * true).sum(axis=1)[inside]
-    assert np.abs(off).max() < 0.005 + 4.0 * noise
+    assert np.abs(off).max() < surfels._BENT * surfels._UNEVEN_M + 4.0 * noise
 
 
 def plain_line(points: NDArray[np.float64], i: int, least: tuple[int, int]) -> tuple[NDArray[np.float64], ...] | None:
@@ -162,8 +162,9 @@ def test_lines_are_those_of_the_plain_version(noise: float) -> None:
         if line is None or bend(line[2]) > 1.0:
             sides = [plain_line(points, i, least) for least in ((3, 0), (0, 3))]
             straight = [side for side in sides if side is not None and bend(side[2]) <= 1.0]
-            line = min(straight, key=lambda side: bend(side[2]), default=None)
-            one_sided += line is not None
+            one_sided += len(straight) > 0
+            kept = [line] if line is not None and line[2][0] <= 0.03**2 else []
+            line = min(straight, key=lambda side: bend(side[2]), default=None) or next(iter(kept), None)
         if line is None:
             assert (normals[i] == 0.0).all()
             continue

@@ -23,6 +23,8 @@ from hsloc.request import RunRequest
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
 pytestmark = pytest.mark.unmeasured
 
 
@@ -125,14 +127,32 @@ def test_freiburg_is_not_built_twice(data: Path) -> None:
     [
         ("aces/aces.clf.gz", "aces/aces.rbpf.txt", 0.12),
         ("seattle/seattle.clf.gz", "seattle/seattle.gfs.ref.txt", 0.10),
-        ("orebro/orebro.clf.gz", "orebro/orebro.gfs.ref.txt", 0.20),
     ],
 )
 @pytest.mark.parametrize("seed", [0, 1])
 def test_sparse_logs_are_mapped_whatever_the_seed(data: Path, log: str, reference: str, rmse: float, seed: int) -> None:
-    """One scan in 0.7 to 0.9 m; in Seattle's odometry a turn is missing, Orebro was a lottery over seeds."""
+    """One scan in 0.7 to 0.9 m; in Seattle's odometry a turn is missing."""
     found = run(RunRequest(logs=(data / log,), seed=seed))
-    expected = np.loadtxt(data / reference)
+    assert rmse_of(found, np.loadtxt(data / reference)) <= rmse
+
+
+def rmse_of(found: Result, expected: NDArray[np.float64]) -> float:
+    """Of the positions (m) against rows (time, x, y, ...), aligned."""
     poses = found.trajectory.interpolated(np.round(expected[:, 0] * 1e9).astype(np.int64))
     moved = umeyama(expected[:, 1:3], poses[:, :2]) @ poses[:, :2]
-    assert np.sqrt((np.hypot(*(moved - expected[:, 1:3]).T) ** 2).mean()) <= rmse
+    return float(np.sqrt((np.hypot(*(moved - expected[:, 1:3]).T) ** 2).mean()))
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("seed", [0, 1])
+def test_orebro_is_right_or_names_the_step_that_two_poses_fit(data: Path, seed: int) -> None:
+    """At 213 s two poses 0.25 m apart explain as many points, and by the seed the map has one or the other."""
+    found = run(RunRequest(logs=(data / "orebro" / "orebro.clf.gz",), seed=seed))
+    rmse = rmse_of(found, np.loadtxt(data / "orebro" / "orebro.gfs.ref.txt"))
+    assert rmse <= 0.45
+    assert found.mapping is not None
+    evidence = found.mapping.evidence
+    assert evidence.verdict == "check"
+    if rmse > 0.20:
+        (unobserved,) = (reason for reason in evidence.reasons if reason.code == "unobserved")
+        assert any(first <= 213.0 <= last for first, last in unobserved.times_s)

@@ -141,8 +141,6 @@ def fit_surfels(
     n = len(points)
     line = Line(np.empty(2), np.empty(2), np.empty(3))
     spread = np.full((n, 3), np.nan)
-    lines = np.empty(n, dtype=np.int64)
-    fitted = 0
     for i in range(n):
         normals[i] = np.float32(0.0)
         centroids[i] = points[i]
@@ -151,11 +149,10 @@ def fit_surfels(
                 normals[i, k] = line.normal[k]
                 centroids[i, k] = line.centroid[k]
             spread[i] = line.spread
-            lines[fitted] = i
-            fitted += 1
-    if fitted < _FEWEST_LINES:
+    known = spread[~np.isnan(spread[:, 0])]
+    if len(known) < _FEWEST_LINES:
         return
-    constant, slope = _range_variance(spread[lines[:fitted]])
+    constant, slope = _range_variance(known)
     for i in range(n):
         if spread[i, 0] <= _limit(spread[i], constant, slope):
             continue
@@ -177,7 +174,10 @@ def fit_surfels(
 def _fit_line(
     points: F32, beams: I32, i: int, least: tuple[int, int], spacing: float, radius: float, origin: F64, line: Line
 ) -> bool:
-    """Write the `line` of hit i and those before and after it, so many at `least` (0: none); False if there is none."""
+    """Write the `line` of hit i and of those before and after it; False if there is none.
+
+    `least` are the numbers of hits that are taken on either side however far they are; where it is 0 none are.
+    """
     n = len(points)
     x0 = np.float64(points[i, 0])
     y0 = np.float64(points[i, 1])

@@ -12,7 +12,6 @@ from rosbags.highlevel import AnyReader
 from hsloc.analysis.analyse import analyse
 from hsloc.cli.main import main
 from hsloc.evaluation import Statistics, evaluate, evaluate_relations, read_relations
-from hsloc.evaluation.alignment import umeyama
 from hsloc.export.results_folder import write_results
 from hsloc.log import LogWriter, ReadOptions, open_log
 from hsloc.maps import load_map
@@ -22,8 +21,6 @@ from hsloc.request import RunRequest
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
 pytestmark = pytest.mark.unmeasured
 
@@ -132,23 +129,16 @@ def test_freiburg_is_not_built_twice(data: Path) -> None:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_sparse_logs_are_mapped_whatever_the_seed(data: Path, log: str, reference: str, rmse: float, seed: int) -> None:
     """One scan in 0.7 to 0.9 m; in Seattle's odometry a turn is missing."""
-    found = run(RunRequest(logs=(data / log,), seed=seed))
-    assert rmse_of(found, np.loadtxt(data / reference)) <= rmse
-
-
-def rmse_of(found: Result, expected: NDArray[np.float64]) -> float:
-    """Of the positions (m) against rows (time, x, y, ...), aligned."""
-    poses = found.trajectory.interpolated(np.round(expected[:, 0] * 1e9).astype(np.int64))
-    moved = umeyama(expected[:, 1:3], poses[:, :2]) @ poses[:, :2]
-    return float(np.sqrt((np.hypot(*(moved - expected[:, 1:3]).T) ** 2).mean()))
+    assert ape(run(RunRequest(logs=(data / log,), seed=seed, reference=str(data / reference)))).rmse <= rmse
 
 
 @pytest.mark.data
 @pytest.mark.parametrize("seed", [0, 1])
 def test_orebro_is_right_or_names_the_step_that_two_poses_fit(data: Path, seed: int) -> None:
     """At 213 s two poses 0.25 m apart explain as many points, and by the seed the map has one or the other."""
-    found = run(RunRequest(logs=(data / "orebro" / "orebro.clf.gz",), seed=seed))
-    rmse = rmse_of(found, np.loadtxt(data / "orebro" / "orebro.gfs.ref.txt"))
+    log, reference = data / "orebro" / "orebro.clf.gz", data / "orebro" / "orebro.gfs.ref.txt"
+    found = run(RunRequest(logs=(log,), seed=seed, reference=str(reference)))
+    rmse = ape(found).rmse
     assert rmse <= 0.45
     assert found.mapping is not None
     evidence = found.mapping.evidence
@@ -156,3 +146,4 @@ def test_orebro_is_right_or_names_the_step_that_two_poses_fit(data: Path, seed: 
     if rmse > 0.20:
         (unobserved,) = (reason for reason in evidence.reasons if reason.code == "unobserved")
         assert any(first <= 213.0 <= last for first, last in unobserved.times_s)
+        pytest.xfail(f"rmse {rmse:.2f} m, where 0.20 m in every seed is the aim")

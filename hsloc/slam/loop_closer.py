@@ -17,6 +17,7 @@ import numpy as np
 from hsloc.errors import MapError
 from hsloc.kernels.normal_equations import path_lengths
 from hsloc.model.pose2 import Pose2, relative_poses
+from hsloc.slam.loop_groups import corroborated
 from hsloc.slam.loop_matcher import Loop, LoopMatcher
 from hsloc.slam.pose_graph import Edges, edge_errors, solve_edges
 
@@ -103,9 +104,10 @@ class LoopCloser:
             self._accepted = None
         self._found[pair] = loop
 
-    def close(self, progress: Callable[[float], None] | None = None) -> None:
+    def close(self, progress: Callable[[float], None] | None = None, with_corroborated: bool = False) -> None:
         """Visit all places in their order, and again as long as loops are found or refused.
 
+        `with_corroborated`: accept loops that only look through walls, if others bear them out.
         Raises MapError if the scans of two places disagree that are asserted to be one.
         """
         for old, place in sorted(self._asserted):
@@ -120,6 +122,7 @@ class LoopCloser:
                     progress((sweep + (place + 1) / len(self._places)) / _SWEEPS)
             if self._unsolved:
                 self.solve()
+            found += self._believe_corroborated() if with_corroborated else 0
             torn = self._tear()
             if found == 0 and torn == 0:
                 break
@@ -168,6 +171,18 @@ class LoopCloser:
             if self._contradict(new):
                 self.solve()
         return len(new)
+
+    def _believe_corroborated(self) -> int:
+        """Accept the loops that only look through walls and that others bear out; returns how many."""
+        found = 0
+        for loop in corroborated(self.loops, self._places):
+            if not self._is_forbidden(loop.first, loop.second):
+                again = self._matcher.corroborated(loop)
+                self._note(again)
+                found += again.accepted
+        if found > 0:
+            self.solve()
+        return found
 
     def _assert(self, old: int, place: int) -> None:
         """Measure a loop that the user asserts: that another pose would fit as well is decided by that."""

@@ -8,7 +8,7 @@ same there is one). Only points count that both places could see: two half-plane
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import ceil, radians
 from typing import TYPE_CHECKING
 
@@ -112,6 +112,13 @@ class Loop:
     reason: str = ""
     is_ambiguous: bool = False
     """Whether it was refused for another pose that fits about as well, and for nothing else."""
+    centre: Pose2 | None = None
+    """The middle of the window, where it was refused for looking through walls that others may bear out."""
+
+    @property
+    def looks_through(self) -> bool:
+        """Whether it was refused for looking through walls, by far fewer points than lie on walls, and nothing else."""
+        return self.centre is not None
 
 
 _CACHED = 48
@@ -123,6 +130,8 @@ _COMPARED_SCANS = 5
 _REGISTRATION = RegistrationParameters((0.5, 0.4, 0.3), 0.33, 1.0 / (0.02**2 * 20.0 * _COMPARED_SCANS), np.inf, 5)
 """Wider gates than from scan to scan: within a place the front end has drifted. Each wall is seen by all scans of a
 place, so that their points count once."""
+_CORROBORATED = 0.6
+"""Consistency from which on a loop may be borne out by others: that of second visits of which a map says nothing."""
 _VISITS = 3_000_000
 """Bounds computed for a window before it counts as ambiguous."""
 
@@ -157,35 +166,51 @@ class LoopMatcher:
         """The loop that is found from the pose `start` on, and whether it is accepted."""
         p = self._parameters
         half, half_angle = window
-        likelihood, pooled = self._field(first)
-        points = self._cloud(second)
         prior = np.diag((1.0 / half**2, 1.0 / half**2, 1.0 / half_angle**2)) * p.sigmas**2
         pose, information, paired, conflict = self._registered(first, second, start, centre, prior)
         if start.distance(pose) > p.distinct_distance:
             pose = start
-        fitness = likelihood.fitness(points, pose)
+        fitness = self._field(first)[0].fitness(self._cloud(second), pose)
         consistency = paired / (paired + conflict) if paired > 0.0 else 0.0
-        rival, reason = float("nan"), ""
+        rival, reason, kept = float("nan"), "", None
         if fitness < p.min_fitness:
             reason = f"fitness {fitness:.2f} below {p.min_fitness:.2f}"
         elif paired < p.min_paired:
             reason = f"only {100.0 * paired:.0f} % of the points lie on walls of the other place"
         elif consistency < p.min_consistency:
             reason = f"{100.0 * conflict:.0f} % of the points lie where the other place saw free space"
+            kept = centre if consistency >= _CORROBORATED else None
         else:
-            rival = self._rival(points, likelihood, pooled, pose, centre, half, half_angle)
-            limit = p.max_rival if fitness >= p.high_fitness else p.max_rival_low
-            if not rival <= limit:
-                reason = f"ambiguous: another pose reaches {100.0 * rival:.0f} % of the fitness"
-            elif half > p.wide and fitness * (1.0 - rival) < p.min_margin:
-                reason = f"ambiguous in a wide window: fitness {fitness:.2f}, another pose {100.0 * rival:.0f} % of it"
+            rival = self._rival(first, second, pose, centre, window)
+            reason = self._ambiguity(fitness, rival, half)
         edge = np.diag((p.sigma_edge**2, p.sigma_edge**2, p.sigma_edge_angle**2))
         covariance: F64 = np.asarray(np.linalg.inv(information + prior), dtype=np.float64) + edge
         # Another pose is looked for only where nothing else speaks against the loop.
         is_ambiguous = bool(reason) and rival == rival
         return Loop(
-            first, second, pose, covariance, fitness, rival, conflict, paired, window, not reason, reason, is_ambiguous
-        )
+            first, second, pose, covariance, fitness, rival, conflict, paired, window, not reason, reason, is_ambiguous,
+            kept,
+        )  # fmt: skip
+
+    def corroborated(self, loop: Loop) -> Loop:
+        """A loop that only looks through walls, and that others bear out: accepted if no other pose comes near to it.
+
+        In a wide window a single place asks for a margin; here others lead to the same pose.
+        """
+        assert loop.centre is not None
+        rival = self._rival(loop.first, loop.second, loop.T_first_second, loop.centre, loop.window)
+        reason = self._ambiguity(loop.fitness, rival, 0.0)
+        return replace(loop, rival=rival, accepted=not reason, reason=reason, is_ambiguous=bool(reason), centre=None)
+
+    def _ambiguity(self, fitness: float, rival: float, half: float) -> str:
+        """Why a loop is refused for another pose in a window of that half-width (m); empty if it is not."""
+        p = self._parameters
+        limit = p.max_rival if fitness >= p.high_fitness else p.max_rival_low
+        if not rival <= limit:
+            return f"ambiguous: another pose reaches {100.0 * rival:.0f} % of the fitness"
+        if half > p.wide and fitness * (1.0 - rival) < p.min_margin:
+            return f"ambiguous in a wide window: fitness {fitness:.2f}, another pose {100.0 * rival:.0f} % of it"
+        return ""
 
     def _registered(
         self, first: int, second: int, start: Pose2, centre: Pose2, prior: F64
@@ -254,18 +279,11 @@ class LoopMatcher:
         own, _ = best_on_lattice(pooled[:1], few, finer, nowhere, 0.0, _VISITS, np.empty(3))
         return float(own)
 
-    def _rival(
-        self,
-        points: F64,
-        likelihood: LikelihoodField,
-        pooled: F32,
-        pose: Pose2,
-        centre: Pose2,
-        half: float,
-        half_angle: float,
-    ) -> float:
-        """The best lattice pose distinct from `pose`, as a part of the best one near it."""
+    def _rival(self, first: int, second: int, pose: Pose2, centre: Pose2, window: tuple[float, float]) -> float:
+        """The best lattice pose in the window distinct from `pose`, as a part of the best one near it."""
         p = self._parameters
+        half, half_angle = window
+        points, (likelihood, pooled) = self._cloud(second), self._field(first)
         few, here, step = self._few(points, likelihood), likelihood.to_cells(pose), 2.0 * p.resolution / p.scan_range
         cell, own = likelihood.resolution, self._fitness_at(here, few, pooled)
         if own <= 0.0:

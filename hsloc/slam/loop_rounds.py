@@ -43,16 +43,23 @@ _BEYOND_SLIPS_M = 2.0
 
 
 def close_loops(
-    session: MapSession, parameters: GraphMapperParameters, rng: Generator, progress: Callable[[float], None]
+    session: MapSession,
+    parameters: GraphMapperParameters,
+    rng: Generator,
+    progress: Callable[[float], None],
+    with_corroborated: bool = False,
 ) -> tuple[F64, list[Loop], Edges]:
-    """Poses (n, 3) of the keyscans with all loops closed, the loops, and those accepted as edges between keyscans."""
+    """Poses (n, 3) of the keyscans with all loops closed, the loops, and those accepted as edges between keyscans.
+
+    `with_corroborated` as in `LoopCloser.close`.
+    """
     p, places, forbidden = parameters.loops, session.places, session.forbidden
     odometry = compose_steps(session.steps.measured) if parameters.use_odometry else None
     for rounds_left in range(_MOST_ROUNDS - 1, -1, -1):
         closer = LoopCloser(
             places, session.scans, p, rng, session.known, session.first_place, session.asserted, forbidden
         )
-        closer.close(progress)
+        closer.close(progress, with_corroborated)
         edges = loop_edges(closer.accepted, places.reference, p.robust)
         poses = solve_edges(places.expand(closer.poses), Edges.concatenate([session.chain, edges]))
         # Across the gap between two logs nothing was driven.

@@ -19,6 +19,7 @@ from hsloc.matching.likelihood_field import LikelihoodField
 from hsloc.model.pose2 import IDENTITY, Pose2, compose_poses, relative_poses, wrap_angles
 from hsloc.slam.keyscans import KeyScans
 from hsloc.slam.loop_closer import LoopCloser
+from hsloc.slam.loop_groups import corroborated, open_steps
 from hsloc.slam.loop_rounds import close_loops
 from hsloc.slam.map_extension import AROUND, LOOKED, loops_of_most, places_on_map
 from hsloc.slam.map_session import between_places
@@ -37,11 +38,10 @@ if TYPE_CHECKING:
     from hsloc.slam.pose_graph import Edges
 
     F64 = NDArray[np.float64]
+    I64 = NDArray[np.int64]
 
 JOINED = "joins pieces"
 """The reason of a loop by which a piece was found."""
-_LOOPS = 2
-"""Loops that hold a step which the scans refused; a single one shares out the errors of what it spans."""
 _LEAST_M = 9.0
 """Length of a piece [m] that is searched for: three places."""
 _MOST_PIECES = 4
@@ -69,19 +69,27 @@ _INCONSISTENT, _INCONSISTENT_M = 0.6, 1.0
 def close_and_join(
     session: MapSession, parameters: GraphMapperParameters, rng: Generator, progress: Callable[[float], None]
 ) -> tuple[MapSession, F64, list[Loop], Edges]:
-    """The session with its loops closed: see `close_loops`; pieces that nothing holds are searched for on the map."""
+    """The session with its loops closed: see `close_loops`; pieces that nothing holds are searched for on the map.
+
+    Those that are not found there are held by loops that look through walls, if several places bear these out and the
+    map does not contradict them.
+    """
     poses, loops, edges = close_loops(session, parameters, rng, progress)
     # Of a map that is extended, or followed while the log is read, it is known how its parts lie.
     if session.first > 0 or session.ties:
         return session, poses, loops, edges
     joined = _join_pieces(session, poses, loops, parameters, rng)
-    if joined is None:
-        return session, poses, loops, edges
-    again, loops_again, edges_again = close_loops(joined, parameters, rng, progress)
-    accepted = [loop for loop in loops_again if loop.accepted]
-    held = all(any(_spans(loop, joined, joint) for loop in accepted) for joint in joined.joints)
-    if held and _is_likelier(joined, again, poses, parameters):
-        return joined, again, loops_again, edges_again
+    if joined is not None:
+        again, loops_again, edges_again = close_loops(joined, parameters, rng, progress)
+        accepted = [loop for loop in loops_again if loop.accepted]
+        held = all(any(_spans(loop, joined, joint) for loop in accepted) for joint in joined.joints)
+        if held and _is_likelier(joined, again, poses, parameters):
+            return joined, again, loops_again, edges_again
+    if corroborated(loops, session.places):
+        again, loops_again, edges_again = close_loops(session, parameters, rng, progress, with_corroborated=True)
+        pieces = replace(session, joints=tuple(_open_steps(session, loops).tolist()))
+        if not _is_contradicted(pieces, again, parameters):
+            return session, again, loops_again, edges_again
     return session, poses, loops, edges
 
 
@@ -203,19 +211,18 @@ def _join_pieces(
     return replace(joined, known=(*joined.known, *of_keyscans))
 
 
+def _open_steps(session: MapSession, loops: list[Loop]) -> I64:
+    """Keyscans at which runs of steps begin that the scans refused and only odometry holds."""
+    reference = session.places.reference
+    accepted = [(int(reference[loop.first]), int(reference[loop.second])) for loop in loops if loop.accepted]
+    is_open = open_steps(session.refused[1:], accepted)
+    # A run of refused steps begins where the robot was carried: until there is a new local map nothing fits.
+    return 1 + np.flatnonzero(is_open & ~np.concatenate(([False], is_open[:-1])))
+
+
 def _long_pieces(session: MapSession, poses: F64, loops: list[Loop]) -> list[range]:
     """Keyscans between steps that only odometry holds, of pieces long enough, in the order of time."""
-    n = len(poses)
-    change = np.zeros(n + 1, dtype=np.int64)
-    reference = session.places.reference
-    for loop in loops:
-        if loop.accepted:
-            change[reference[loop.first] + 1] += 1
-            change[reference[loop.second] + 1] -= 1
-    is_open = session.refused & (np.cumsum(change)[:n] < _LOOPS)
-    # A run of refused steps begins where the robot was carried: until there is a new local map nothing fits.
-    begins = is_open & ~np.concatenate(([False], is_open[:-1]))
-    starts = np.unique(np.concatenate(([0], np.flatnonzero(begins), [n])))
+    starts = np.unique(np.concatenate(([0], _open_steps(session, loops), [len(poses)])))
     way = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))))
     pieces = [range(a, b) for a, b in pairwise(starts.tolist())]
     length = {piece: float(way[piece.stop - 1] - way[piece.start]) for piece in pieces}

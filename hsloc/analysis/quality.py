@@ -285,7 +285,7 @@ def _of_the_map(mapping: MappingResult, result: Result) -> list[VerdictReason]:
 def _map_remedy(code: str, result: Result) -> str:
     if code in {"blind", "no-returns"}:
         return _RANGES_REMEDY
-    if code == "relocated":
+    if code in {"relocated", "record-gap"}:
         return "look at the places on the map; where it is wrong, --forbid-loop T1,T2, or cut the log (--start, --end)"
     if code == "uncertain":
         return "add a drive that joins far places another way (hsloc merge), or hold the map to a plan (--align-to)"

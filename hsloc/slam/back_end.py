@@ -13,7 +13,7 @@ from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import Pose2, relative_poses
 from hsloc.slam.calibration import OdometryCalibration
 from hsloc.slam.displaced import mended
-from hsloc.slam.evidence import Recorded, nothing_seen, weigh
+from hsloc.slam.evidence import nothing_seen, weigh
 from hsloc.slam.loop_closer import TORN, loop_edges
 from hsloc.slam.map_extension import connect, unconnected
 from hsloc.slam.map_session import LEFT_THE_MAP
@@ -23,6 +23,7 @@ from hsloc.slam.occupancy_mapper import build_grid
 from hsloc.slam.open_joints import close_and_join
 from hsloc.slam.plan_alignment import find_on_plan
 from hsloc.slam.pose_graph import Edges, PoseGraph, compose_steps, edge_errors
+from hsloc.slam.recorded import Recorded
 from hsloc.slam.refinement import near_the_end, refine_map, refine_with_calibration
 from hsloc.slam.result import MappingQuality, MappingResult
 from hsloc.slam.slips import compare_with_odometry, held_by_the_rest, known_by_scans, without_slips
@@ -237,6 +238,7 @@ def _recorded(
         loops=accepted,
         torn=ends[[loop.reason.startswith(TORN) for loop in loops]][chi > _CONTRADICTED],
         joints=np.array(gathered.joints, dtype=np.int64),
+        after_gaps=np.array(gathered.after_gaps, dtype=np.int64),
         no_return_share=float(np.isposinf(ranges).sum()) / measured,
         stretches=repaired.stretches,
         held=repaired.held,

@@ -8,8 +8,6 @@ contradicted, stretches driven without seeing a wall.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import erfc
 from statistics import NormalDist
 from typing import TYPE_CHECKING
 
@@ -18,68 +16,16 @@ import numpy as np
 from hsloc.model.pose2 import relative_poses, wrap_angles
 from hsloc.model.verdict import counted, spans_of
 from hsloc.slam.jumps import jumps, tears
-from hsloc.slam.slips import STRETCHES_DEEP, joined
+from hsloc.slam.recorded import HARM_M, Recorded, reason_at, seconds_of
+from hsloc.slam.slip_evidence import hidden_slips, slips, unobserved
 from hsloc.slam.verdict import Evidence, Reason
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hsloc.slam.slips import Held, Stretches
-
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
     Bools = NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Recorded:
-    """What the verdict is found from; n keyscans.
-
-    `poses` (n, 3) are final. `motions` and `covariances` lead to each keyscan from the one before, as the front end
-    had them; `refused` (n,) where it had not the scans' word. `odometry` (n, 3) is as recorded, None without any.
-    `pairs` (m, 2) of keyscans that see the same walls, with `counts` (m, 5) as in `kernels.point_to_line.pair_terms`.
-    `loops` (k, 2) are pairs of keyscans that accepted loops join, `torn` (j, 2) those of loops that were contradicted
-    by the others, and are by the finished map. `joints` are keyscans at which pieces begin that were found on the map
-    of the others. `no_return_share` is the part of the beams that met nothing. `stretches` are what the scans alone say
-    of the motion along short parts of the path, `held` what the rest of the map does. `pose_covariances` (n, 3, 3) are
-    those of the final poses.
-    """
-
-    stamps_ns: I64
-    poses: F64
-    motions: F64
-    covariances: F64
-    refused: Bools
-    odometry: F64 | None
-    pairs: I64
-    counts: F64
-    loops: I64
-    torn: I64
-    joints: I64
-    no_return_share: float
-    stretches: Stretches
-    held: Held
-    pose_covariances: F64
-
-    def lengths(self) -> F64:
-        """Metres to each keyscan from the one before."""
-        return np.asarray(np.hypot(self.motions[:, 0], self.motions[:, 1]), dtype=np.float64)
-
-    def spanned(self, loops: int = 1) -> Bools:
-        """Steps (n,) between the two ends of this number of accepted loops: a wrong step would have kept them open."""
-        return np.asarray(self.summed_across(self.loops, np.ones(len(self.loops))) >= loops)
-
-    def summed_across(self, pairs: I64, weights: F64) -> F64:
-        """For each step (n, ...) the sum of the `weights` (m, ...) of the pairs (m, 2) of keyscans around it."""
-        change = np.zeros((len(self.poses) + 1, *weights.shape[1:]))
-        np.add.at(change, pairs.min(axis=1) + 1, weights)
-        np.add.at(change, pairs.max(axis=1) + 1, -weights)
-        return np.asarray(np.cumsum(change, axis=0)[: len(self.poses)], dtype=np.float64)
-
-    def summed_at(self, pairs: I64, weights: F64) -> F64:
-        """For each keyscan (n,) the sum of the `weights` (m,) of the pairs (m, 2) that it is in."""
-        sums = np.bincount(pairs.reshape(-1), weights=np.repeat(weights, 2), minlength=len(self.poses))
-        return np.asarray(sums, dtype=np.float64)
 
 
 _SECOND_VISIT_M = 12.0
@@ -114,24 +60,13 @@ _ODOMETRY_TURN = 0.5
 _WEAK_M = 0.125
 """Standard deviation [m] of the motion by the scans from which on a slip of half a metre, the largest that wheels were
 seen to make in a second, may go unnoticed: it is four of these."""
-_HARM_M = 0.25
-"""Displacement [m] of a part of the map from which on it is wrong: a doorway is missed by a quarter of its width."""
-_SLIPS_M = np.linspace(_HARM_M, 1.0, 16)
-"""Displacements [m] by slips, each as likely: to the largest that wheels were seen to make in a stretch."""
-_LIKELY = 0.01
-"""Expected number of slips that nothing shows, in the whole map, from which on it has to be looked at: a map that is
-called good has a hidden slip in one case of a hundred at most, if slips are as frequent there as where they show."""
-_UNCERTAIN_M = _HARM_M / NormalDist().inv_cdf(0.9)
+_UNCERTAIN_M = HARM_M / NormalDist().inv_cdf(0.9)
 """Standard deviation [m] of a position with which one in five maps is wrong there, though nothing contradicts it."""
 _BLIND_M = 2.0
 """A step longer than this [m], and than five times the usual one, was driven without enough returns."""
 _BLIND_SHARE = 0.1
 _NO_RETURN_SHARE = 0.4
 """On five real logs at most 0.03 of the beams meet nothing, cut to 4 m 0.27; where they erased walls 0.52 and more."""
-_MOST_OF_IT = 0.9
-"""Share of the expected slips whose stretches are named."""
-_MOST_NAMED = 20
-"""Places named in a reason, at most."""
 
 
 def weigh(recorded: Recorded) -> Evidence:
@@ -140,10 +75,12 @@ def weigh(recorded: Recorded) -> Evidence:
     found = [
         _open_joints(recorded, bridged),
         _relocated(recorded),
+        _record_gaps(recorded),
         _second_visits(recorded),
         _against_odometry(recorded, bridged),
-        _slips(recorded),
-        _unobserved(recorded),
+        slips(recorded),
+        unobserved(recorded),
+        hidden_slips(recorded),
         _uncertain(recorded),
         _torn_loops(recorded),
         _jumps(recorded),
@@ -169,7 +106,7 @@ def _open_joints(r: Recorded, bridged: Bools) -> Reason | None:
     if not wrong:
         return None
     text = f"odometry alone holds {counted(len(wrong), 'joint')}: the scans refused it, fewer than two loops span it"
-    return _reason(r, "open-joint", text, wrong, failed=False)
+    return reason_at(r, "open-joint", text, wrong, failed=False)
 
 
 def _relocated(r: Recorded) -> Reason | None:
@@ -178,7 +115,18 @@ def _relocated(r: Recorded) -> Reason | None:
         return None
     text = f"neither scans nor odometry say how the robot moved at {counted(len(r.joints), 'place')}, as if it was "
     text += "carried: where it went on was found by a search of the whole map"
-    return _reason(r, "relocated", text, [(int(joint), int(joint)) for joint in r.joints], failed=False)
+    return reason_at(r, "relocated", text, [(int(joint), int(joint)) for joint in r.joints], failed=False)
+
+
+def _record_gaps(r: Recorded) -> Reason | None:
+    """Where the record goes on after a gap, and nobody knows what became of the robot meanwhile."""
+    after = np.setdiff1d(r.after_gaps, r.joints)
+    if len(after) == 0:
+        return None
+    seconds = (r.stamps_ns[after] - r.stamps_ns[np.maximum(after - 1, 0)]) * 1e-9
+    text = f"nothing was recorded for {seconds.max():.0f} s, in {counted(len(after), 'gap')}: only the scans say that "
+    text += "the robot was not moved meanwhile, and places that look alike could be mixed up"
+    return reason_at(r, "record-gap", text, [(int(k), int(k)) for k in after], failed=False)
 
 
 def _healed(r: Recorded, first: int, last: int) -> bool:
@@ -219,14 +167,14 @@ def _second_visits(r: Recorded) -> Reason | None:
     text = (
         f"{100.0 * share:.0f} % of second visits look through walls of the first, in {counted(len(wrong), 'stretch')}"
     )
-    return _reason(r, "second-visit", text, wrong, failed=share > _FAILED_SHARE)
+    return reason_at(r, "second-visit", text, wrong, failed=share > _FAILED_SHARE)
 
 
 def _strays(r: Recorded) -> tuple[tuple[float, float], ...]:
     """Refused keyscans that fit nowhere: single scans beside their place, as while wheels slip, draw walls twice."""
     paired, conflict = (r.summed_at(r.pairs, r.counts[:, k]) for k in (0, 1))
     stray = r.refused & (paired + conflict >= _VISIT_SEEN) & (paired < _STRAY * (paired + conflict))
-    return _seconds(r, spans_of(stray))
+    return seconds_of(r, spans_of(stray))
 
 
 def _against_odometry(r: Recorded, bridged: Bools) -> Reason | None:
@@ -248,45 +196,7 @@ def _against_odometry(r: Recorded, bridged: Bools) -> Reason | None:
     if not wrong:
         return None
     text = f"map and odometry contradict each other over {counted(len(wrong), 'stretch')} that no loop spans"
-    return _reason(r, "odometry", text, wrong, failed=False)
-
-
-def _slips(r: Recorded) -> Reason | None:
-    """Slips of the wheels of which neither the scans nor the rest of the map say how long they were."""
-    slipped = r.stretches.contradicted[r.held.stretches]
-    # The odometry was left out there: what is left is the uncertainty of all else.
-    harmful = _off(r.held.sigma[slipped])
-    if _number(harmful) < _LIKELY:
-        return None
-    runs, sigma = _most_likely(r, slipped, harmful)
-    text = f"the wheels slipped in {counted(len(runs), 'stretch')} where the scans fix the motion to {sigma:.2f} m only"
-    return _reason(r, "slip", text, runs, failed=False)
-
-
-def _unobserved(r: Recorded) -> Reason | None:
-    """Stretches in which a slip would not be noticed: plain corridors, long halls that nothing else measures."""
-    slipped = r.stretches.contradicted
-    # How often wheels slip in this log is known where it shows (Laplace's rule of succession).
-    slips = len(joined(r.stretches.ends[slipped]))
-    seen = _number((~slipped & ~r.stretches.hidden).astype(np.float64))
-    prior = (slips + 1.0) / (seen + slips + 2.0)
-    quiet = ~slipped[r.held.stretches]
-    difference = r.held.difference[quiet]
-    sigma2 = r.held.sigma[quiet] ** 2 + r.held.odometry_sigma[quiet] ** 2
-    displaced = difference[:, None] - np.concatenate((_SLIPS_M, -_SLIPS_M))
-    # By how much more likely the difference is with a slip than without.
-    ratio = np.exp(0.5 * (difference[:, None] ** 2 - displaced**2) / sigma2[:, None]).mean(axis=1)
-    harmful = prior * ratio / (1.0 - prior + prior * ratio)
-    if r.odometry is None:
-        harmful = _off(r.held.sigma[quiet])
-    if _number(harmful) < _LIKELY:
-        return None
-    runs, sigma = _most_likely(r, quiet, harmful)
-    text = (
-        f"in {counted(len(runs), 'stretch')} the scans and the rest of the map fix the motion to {sigma:.2f} m only: "
-        "the position along them rests on the odometry, and a slip would not be noticed"
-    )
-    return _reason(r, "unobserved", text, runs, failed=False)
+    return reason_at(r, "odometry", text, wrong, failed=False)
 
 
 def _uncertain(r: Recorded) -> Reason | None:
@@ -297,28 +207,9 @@ def _uncertain(r: Recorded) -> Reason | None:
         return None
     text = (
         f"positions are known to {sigma.max():.2f} m only (standard deviation, relative to the first pose): "
-        f"more than one in five such maps is off by more than {_HARM_M} m there"
+        f"more than one in five such maps is off by more than {HARM_M} m there"
     )
-    return _reason(r, "uncertain", text, spans_of(uncertain), failed=False)
-
-
-def _off(sigma: F64) -> F64:
-    """Probability (h,) that a motion with such standard deviations (m) is off by what does harm."""
-    return np.array([erfc(_HARM_M / (2.0**0.5 * one)) for one in sigma.tolist()])
-
-
-def _number(stretches: F64) -> float:
-    """Their sum as a number of stretches that do not overlap."""
-    return float(stretches.sum()) / STRETCHES_DEEP
-
-
-def _most_likely(r: Recorded, of_held: Bools, harmful: F64) -> tuple[list[tuple[int, int]], float]:
-    """Runs of the stretches that count most, in all but a tenth of what is expected, and their largest sigma (m)."""
-    order = np.argsort(-harmful, kind="stable")
-    before = np.cumsum(harmful[order]) - harmful[order]
-    chosen = np.sort(order[before < _MOST_OF_IT * harmful.sum()])
-    numbers = np.flatnonzero(of_held)[chosen]
-    return joined(r.stretches.ends[r.held.stretches[numbers]]), float(r.held.sigma[numbers].max())
+    return reason_at(r, "uncertain", text, spans_of(uncertain), failed=False)
 
 
 def _driven(poses: F64) -> tuple[F64, F64]:
@@ -335,7 +226,7 @@ def _torn_loops(r: Recorded) -> Reason | None:
         return None
     text = f"{len(r.torn)} of {len(r.loops) + len(r.torn)} loops contradict the others: one side is wrong"
     ends = [(int(pair.max()), int(pair.max())) for pair in r.torn]
-    return _reason(r, "torn-loop", text, ends, failed=False)
+    return reason_at(r, "torn-loop", text, ends, failed=False)
 
 
 def _jumps(r: Recorded) -> Reason | None:
@@ -343,7 +234,7 @@ def _jumps(r: Recorded) -> Reason | None:
     torn = tears(wrong, r.poses, r.odometry)
     text = f"the map moves the robot faster than it drives in {counted(len(wrong), 'stretch')}: "
     text += "loops join places that only look alike, or it was carried" if torn else "scans within them are misplaced"
-    return _reason(r, "jump", text, wrong, failed=bool(torn)) if wrong else None
+    return reason_at(r, "jump", text, wrong, failed=bool(torn)) if wrong else None
 
 
 def _blind(r: Recorded) -> Reason | None:
@@ -356,7 +247,7 @@ def _blind(r: Recorded) -> Reason | None:
     if share < _BLIND_SHARE:
         return None
     text = f"{100.0 * share:.0f} % of the path was driven with too few returns: the lidar sees too little here"
-    return _reason(r, "blind", text, spans_of(long), failed=share > 0.5)
+    return reason_at(r, "blind", text, spans_of(long), failed=share > 0.5)
 
 
 def _no_returns(r: Recorded) -> Reason | None:
@@ -364,20 +255,3 @@ def _no_returns(r: Recorded) -> Reason | None:
         return None
     text = f"{100.0 * r.no_return_share:.0f} % of the beams met nothing: where that is a fault they erase walls"
     return Reason("no-returns", text, "check")
-
-
-def _reason(r: Recorded, code: str, text: str, runs: list[tuple[int, int]], *, failed: bool) -> Reason:
-    named = runs[:_MOST_NAMED]
-    return Reason(
-        code,
-        text,
-        "failed" if failed else "check",
-        tuple((float(r.poses[last, 0]), float(r.poses[last, 1])) for _, last in named),
-        _seconds(r, named),
-    )
-
-
-def _seconds(r: Recorded, runs: list[tuple[int, int]]) -> tuple[tuple[float, float], ...]:
-    """From the keyscan before each run to its last."""
-    seconds = (r.stamps_ns - r.stamps_ns[0]) * 1e-9
-    return tuple((float(seconds[max(first - 1, 0)]), float(seconds[last])) for first, last in runs)

@@ -22,6 +22,7 @@ from hsloc.slam.calibration import FLOOR
 from hsloc.slam.front_end import FrontEnd
 from hsloc.slam.known_map import KnownMap
 from hsloc.slam.map_session import MapSession, Tie, from_front_end
+from hsloc.slam.record_gaps import RecordGaps
 from hsloc.slam.stated_loops import StatedLoops
 from hsloc.slam.trajectory_correction import EventLog
 
@@ -56,6 +57,7 @@ class Mapper:
         self._plan = plan
         self._stated_loops = StatedLoops() if stated_loops is None else stated_loops
         self._first_ns: int | None = None
+        self._gaps = RecordGaps()
         self._matcher = FrontEnd(parameters.front_end, rng, parameters.use_odometry)
         self._track = EventLog(parameters.front_end.turn_length)
         self._scans: list[KeyScan] = []
@@ -71,8 +73,10 @@ class Mapper:
 
     def update(self, event: Odometry | PairedScan) -> Estimate:
         """Take an event; the estimate at its stamp, in the map as it is known so far (it drifts)."""
+        stamp_ns = event.stamp_ns if isinstance(event, Odometry) else event.scan.stamp_ns
+        self._gaps.add(stamp_ns)
         if self._first_ns is None:
-            self._first_ns = event.stamp_ns if isinstance(event, Odometry) else event.scan.stamp_ns
+            self._first_ns = stamp_ns
         if isinstance(event, Odometry):
             # Without odometry the message gives no motion: the pose is that of the last scan.
             T_odom_base = event.T_odom_base if self._parameters.use_odometry else self._T_last_scan
@@ -90,6 +94,8 @@ class Mapper:
         else:
             covariance = predict_covariance(covariance, self._T_map_key, found.motion, found.covariance)
         T_odom_base = event.T_odom_base if self._parameters.use_odometry else found.pose
+        if found.is_keyscan and self._gaps.take():
+            found = replace(found, is_after_gap=True, is_doubtful=True)
         first_new = len(self._local)
         local = self._keep_companions(event, found) if found.is_keyscan else found
         self._held = []  # No later scan carries them: a robot that waits for hours has no keyscans.

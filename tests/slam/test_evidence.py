@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from hsloc.kernels.normal_equations import Evaluated, PairTerms
-from hsloc.slam.evidence import Recorded, nothing_seen, weigh
+from hsloc.slam.evidence import nothing_seen, weigh
 from hsloc.slam.joint_registration import Registration
 from hsloc.slam.pose_graph import Edges
+from hsloc.slam.recorded import Recorded
 from hsloc.slam.slips import Held, Stretches, held_by_the_rest
 
 N = 200
@@ -36,6 +37,7 @@ def lap() -> Recorded:
         loops=np.array([(10, 110)]),
         torn=np.zeros((0, 2), dtype=np.int64),
         joints=np.zeros(0, dtype=np.int64),
+        after_gaps=np.zeros(0, dtype=np.int64),
         no_return_share=0.1,
         stretches=stretches(np.full(3, 0.01), np.ones(3)),
         held=held(),
@@ -73,6 +75,29 @@ def test_slips_and_stretches_in_which_none_would_be_detected_are_named(lap: Reco
     assert codes(replace(firm, held=held((0, 0.05, 0.2), (1, 0.05, 0.2))))[1] == ["unobserved"], "and a slip is likely"
     assert codes(replace(firm, odometry=None)) == ("good", [])
     assert codes(replace(weak, odometry=None))[1] == ["unobserved"]
+
+
+def test_stretches_along_bare_walls_that_agree_better_displaced_are_named(lap: Recorded) -> None:
+    bare = stretches(np.array((0.2, 0.2, 0.2)), np.ones(3))
+    firm = replace(lap, held=held((0, 0.02, 0.0), (1, 0.02, 0.0), (2, 0.02, 0.0)))
+    margin = np.zeros(100)
+    margin[:2] = -0.1
+    (reason,) = weigh(replace(firm, stretches=replace(bare, margin=margin))).reasons
+    assert (reason.code, reason.verdict, reason.times_s) == ("hidden-slip", "check", ((39.0, 65.0),))
+    margin[1] = 0.0
+    assert codes(replace(firm, stretches=replace(bare, margin=margin))) == ("good", []), "a single one is a door"
+    margin[:2] = -0.1
+    slipped = replace(bare, margin=margin, normalised=np.full(100, 5.0))
+    assert "hidden-slip" not in codes(replace(firm, stretches=slipped))[1], "it was found, and the odometry left out"
+
+
+def test_a_gap_of_the_record_is_named(lap: Recorded) -> None:
+    stamps = lap.stamps_ns + np.where(np.arange(N) >= 80, 30 * 10**9, 0)
+    paused = replace(lap, stamps_ns=stamps, after_gaps=np.array([80]))
+    (reason,) = weigh(paused).reasons
+    assert (reason.code, reason.verdict, reason.times_s) == ("record-gap", "check", ((79.0, 110.0),))
+    assert reason.text.startswith("nothing was recorded for 31 s, in 1 gap:")
+    assert codes(replace(paused, joints=np.array([80])))[1] == ["relocated"], "that says more"
 
 
 def test_places_of_a_right_map_that_are_hardly_known_are_named(lap: Recorded) -> None:

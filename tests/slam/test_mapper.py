@@ -227,3 +227,21 @@ def test_a_robot_that_waits_keeps_no_scan_of_its_lasers() -> None:
     del first, second
     # The first pair makes the first keyscans, which are kept in a shorter form.
     assert [reference() is None for reference in held] == [True] * 6
+
+
+def test_a_pause_of_the_recorder_is_named_and_changes_nothing_else(loop: Any, loop_map: Any) -> None:
+    events = loop[0]
+    half = len(events) // 2
+    paused = [*events[:half], *(half_a_minute_later(event) for event in events[half:])]
+    result, _ = mapped(paused)
+    (reason,) = result.evidence.reasons
+    assert reason.code == "record-gap"
+    ((before, after),) = reason.times_s
+    assert after - before == pytest.approx(30.0, abs=1.0)
+    assert np.hypot(*(result.keyscan_poses - loop_map[0].keyscan_poses)[:, :2].T).max() < 0.01
+
+
+def half_a_minute_later(event: Odometry | PairedScan) -> Odometry | PairedScan:
+    if isinstance(event, Odometry):
+        return replace(event, stamp_ns=event.stamp_ns + 30 * 10**9)
+    return replace(event, scan=replace(event.scan, stamp_ns=event.scan.stamp_ns + 30 * 10**9))

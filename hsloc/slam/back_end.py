@@ -27,6 +27,7 @@ from hsloc.slam.recorded import Recorded
 from hsloc.slam.refinement import near_the_end, refine_map, refine_with_calibration
 from hsloc.slam.result import MappingQuality, MappingResult
 from hsloc.slam.slips import compare_with_odometry, held_by_the_rest, known_by_scans, without_slips
+from hsloc.slam.stray_scans import put_back
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -117,6 +118,9 @@ def finish_session(
             edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), loop_edges])
             refined, more = refine_map(fit.moved(refined.poses), arrays, edges, near_the_end(parameters), _silent)
             passes += more
+    steps = without_slips(gathered.steps, gathered.slipped)
+    refined, more = put_back(refined, gathered, arrays, Edges.concatenate([steps, loop_edges]), parameters)
+    passes += more
     repaired = _without_slips(refined, gathered, loop_edges, arrays, parameters)
     refined, observed, edges = repaired.refined, repaired.observed, repaired.edges
     gathered, passes = replace(gathered, steps=repaired.steps), passes + repaired.passes

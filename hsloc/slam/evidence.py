@@ -18,6 +18,7 @@ from hsloc.model.verdict import counted, spans_of
 from hsloc.slam.jumps import jumps, tears
 from hsloc.slam.recorded import HARM_M, Recorded, reason_at, seconds_of
 from hsloc.slam.slip_evidence import hidden_slips, slips, unobserved
+from hsloc.slam.stray_scans import STRAY
 from hsloc.slam.verdict import Evidence, Reason
 
 if TYPE_CHECKING:
@@ -46,9 +47,6 @@ _OPEN_LOOPS = 2
 """Accepted loops that verify the steps between their ends."""
 _HEALED = 0.9
 """Consistency of the scans before and after refused steps at which these did no harm, as is asked of a loop."""
-_STRAY = 0.8
-"""Consistency of a refused scan with all scans around it below which it is beside its place: simulated ones that were
-0.3 to 0.6 m off had 0.74 to 0.79, and of the right steps of five real logs 95 of 100 have 0.82 and more."""
 _HEALED_WITHIN = 10
 """Keyscans before and after that are compared."""
 _WINDOW = 20
@@ -173,7 +171,7 @@ def _second_visits(r: Recorded) -> Reason | None:
 def _strays(r: Recorded) -> tuple[tuple[float, float], ...]:
     """Refused keyscans that fit nowhere: single scans beside their place, as while wheels slip, draw walls twice."""
     paired, conflict = (r.summed_at(r.pairs, r.counts[:, k]) for k in (0, 1))
-    stray = r.refused & (paired + conflict >= _VISIT_SEEN) & (paired < _STRAY * (paired + conflict))
+    stray = r.refused & (paired + conflict >= _VISIT_SEEN) & (paired < STRAY * (paired + conflict))
     return seconds_of(r, spans_of(stray))
 
 

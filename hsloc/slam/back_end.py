@@ -24,7 +24,7 @@ from hsloc.slam.open_joints import close_and_join
 from hsloc.slam.plan_alignment import find_on_plan
 from hsloc.slam.pose_graph import Edges, PoseGraph, compose_steps, edge_errors
 from hsloc.slam.recorded import Recorded
-from hsloc.slam.refinement import near_the_end, refine_map, refine_with_calibration
+from hsloc.slam.refinement import near_the_end, refine_map, refine_with_calibration, silent
 from hsloc.slam.result import MappingQuality, MappingResult
 from hsloc.slam.slips import compare_with_odometry, held_by_the_rest, known_by_scans, without_slips
 from hsloc.slam.stray_scans import put_back
@@ -70,7 +70,7 @@ def finish(
     With a floor `plan` the map is in its frame, if it fits one place of it only.
     Raises MapError if the log cannot be connected with the saved map.
     """
-    report = progress if progress is not None else _silent
+    report = progress if progress is not None else silent
     if gathered is None:
         if resume is not None:
             raise MapError(unconnected(resume.state))
@@ -85,8 +85,8 @@ def solve(gathered: MapSession, parameters: GraphMapperParameters, rng: Generato
     """Close the loops of a session and refine it, so that the log can go on from there: its keyscans as solved."""
     arrays = gathered.scans.arrays(parameters.joint_registration.points_per_scan)
     gathered = mended(gathered, arrays)
-    gathered, poses, loops, edges = close_and_join(gathered, parameters, rng, _silent)
-    gathered, refined, _ = refine_with_calibration(poses, arrays, gathered, edges, parameters, _silent)
+    gathered, poses, loops, edges = close_and_join(gathered, parameters, rng, silent)
+    gathered, refined, _ = refine_with_calibration(poses, arrays, gathered, edges, parameters, silent)
     return replace(gathered, poses=refined.poses, known=tuple(loops))
 
 
@@ -111,15 +111,13 @@ def finish_session(
     gathered, refined, passes = refine_with_calibration(
         poses, arrays, gathered, loop_edges, parameters, lambda part: report(0.5 + 0.4 * part)
     )
-    fit = None
+    fit, edges = None, Edges.concatenate([without_slips(gathered.steps, gathered.slipped), loop_edges])
     if plan is not None:
         fit = find_on_plan(plan, build_grid(refined.poses, gathered.scans, parameters.occupancy), refined.poses)
         if fit.is_certain:
-            edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), loop_edges])
-            refined, more = refine_map(fit.moved(refined.poses), arrays, edges, near_the_end(parameters), _silent)
+            refined, more = refine_map(fit.moved(refined.poses), arrays, edges, near_the_end(parameters), silent)
             passes += more
-    steps = without_slips(gathered.steps, gathered.slipped)
-    refined, more = put_back(refined, gathered, arrays, Edges.concatenate([steps, loop_edges]), parameters)
+    refined, more = put_back(refined, gathered, arrays, edges, parameters)
     passes += more
     repaired = _without_slips(refined, gathered, loop_edges, arrays, parameters)
     refined, observed, edges = repaired.refined, repaired.observed, repaired.edges
@@ -181,7 +179,7 @@ def _without_slips(
     for repairs_left in range(_MOST_REPAIRS if parameters.use_odometry else 0, -1, -1):
         edges = Edges.concatenate([steps, loop_edges])
         if known is not None:
-            refined, more = refine_map(refined.poses, scans, edges, near_the_end(parameters), _silent, refined)
+            refined, more = refine_map(refined.poses, scans, edges, near_the_end(parameters), silent, refined)
             passes += more
         motions = compare_with_odometry(refined, gathered.steps if known is None else steps)
         if known is not None:
@@ -242,7 +240,7 @@ def _recorded(
         loops=accepted,
         torn=ends[[loop.reason.startswith(TORN) for loop in loops]][chi > _CONTRADICTED],
         joints=np.array(gathered.joints, dtype=np.int64),
-        after_gaps=np.array(gathered.after_gaps, dtype=np.int64),
+        after_gaps=gathered.after_gaps,
         no_return_share=float(np.isposinf(ranges).sum()) / measured,
         stretches=repaired.stretches,
         held=repaired.held,
@@ -354,7 +352,3 @@ def _empty(track: EventLog) -> MappingResult:
         state=None,
         evidence=nothing_seen(),
     )
-
-
-def _silent(_: float) -> None:
-    """Progress without a listener."""

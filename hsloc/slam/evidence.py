@@ -16,9 +16,10 @@ import numpy as np
 from hsloc.model.pose2 import relative_poses, wrap_angles
 from hsloc.model.verdict import counted, spans_of
 from hsloc.slam.jumps import jumps, tears
+from hsloc.slam.loop_groups import open_steps
 from hsloc.slam.recorded import HARM_M, Recorded, reason_at, seconds_of
 from hsloc.slam.slip_evidence import hidden_slips, slips, unobserved
-from hsloc.slam.stray_scans import STRAY
+from hsloc.slam.stray_scans import inconsistent
 from hsloc.slam.verdict import Evidence, Reason
 
 if TYPE_CHECKING:
@@ -43,8 +44,6 @@ _OPEN_STEPS = 3
 """Refused steps in a row that no loop spans: fewer are bridged by the scans around them."""
 _OPEN_SIGMA_M = 0.4
 """Standard deviation [m] of such steps together, of which one is enough: that of a step that the scans contradicted."""
-_OPEN_LOOPS = 2
-"""Accepted loops that verify the steps between their ends."""
 _HEALED = 0.9
 """Consistency of the scans before and after refused steps at which these did no harm, as is asked of a loop."""
 _HEALED_WITHIN = 10
@@ -96,7 +95,7 @@ def nothing_seen() -> Evidence:
 def _open_joints(r: Recorded, bridged: Bools) -> Reason | None:
     """Runs of steps that only odometry holds: one loop over several of them shares out their errors as it likes."""
     wrong = []
-    for first, last in spans_of(r.refused & ~r.spanned(_OPEN_LOOPS)):
+    for first, last in spans_of(open_steps(r.refused, r.loops)):
         sigma = float(np.sqrt(np.trace(r.covariances[first : last + 1, :2, :2].sum(axis=0))))
         is_long = last - first + 1 >= _OPEN_STEPS or sigma > _OPEN_SIGMA_M
         if is_long and not bridged[first : last + 1].all() and not _healed(r, first, last):
@@ -117,14 +116,14 @@ def _relocated(r: Recorded) -> Reason | None:
 
 
 def _record_gaps(r: Recorded) -> Reason | None:
-    """Where the record goes on after a gap, and nobody knows what became of the robot meanwhile."""
-    after = np.setdiff1d(r.after_gaps, r.joints)
-    if len(after) == 0:
+    """Where the record goes on after a gap, and it is not known whether the robot was moved."""
+    gaps = [(keyscan, seconds) for keyscan, seconds in r.after_gaps if keyscan not in r.joints]
+    if not gaps:
         return None
-    seconds = (r.stamps_ns[after] - r.stamps_ns[np.maximum(after - 1, 0)]) * 1e-9
-    text = f"nothing was recorded for {seconds.max():.0f} s, in {counted(len(after), 'gap')}: only the scans say that "
+    longest = max(seconds for _, seconds in gaps)
+    text = f"nothing was recorded for {longest:.0f} s, in {counted(len(gaps), 'gap')}: only the scans say that "
     text += "the robot was not moved meanwhile, and places that look alike could be mixed up"
-    return reason_at(r, "record-gap", text, [(int(k), int(k)) for k in after], failed=False)
+    return reason_at(r, "record-gap", text, [(keyscan, keyscan) for keyscan, _ in gaps], failed=False)
 
 
 def _healed(r: Recorded, first: int, last: int) -> bool:
@@ -170,9 +169,7 @@ def _second_visits(r: Recorded) -> Reason | None:
 
 def _strays(r: Recorded) -> tuple[tuple[float, float], ...]:
     """Refused keyscans that fit nowhere: single scans beside their place, as while wheels slip, draw walls twice."""
-    paired, conflict = (r.summed_at(r.pairs, r.counts[:, k]) for k in (0, 1))
-    stray = r.refused & (paired + conflict >= _VISIT_SEEN) & (paired < STRAY * (paired + conflict))
-    return seconds_of(r, spans_of(stray))
+    return seconds_of(r, spans_of(r.refused & inconsistent(len(r.poses), r.pairs, r.counts)))
 
 
 def _against_odometry(r: Recorded, bridged: Bools) -> Reason | None:

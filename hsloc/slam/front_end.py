@@ -93,7 +93,7 @@ class LocalMatch:
     """What the front end made of a scan.
 
     `pose` is in the drifting frame of the front end. `motion` and `covariance` (3, 3, in the frame of the last
-    keyscan) give the motion since the last keyscan. `is_keyscan`: it is to be kept; `is_after_gap`: see `record_gaps`.
+    keyscan) give the motion since the last keyscan. `is_keyscan`: the scan is to be kept.
     """
 
     pose: Pose2
@@ -105,7 +105,6 @@ class LocalMatch:
     evaluations: int = 0
     reason: str = ""
     is_doubtful: bool = False
-    is_after_gap: bool = False
     scans: tuple[MovingScan, ...] = ()
     """The scan and its companions, prepared; of a keyscan."""
     anchor: Anchor | None = None

@@ -1,8 +1,8 @@
 """Loops that several places bear out, though walls are looked through.
 
 Where people stand, furniture was moved or a lidar is tilted, the scans of the right place look through walls, too, and
-a loop is refused that a single place shows. What is found by chance, or in a place that only looks alike, is found
-elsewhere by the next place, seldom at the pose to which the path in between leads.
+a loop is refused that a single place shows. What is found by chance, or in a place that only looks alike, rarely
+agrees with the path and with what the next place finds.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.model.pose2 import Pose2, mahalanobis_distances, pose_differences, rotated
+from hsloc.slam.pair_sums import summed_across
 from hsloc.slam.slips import motions_by_steps
 
 if TYPE_CHECKING:
@@ -38,8 +39,8 @@ def corroborated(loops: list[Loop], places: Submaps) -> list[Loop]:
     Of those that lead over a step which the scans refused and fewer than two loops hold: elsewhere the path is known,
     and such a loop of a place that looks alike would bend it. Those that join pieces of a path have to pass all tests.
     """
-    accepted = [(loop.first, loop.second) for loop in loops if loop.accepted]
-    over_open = np.concatenate(([0], np.cumsum(open_steps(places.uncertain, accepted))))
+    accepted = np.array([(loop.first, loop.second) for loop in loops if loop.accepted], dtype=np.int64).reshape(-1, 2)
+    over_open = np.cumsum(open_steps(np.concatenate(([False], places.uncertain)), accepted))
     refused = [
         loop
         for loop in loops
@@ -50,16 +51,12 @@ def corroborated(loops: list[Loop], places: Submaps) -> list[Loop]:
     return [loop for loop in refused if len(_bearing_out(loop, refused, places)) >= _PLACES - 1]
 
 
-def open_steps(refused: NDArray[np.bool_], loops: list[tuple[int, int]]) -> NDArray[np.bool_]:
-    """Steps (n - 1,) that the scans `refused` and that fewer than two loops hold: odometry alone does.
+def open_steps(refused: NDArray[np.bool_], loops: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Steps (n,), to each keyscan or place from the one before, that scans `refused` and odometry alone holds.
 
-    `loops` are pairs of those n, keyscans or places, between which the steps lead.
+    Fewer than two of the accepted `loops` (k, 2) lead over them.
     """
-    change = np.zeros(len(refused) + 1, dtype=np.int64)
-    for first, second in loops:
-        change[min(first, second)] += 1
-        change[max(first, second)] -= 1
-    return np.asarray(refused & (np.cumsum(change)[:-1] < _LOOPS), dtype=np.bool_)
+    return np.asarray(refused & (summed_across(len(refused), loops, np.ones(len(loops))) < _LOOPS), dtype=np.bool_)
 
 
 def _bearing_out(loop: Loop, loops: list[Loop], places: Submaps) -> set[int]:

@@ -81,8 +81,8 @@ class MapSession:
     """Keyscans before steps in which the wheels slipped, as the scans around them show."""
     joints: tuple[int, ...] = ()
     """Keyscans at which a piece of the path begins that was found on the map of the others alone."""
-    after_gaps: tuple[int, ...] = ()
-    """Keyscans before which nothing was recorded for long."""
+    after_gaps: tuple[tuple[int, float], ...] = ()
+    """Keyscans before which nothing was recorded, and for how many seconds."""
     systematic: SystematicErrors | None = None
     """What was added to the steps; None before the map was refined."""
 
@@ -162,6 +162,7 @@ def from_front_end(
     parameters: GraphMapperParameters,
     solved: MapSession | None = None,
     ties: tuple[Tie, ...] = (),
+    after_gaps: tuple[tuple[int, float], ...] = (),
 ) -> MapSession:
     """Of a log with at least one keyscan; those of `solved` come first, at the poses at which they were solved."""
     poses = np.array([found.pose.to_array() for found in local]).reshape(-1, 3)
@@ -169,10 +170,7 @@ def from_front_end(
     covariances = np.array([found.covariance for found in local]).reshape(-1, 3, 3)
     refused = np.array([found.status is Status.REJECTED or found.is_doubtful for found in local], dtype=bool)
     known: tuple[Loop, ...] = ()
-    first_new = len(solved.poses) if solved is not None else 0
-    after_gaps = tuple(first_new + k for k, found in enumerate(local) if found.is_after_gap)
     if solved is not None:
-        after_gaps = (*solved.after_gaps, *after_gaps)
         stamps_ns = np.concatenate((solved.stamps_ns, stamps_ns))
         poses = np.concatenate((solved.poses, poses))
         motions = np.concatenate((solved.motions, motions))
@@ -261,7 +259,7 @@ def concatenate(old: MapSession, new: MapSession) -> MapSession:
         first=n,
         first_place=m,
         slips=(*old.slips, *(n + step for step in new.slips)),
-        after_gaps=tuple(n + keyscan for keyscan in new.after_gaps),
+        after_gaps=tuple((n + keyscan, seconds) for keyscan, seconds in new.after_gaps),
     )
 
 

@@ -58,6 +58,7 @@ class Mapper:
         self._stated_loops = StatedLoops() if stated_loops is None else stated_loops
         self._first_ns: int | None = None
         self._gaps = RecordGaps()
+        self._after_gaps: list[tuple[int, float]] = []
         self._matcher = FrontEnd(parameters.front_end, rng, parameters.use_odometry)
         self._track = EventLog(parameters.front_end.turn_length)
         self._scans: list[KeyScan] = []
@@ -94,9 +95,9 @@ class Mapper:
         else:
             covariance = predict_covariance(covariance, self._T_map_key, found.motion, found.covariance)
         T_odom_base = event.T_odom_base if self._parameters.use_odometry else found.pose
-        if found.is_keyscan and self._gaps.take():
-            found = replace(found, is_after_gap=True, is_doubtful=True)
         first_new = len(self._local)
+        if found.is_keyscan:
+            found = self._doubted_after_gap(found)
         local = self._keep_companions(event, found) if found.is_keyscan else found
         self._held = []  # No later scan carries them: a robot that waits for hours has no keyscans.
         self._track.add(T_odom_base, is_scan=True, is_key=found.is_keyscan)
@@ -122,6 +123,15 @@ class Mapper:
             found.evaluations,
             found.reason,
         )
+
+    def _doubted_after_gap(self, found: LocalMatch) -> LocalMatch:
+        """The match of a keyscan, doubtful if nothing was recorded for long since the one before; the gap is noted."""
+        seconds = self._gaps.take()
+        keyscan = len(self._local) + (len(self._solved.poses) if self._solved is not None else 0)
+        if seconds == 0.0 or keyscan == 0:
+            return found
+        self._after_gaps.append((keyscan, seconds))
+        return replace(found, is_doubtful=True)
 
     def _tie(self, anchor: Anchor, first_new: int) -> None:
         """Note where the log left the known map: at the keyscan of that number since it was solved."""
@@ -158,7 +168,7 @@ class Mapper:
             return None
         session = from_front_end(
             self._scans, np.array(self._stamps, dtype=np.int64), self._local, self._track, self._parameters,
-            self._solved, tuple(self._ties),
+            self._solved, tuple(self._ties), tuple(self._after_gaps),
         )  # fmt: skip
         return session.stated(self._stated_loops, self._first_ns or 0)
 

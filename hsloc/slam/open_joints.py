@@ -213,11 +213,10 @@ def _join_pieces(
 
 def _open_steps(session: MapSession, loops: list[Loop]) -> I64:
     """Keyscans at which runs of steps begin that the scans refused and only odometry holds."""
-    reference = session.places.reference
-    accepted = [(int(reference[loop.first]), int(reference[loop.second])) for loop in loops if loop.accepted]
-    is_open = open_steps(session.refused[1:], accepted)
+    ends = [(loop.first, loop.second) for loop in loops if loop.accepted]
+    is_open = open_steps(session.refused, session.places.reference[np.array(ends, dtype=np.int64).reshape(-1, 2)])
     # A run of refused steps begins where the robot was carried: until there is a new local map nothing fits.
-    return 1 + np.flatnonzero(is_open & ~np.concatenate(([False], is_open[:-1])))
+    return np.flatnonzero(is_open & ~np.concatenate(([False], is_open[:-1])))
 
 
 def _long_pieces(session: MapSession, poses: F64, loops: list[Loop]) -> list[range]:

@@ -10,13 +10,13 @@ _UNUSUAL = 20.0
 
 
 class RecordGaps:
-    """State: the stamps of the first and the last message, and whether a gap was met since it was asked for."""
+    """State: the stamps of the first and the last message, and the longest gap since it was asked for."""
 
     def __init__(self) -> None:
         self._first_ns = 0
         self._last_ns = 0
         self._messages = 0
-        self._met = False
+        self._longest_s = 0.0
 
     def add(self, stamp_ns: int) -> None:
         """Take the stamp of a message."""
@@ -25,11 +25,12 @@ class RecordGaps:
             self._first_ns = stamp_ns
         elif seconds >= _LONG_S:
             mean = (self._last_ns - self._first_ns) * 1e-9 / max(self._messages - 1, 1)
-            self._met |= seconds >= _UNUSUAL * mean
+            if seconds >= _UNUSUAL * mean:
+                self._longest_s = max(seconds, self._longest_s)
         self._last_ns = max(stamp_ns, self._last_ns)
         self._messages += 1
 
-    def take(self) -> bool:
-        """Whether a gap was met since this was asked last."""
-        met, self._met = self._met, False
-        return met
+    def take(self) -> float:
+        """Seconds of the longest gap since this was asked last; 0 if there was none."""
+        longest, self._longest_s = self._longest_s, 0.0
+        return longest

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.slam.pair_sums import summed_across, summed_at
 from hsloc.slam.verdict import Reason
 
 if TYPE_CHECKING:
@@ -33,10 +34,10 @@ class Recorded:
     `pairs` (m, 2) of keyscans that see the same walls, with `counts` (m, 5) as in
     `kernels.point_to_line.pair_terms`. `loops` (k, 2) are pairs of keyscans that accepted loops join, `torn` (j, 2)
     those of loops that were contradicted by the others, and are by the finished map. `joints` are keyscans at which
-    pieces begin that were found on the map of the others, `after_gaps` those before which nothing was recorded for
-    long. `no_return_share` is the part of the beams that met nothing. `stretches` are what the scans alone say of
-    the motion along short parts of the path, `held` what the rest of the map does. `pose_covariances` (n, 3, 3) are
-    those of the final poses.
+    pieces begin that were found on the map of the others, `after_gaps` those before which nothing was recorded, and
+    for how many seconds. `no_return_share` is the part of the beams that met nothing. `stretches` are what the
+    scans alone say of the motion along short parts of the path, `held` what the rest of the map does.
+    `pose_covariances` (n, 3, 3) are those of the final poses.
     """
 
     stamps_ns: I64
@@ -50,7 +51,7 @@ class Recorded:
     loops: I64
     torn: I64
     joints: I64
-    after_gaps: I64
+    after_gaps: tuple[tuple[int, float], ...]
     no_return_share: float
     stretches: Stretches
     held: Held
@@ -60,21 +61,17 @@ class Recorded:
         """Metres to each keyscan from the one before."""
         return np.asarray(np.hypot(self.motions[:, 0], self.motions[:, 1]), dtype=np.float64)
 
-    def spanned(self, loops: int = 1) -> Bools:
-        """Steps (n,) between the two ends of this number of accepted loops: a wrong step would have kept them open."""
-        return np.asarray(self.summed_across(self.loops, np.ones(len(self.loops))) >= loops)
+    def spanned(self) -> Bools:
+        """Steps (n,) between the two ends of an accepted loop: a wrong step would have kept it open."""
+        return np.asarray(self.summed_across(self.loops, np.ones(len(self.loops))) >= 1)
 
     def summed_across(self, pairs: I64, weights: F64) -> F64:
         """For each step (n, ...) the sum of the `weights` (m, ...) of the pairs (m, 2) of keyscans around it."""
-        change = np.zeros((len(self.poses) + 1, *weights.shape[1:]))
-        np.add.at(change, pairs.min(axis=1) + 1, weights)
-        np.add.at(change, pairs.max(axis=1) + 1, -weights)
-        return np.asarray(np.cumsum(change, axis=0)[: len(self.poses)], dtype=np.float64)
+        return summed_across(len(self.poses), pairs, weights)
 
     def summed_at(self, pairs: I64, weights: F64) -> F64:
         """For each keyscan (n,) the sum of the `weights` (m,) of the pairs (m, 2) that it is in."""
-        sums = np.bincount(pairs.reshape(-1), weights=np.repeat(weights, 2), minlength=len(self.poses))
-        return np.asarray(sums, dtype=np.float64)
+        return summed_at(len(self.poses), pairs, weights)
 
 
 def reason_at(r: Recorded, code: str, text: str, runs: list[tuple[int, int]], *, failed: bool) -> Reason:

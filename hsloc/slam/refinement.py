@@ -89,6 +89,10 @@ def _settled(
     return refined, passes
 
 
+def silent(_: float) -> None:
+    """Progress without a listener."""
+
+
 def near_the_end(parameters: GraphMapperParameters) -> GraphMapperParameters:
     """Without the wide gates of the first rounds."""
     registration = parameters.joint_registration

@@ -13,7 +13,8 @@ import numpy as np
 
 from hsloc.model.pose2 import Pose2, rotated
 from hsloc.model.verdict import spans_of
-from hsloc.slam.refinement import near_the_end, refine_map
+from hsloc.slam.pair_sums import summed_at
+from hsloc.slam.refinement import near_the_end, refine_map, silent
 from hsloc.slam.scan_registration import MovingScan, StoredScans, register_onto
 
 if TYPE_CHECKING:
@@ -26,12 +27,13 @@ if TYPE_CHECKING:
     from hsloc.slam.pose_graph import Edges
 
     F64 = NDArray[np.float64]
+    I64 = NDArray[np.int64]
     Bools = NDArray[np.bool_]
 
-STRAY = 0.8
+_STRAY = 0.8
 """Consistency of a refused scan with all scans around it below which it is beside its place: simulated ones that were
 0.3 to 0.6 m off had 0.74 to 0.79, and of the right steps of five real logs 95 of 100 have 0.82 and more."""
-SEEN = 60.0
+_SEEN = 60.0
 """Points that a scan and those around it could see of each other, without which its consistency says nothing."""
 _LONGEST = 5
 """Keyscans in a row that are put back: more are a part of the path, not beside it."""
@@ -59,19 +61,23 @@ def put_back(
     moved = (poses != refined.poses).any(axis=1)
     if not moved.any():
         return refined, 0
-    again, passes = refine_map(poses, scans, edges, near_the_end(parameters), _silent, refined)
-    before, after = (paired - conflict for paired, conflict in (_counts(refined), _counts(again)))
-    return (again, passes) if after[moved].sum() > before[moved].sum() else (refined, passes)
+    again, passes = refine_map(poses, scans, edges, near_the_end(parameters), silent, refined)
+    is_better = _agreement(again)[moved].sum() > _agreement(refined)[moved].sum()
+    return (again if is_better else refined), passes
 
 
 def _stray(refined: Registration, refused: Bools) -> Bools:
     """Which keyscans (n,) are beside their place: refused ones, and those next to them that are as inconsistent."""
-    paired, conflict = _counts(refined)
-    inconsistent = (paired + conflict >= SEEN) & (paired < STRAY * (paired + conflict))
     stray = np.zeros(len(refused), dtype=np.bool_)
-    for first, last in spans_of(inconsistent):
+    for first, last in spans_of(inconsistent(len(refused), refined.pairs, refined.counts)):
         stray[first : last + 1] = refused[first : last + 1].any()
     return stray
+
+
+def inconsistent(n: int, pairs: I64, counts: F64) -> Bools:
+    """Which keyscans (n,) do not fit those around; `counts` (m, 5) of the pairs (m, 2) as in `pair_terms`."""
+    paired, conflict = (summed_at(n, pairs, counts[:, k]) for k in (0, 1))
+    return np.asarray((paired + conflict >= _SEEN) & (paired < _STRAY * (paired + conflict)), dtype=np.bool_)
 
 
 def _placed(session: MapSession, poses: F64, still: list[tuple[F64, MovingScan]], run: tuple[int, int, int]) -> F64:
@@ -94,12 +100,6 @@ def _placed(session: MapSession, poses: F64, still: list[tuple[F64, MovingScan]]
     return best.to_array() if best.distance(here) > _FOUND_M else poses[k]
 
 
-def _counts(refined: Registration) -> tuple[F64, F64]:
-    """Points of each keyscan (n,) and its partners that lie on walls of each other, and where they looked through."""
-    keyscans, n = refined.pairs.reshape(-1), len(refined.poses)
-    paired, conflict = (np.bincount(keyscans, np.repeat(refined.counts[:, k], 2), n) for k in (0, 1))
-    return np.asarray(paired, dtype=np.float64), np.asarray(conflict, dtype=np.float64)
-
-
-def _silent(_: float) -> None:
-    """Report nothing."""
+def _agreement(refined: Registration) -> F64:
+    """Points of each keyscan (n,) and its partners on walls of each other, less those where they looked through."""
+    return summed_at(len(refined.poses), refined.pairs, refined.counts[:, 0] - refined.counts[:, 1])

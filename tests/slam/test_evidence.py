@@ -37,7 +37,7 @@ def lap() -> Recorded:
         loops=np.array([(10, 110)]),
         torn=np.zeros((0, 2), dtype=np.int64),
         joints=np.zeros(0, dtype=np.int64),
-        after_gaps=np.zeros(0, dtype=np.int64),
+        after_gaps=(),
         no_return_share=0.1,
         stretches=stretches(np.full(3, 0.01), np.ones(3)),
         held=held(),
@@ -93,7 +93,7 @@ def test_stretches_along_bare_walls_that_agree_better_displaced_are_named(lap: R
 
 def test_a_gap_of_the_record_is_named(lap: Recorded) -> None:
     stamps = lap.stamps_ns + np.where(np.arange(N) >= 80, 30 * 10**9, 0)
-    paused = replace(lap, stamps_ns=stamps, after_gaps=np.array([80]))
+    paused = replace(lap, stamps_ns=stamps, after_gaps=((80, 31.0),))
     (reason,) = weigh(paused).reasons
     assert (reason.code, reason.verdict, reason.times_s) == ("record-gap", "check", ((79.0, 110.0),))
     assert reason.text.startswith("nothing was recorded for 31 s, in 1 gap:")

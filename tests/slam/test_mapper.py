@@ -241,6 +241,24 @@ def test_a_pause_of_the_recorder_is_named_and_changes_nothing_else(loop: Any, lo
     assert np.hypot(*(result.keyscan_poses - loop_map[0].keyscan_poses)[:, :2].T).max() < 0.01
 
 
+def test_a_gap_has_its_own_length_and_what_was_before_the_first_scan_is_none(loop: Any) -> None:
+    events = loop[0][:400]
+    early = replace(next(event for event in events if isinstance(event, Odometry)), stamp_ns=0)
+    shifted = [half_a_minute_later(event) for event in events]
+    ((_, seconds),) = gaps_of([*events[:200], *shifted[200:]])
+    assert seconds == pytest.approx(30.0, abs=0.2)
+    assert gaps_of([early, *shifted]) == ()
+
+
+def gaps_of(events: Any) -> tuple[tuple[int, float], ...]:
+    mapper = Mapper(GraphMapperParameters(), np.random.default_rng(0))
+    for event in events:
+        mapper.update(event)
+    session = mapper._session()
+    assert session is not None
+    return session.after_gaps
+
+
 def half_a_minute_later(event: Odometry | PairedScan) -> Odometry | PairedScan:
     if isinstance(event, Odometry):
         return replace(event, stamp_ns=event.stamp_ns + 30 * 10**9)

@@ -18,7 +18,6 @@ from hsloc.preprocessing.left_out_hits import without_isolated
 from hsloc.preprocessing.odometry import OdometryWatch
 from hsloc.replay.map_and_start import load_grid, resumed
 from hsloc.slam.laser_odometry import with_laser_odometry
-from hsloc.slam.mapper import Mapper
 from hsloc.slam.point_mapper import PointMapper
 from hsloc.slam.stated_loops import StatedLoops
 
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     from hsloc.model.pose2 import Pose2
     from hsloc.request import RunRequest
     from hsloc.slam.map_state import MapState
+    from hsloc.slam.mapper import Mapper
 
 
 def events_of(
@@ -73,6 +73,8 @@ def make_mapper(request: RunRequest, state: MapState | None, lidar_only: bool) -
     if state is not None:
         begin = None if request.unknown_start else request.initial_pose
         resume = resumed(state, request.config, request.matcher, begin)
+    from hsloc.slam.mapper import Mapper
+
     return Mapper(
         replace(request.config.graph_mapper, use_odometry=not lidar_only),
         np.random.default_rng(request.seed),

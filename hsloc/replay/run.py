@@ -41,7 +41,6 @@ from hsloc.replay.progress import Progress, share_of, with_progress
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory, pose_covariances
 from hsloc.request import RunRequest
-from hsloc.slam.mapper import Mapper
 from hsloc.slam.point_mapper import PointMapper
 from hsloc.slam.time_offset import clock_warnings
 from hsloc.warnings import RunWarning, WarningCode
@@ -63,6 +62,7 @@ if TYPE_CHECKING:
     from hsloc.model.trajectory import Trajectory
     from hsloc.replay.engine import Estimator
     from hsloc.replay.progress import Report
+    from hsloc.slam.mapper import Mapper
     from hsloc.slam.result import MappingResult
     from hsloc.slam.time_offset import Offset
 
@@ -292,6 +292,7 @@ def _run_with(
     )
     localise = request.mode == "localise" or (grid is not None and not builds)
     given_resolution, opened = None, time.perf_counter()
+    mapper: Mapper | PointMapper | None = None
     if progress is not None:
         progress(Progress("prepare", 0.0, log.summary.duration_s, 0))
     if localise:
@@ -307,7 +308,8 @@ def _run_with(
         localiser = make_localiser(request, require_map(grid), likelihood, start)
         estimator: Estimator = localiser
     else:
-        localiser, likelihood, estimator = None, None, make_mapper(request, state, lidar_only)
+        localiser, likelihood = None, None
+        estimator = mapper = make_mapper(request, state, lidar_only)
     first = None if lidar_only else first_odometry(log.events())
     own = body_beams(log.events())
     warnings = (*warnings, *body_warnings(own))
@@ -328,16 +330,16 @@ def _run_with(
     seconds = {"open": opened - begin, "prepare": prepared - opened, "replay": replayed - prepared}
     of_steps = log.losses.step_warnings(log.summary)
     mapping, true_grid, offsets, is_right = None, None if localise else grid, None, False
-    if isinstance(estimator, Mapper):
+    if isinstance(mapper, PointMapper):
+        grid = mapper.grid()
+    elif mapper is not None:
         if not lidar_only and not of_steps:
             is_first = time_offset is None
             is_right = is_first and require_direction(request, log, reading, history)
             offsets = offsets_of_mapping(request, log, reading, history, deskew=deskew, correct=is_first)
-        mapping = estimator.finish(share_of(progress, log.summary.duration_s, history.scans))
+        mapping = mapper.finish(share_of(progress, log.summary.duration_s, history.scans))
         grid = mapping.grid
         seconds["finish"] = time.perf_counter() - replayed
-    elif isinstance(estimator, PointMapper):
-        grid = estimator.grid()
     trajectory, localised = history.trajectory() if mapping is None else history.mapped(mapping)
     scale = None if localiser is None else localiser.map_scale
     if scale is not None and isinstance(correction, tuple):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.request import urlopen
 
 import pytest
-from live_service import Worker, free_port, go_on, settings, submit, upload, wait
+from live_service import Worker, free_port, go_on, settings, submit, upload, wait, with_coverage
 from paths import ROOT
 from ruamel.yaml import YAML
 from sqlalchemy import text
@@ -137,7 +137,7 @@ def test_an_upload_begun_at_one_server_goes_on_at_the_other_and_a_worker_runs_th
     assert not list((fleet.folder / "a" / "uploads").iterdir())
     job = other.post("/v1/jobs", json={"log": file["id"]}).json()["id"]
     port = free_port()
-    worker = fleet.worker("--slots", "2", "--metrics", str(port))
+    worker = fleet.worker("--slots", "2", "--metrics", str(port), **with_coverage())
     assert wait(one, job)["state"] == "succeeded"
     results = [client.get(f"/v1/jobs/{job}/results/trajectory.tum") for client in servers]
     assert results[0].status_code == 200
@@ -180,7 +180,7 @@ def test_an_upload_begun_at_one_server_goes_on_at_the_other_and_a_worker_runs_th
 
 def test_a_worker_that_is_killed_or_stands_still_does_not_keep_its_job(servers: list[TestClient], fleet: Fleet) -> None:
     one, other = servers
-    first = fleet.worker()
+    first = fleet.worker(**with_coverage())
     job = submit(one, b"held-first")
     wait(other, job, states=("running",))
     second = fleet.worker()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from imports import need_no_import
-from live_service import free_port, go_on, submit, upload, wait
+from live_service import free_port, go_on, submit, upload, wait, with_coverage
 from waiting import LIMIT_S, until
 
 from hsloc_service.execution import job_process
@@ -92,7 +92,7 @@ def test_cancel_ends_what_ignores_sigterm_and_leaves_the_group(make_client: Call
 
 
 def test_sigterm_puts_running_jobs_back_and_leaves_no_process(make_live: Callable[..., Live]) -> None:
-    live = make_live()
+    live = make_live(**with_coverage())
     with live.client() as client:
         job = submit(client, b"held-first")
         wait(client, job, states=("running",))
@@ -148,6 +148,7 @@ def test_the_process_has_no_secret_of_the_server(make_live: Callable[..., Live])
         assert token.encode() not in environment
         client.post(f"/v1/jobs/{job}/cancel")
         wait(client, job)
+    until(lambda: not any((live.data / "work").iterdir()), "what the job left is removed")
     for path in live.data.rglob("*"):
         if path.is_file() and os.access(path, os.R_OK):
             assert token.encode() not in path.read_bytes()

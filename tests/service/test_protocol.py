@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import httpx2 as httpx
 import pytest
-from live_service import Live, submit
+from live_service import Live, submit, with_coverage
 from waiting import LIMIT_S, until
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ PATIENT = {"HSLOC_HEADER_TIMEOUT_S": "600", "HSLOC_BODY_TIMEOUT_S": "600"}
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     """One server for all of these, impatient."""
-    server = Live(tmp_path_factory.mktemp("protocol"), **QUICK).start()
+    server = Live(tmp_path_factory.mktemp("protocol"), **QUICK, **with_coverage()).start()
     yield server
     assert server.end() == 0
 

@@ -23,6 +23,7 @@ from hsloc_service.settings import Settings
 FAKE = (sys.executable, "-P", str(Path(__file__).parents[1] / "service" / "fake_worker.py"))
 IN_MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
 """Parent of folders whose thousands of commits would wait for a disk, 5 ms each."""
+_COVERAGE = "COVERAGE_PROCESS_CONFIG"
 SMALL: dict[str, Any] = {
     "min_free_bytes": 1 << 20,
     "grace_s": 0.3,
@@ -72,9 +73,18 @@ def free_port() -> int:
         return int(found.getsockname()[1])
 
 
+def with_coverage() -> dict[str, str]:
+    """The variables of a server or worker whose coverage counts: one that ends by itself, or by SIGTERM."""
+    return {_COVERAGE: os.environ[_COVERAGE]} if _COVERAGE in os.environ else {}
+
+
 def environment(**variables: str) -> dict[str, str]:
-    """The variables of a server or worker that keeps tests short."""
-    return {k: v for k, v in os.environ.items() if not k.startswith("HSLOC_")} | {
+    """The variables of a server or worker that keeps tests short.
+
+    Coverage is not measured, unless they are `with_coverage()` as well: it doubles what a start takes, to 3 s, and is
+    lost where the process is killed, as most are.
+    """
+    return {k: v for k, v in os.environ.items() if not k.startswith("HSLOC_") and k != _COVERAGE} | {
         "HSLOC_MIN_FREE_BYTES": "1M",
         "HSLOC_GRACE_S": "0.3",
         "HSLOC_HEARTBEAT_S": "0.5",

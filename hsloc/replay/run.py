@@ -37,9 +37,10 @@ from hsloc.replay.map_and_start import (
     require_map,
 )
 from hsloc.replay.matched_scans import mean_fitness
+from hsloc.replay.pose_covariances import pose_covariances
 from hsloc.replay.progress import Progress, share_of, with_progress
 from hsloc.replay.references import read_reference
-from hsloc.replay.run_history import RunHistory, pose_covariances
+from hsloc.replay.run_history import RunHistory
 from hsloc.request import RunRequest
 from hsloc.slam.point_mapper import PointMapper
 from hsloc.slam.time_offset import clock_warnings

@@ -14,7 +14,6 @@ from hsloc.localisation.kalman_filter import (
     SmoothedMatches,
     between_matches,
     bridge_variances,
-    predict_covariance,
     smooth_matches,
 )
 from hsloc.localisation.motion_models import OdometryNoise
@@ -38,8 +37,6 @@ from hsloc.slam.time_offset import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
     from hsloc.localisation.map_scale import MapScale
@@ -357,30 +354,3 @@ class RunHistory:
 def _trajectory(stamps: array[int], poses: array[float]) -> Trajectory:
     """A view of the columns, which can grow no more while it lives: an hour's would be large to copy."""
     return Trajectory(np.frombuffer(stamps, dtype=np.int64), np.frombuffer(poses, dtype=np.float64).reshape(-1, 3))
-
-
-def pose_covariances(
-    trajectory: Trajectory,
-    localised: NDArray[np.bool_],
-    scans: ScanDiagnostics,
-    motion_covariance: Callable[[Pose2], NDArray[np.float64]],
-) -> NDArray[np.float64]:
-    """Covariance (n, 3, 3) of each pose over (x, y, theta) in the map frame (m^2, m rad, rad^2).
-
-    That of the last scan before it whose covariance is known, propagated over the motion since, whose own covariance
-    is `motion_covariance`. NaN before the first such scan, and where the pose is not localised.
-    """
-    found = np.full((len(trajectory), 3, 3), np.nan)
-    known = np.flatnonzero(np.isfinite(scans.covariance[:, 0, 0]))
-    # Stamps may repeat and run backwards, where the log's do: a scan counts from its stamp on, in the order of time.
-    order = known[np.argsort(scans.stamps_ns[known], kind="stable")]
-    last = np.searchsorted(scans.stamps_ns[order], trajectory.stamps_ns, side="right") - 1
-    anchors: dict[int, Pose2] = {}
-    for row in np.flatnonzero(localised & (last >= 0)).tolist():
-        scan = int(order[last[row]])
-        pose = Pose2.from_array(trajectory.poses[row])
-        # The pose of the scan is not in the result: that of the first message after it is the nearest.
-        anchor = anchors.setdefault(scan, pose)
-        motion = anchor.between(pose)
-        found[row] = predict_covariance(scans.covariance[scan], anchor, motion, motion_covariance(motion))
-    return found

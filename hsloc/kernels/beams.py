@@ -93,18 +93,26 @@ def count_seen(
     `work` is two arrays as large as `counts`.
     """
     hits, misses = work
-    hits[:] = 0
-    misses[:] = 0
+    height, width = counts.shape
     x, y, c, s = pose
     origins, ends = np.empty_like(points), np.empty_like(points)
+    u0 = u1 = origin[0] / side
+    v0 = v1 = origin[1] / side
     for i in range(len(points)):
         ends[i, 0] = (x + c * points[i, 0] - s * points[i, 1]) / side
         ends[i, 1] = (y + s * points[i, 0] + c * points[i, 1]) / side
         origins[i, 0] = origin[0] / side
         origins[i, 1] = origin[1] / side
+        u0, u1 = min(u0, ends[i, 0]), max(u1, ends[i, 0])
+        v0, v1 = min(v0, ends[i, 1]), max(v1, ends[i, 1])
+    # A scan reaches a small part of a map: only the rectangle around its beams is cleared and counted.
+    rows = slice(min(max(floor(v0), 0), height), max(min(floor(v1) + 1, height), 0))
+    columns = slice(min(max(floor(u0), 0), width), max(min(floor(u1) + 1, width), 0))
+    hits[rows, columns] = 0
+    misses[rows, columns] = 0
     trace(hits, misses, origins, ends, np.ones(len(points), dtype=np.uint8))
-    for v in range(counts.shape[0]):
-        for u in range(counts.shape[1]):
+    for v in range(rows.start, rows.stop):
+        for u in range(columns.start, columns.stop):
             if hits[v, u] + misses[v, u] > 0:
                 counts[v, u] += 1
 

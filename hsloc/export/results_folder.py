@@ -22,8 +22,9 @@ from hsloc.errors import OutputError
 from hsloc.evaluation import write_json, write_tum
 from hsloc.export.provenance import config_text, provenance
 from hsloc.export.run_mcap import LAYOUT_FILE, RunRecording, write_layout
+from hsloc.garbage_collection import rarely_collected
 from hsloc.maps import save_map
-from hsloc.report.data import ReportParts
+from hsloc.report.data import ReportParts, prepare
 from hsloc.report.html import write_report_html
 from hsloc.report.map_image import THUMBNAIL_FILE, draw_thumbnail
 from hsloc.report.png import draw_report
@@ -85,7 +86,7 @@ def write_results(
     folder = Path(folder)
     refuse_folder(folder, overwrite)
     folder = folder.resolve()  # "." and ".." have no name of their own, and a link stays what it is
-    with whole_folder(folder) as partial:
+    with whole_folder(folder) as partial, rarely_collected():
         return _write(result, partial, progress)
 
 
@@ -130,10 +131,11 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
             write_state(result.mapping.state, folder / STATE_FILE)
     write_json(folder / "metrics.json", analysis.metrics.to_json())
     (folder / "config.yaml").write_text(config_text(result), encoding="utf-8")
-    draw_report(folder / "report.png", parts)
-    draw_thumbnail(folder / THUMBNAIL_FILE, parts)
-    view = view_of(parts)
-    write_report_html(folder / "report.html", parts, view)
+    data = prepare(parts)
+    draw_report(folder / "report.png", parts, data)
+    draw_thumbnail(folder / THUMBNAIL_FILE, parts, data)
+    view = view_of(parts, data)
+    write_report_html(folder / "report.html", parts, view, data)
     seconds["reports"] = time.perf_counter() - begin
     timings = run_timings(result, seconds)
     write_json(folder / "timings.json", timings.to_json())

@@ -53,13 +53,15 @@ _OF_THE_FIRST = (
 """Parts of a view that are drawn of the first run alone."""
 
 
-def write_report_html(path: str | Path, parts: ReportParts, view: ReportView | None = None) -> None:
+def write_report_html(
+    path: str | Path, parts: ReportParts, view: ReportView | None = None, data: ReportData | None = None
+) -> None:
     """Write the report of a run as one self-contained HTML file: the same run gives the same bytes.
 
-    `view` is what `view_of(parts)` gave, where it is known already. All text is escaped. Raises `OutputError` where
-    the file cannot be written.
+    `view` is what `view_of(parts)` gave and `data` what `prepare(parts)` did, where they are known already. All text
+    is escaped. Raises `OutputError` where the file cannot be written.
     """
-    data, metrics = prepare(parts), parts.metrics
+    data, metrics = prepare(parts) if data is None else data, parts.metrics
     summary = None if metrics is None else ResultSummary.of(metrics)
     view = view_of(parts, data) if view is None else view
     values = view.values if view.map_png is None else view.with_picture(data_url(view.map_png))

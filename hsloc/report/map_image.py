@@ -133,11 +133,14 @@ def shown_extent(data: ReportData, grid: OccupancyGrid | None, points: Floats | 
     return Extent(*(middle - half).tolist(), *(middle + half).tolist())
 
 
-def draw_thumbnail(path: Path, parts: ReportParts) -> None:
-    """Write a picture of map and trajectory that is small enough for a table of results; known poses are blue."""
+def draw_thumbnail(path: Path, parts: ReportParts, data: ReportData | None = None) -> None:
+    """Write a picture of map and trajectory that is small enough for a table of results; known poses are blue.
+
+    `data` is what `prepare(parts)` gave, where it is known already.
+    """
     from PIL import Image, ImageDraw
 
-    data, grid = prepare(parts), parts.grid
+    data, grid = prepare(parts) if data is None else data, parts.grid
     width, height = (_FINER * side for side in THUMBNAIL)
     extent = shown_extent(data, grid, parts.points).widened(width / height)
     pixel = extent.width / width
@@ -157,14 +160,20 @@ def draw_thumbnail(path: Path, parts: ReportParts) -> None:
     draw = ImageDraw.Draw(image)
     for rows_of, colour in ((~data.localised, style.PURPLE), (data.localised, style.BLUE)):
         line = with_gaps(np.where(rows_of[:, None], data.path, np.nan), data.jumps)
-        line = (line - (extent.x0, extent.y1)) * (1.0 / pixel, -1.0 / pixel)
-        for piece in np.split(line, np.flatnonzero(~np.isfinite(line[:, 0]))):
-            shown = np.round(piece[np.isfinite(piece[:, 0])], 1)
-            if len(shown):
-                every = np.append(np.any(np.diff(shown, axis=0) != 0.0, axis=1), True)
-                draw.line(shown[every].reshape(-1).tolist(), fill=colour, width=2 * _FINER - 1)
-                draw.circle(shown[0].tolist(), 2 * _FINER - 1, fill=colour)  # also of a robot that stood still
+        line = np.round((line - (extent.x0, extent.y1)) * (1.0 / pixel, -1.0 / pixel), 1)
+        for begin, end in known_runs(line):
+            shown = line[begin:end]
+            every = np.append(np.any(np.diff(shown, axis=0) != 0.0, axis=1), True)
+            draw.line(shown[every].reshape(-1).tolist(), fill=colour, width=2 * _FINER - 1)
+            draw.circle(shown[0].tolist(), 2 * _FINER - 1, fill=colour)  # also of a robot that stood still
     image.reduce(_FINER).save(path, optimize=True)
+
+
+def known_runs(line: Floats) -> list[list[int]]:
+    """First row of each run of known points of a path (n, 2), and the row after its last; NaN is between runs."""
+    known = np.concatenate(([False], np.isfinite(line).all(axis=1), [False]))
+    runs: list[list[int]] = np.flatnonzero(known[1:] != known[:-1]).reshape(-1, 2).tolist()
+    return runs
 
 
 def line_width(data: ReportData, extent: Extent) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from PIL import Image
 
 from hsloc.atomic_write import write_atomically
 from hsloc.errors import OutputError, not_written
@@ -69,10 +70,11 @@ FORMATS: dict[str, dict[str, str | None]] = {
 """Kinds of picture, without the time, so that the same errors give the same bytes."""
 
 
-def draw_report(path: str | Path, parts: ReportParts) -> None:
+def draw_report(path: str | Path, parts: ReportParts, data: ReportData | None = None) -> None:
     """Draw the report of a run as a PNG of 1600 x 1000 pixels: the same run gives the same bytes.
 
-    Raises `OutputError` where `path` cannot be written.
+    `data` is what `prepare(parts)` gave, where it is known already. Raises `OutputError` where the file cannot be
+    written.
     """
     # A user's matplotlibrc must not change the picture.
     defaults = {
@@ -84,17 +86,20 @@ def draw_report(path: str | Path, parts: ReportParts) -> None:
     ):
         # A letter that the font lacks becomes a box in the picture: the user need not be warned.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
-        figure = report_figure(parts)
-        # Without the version of matplotlib in the file. Level 3 of zlib: 3 % more bytes in two thirds of the time.
-        options: dict[str, Any] = {"metadata": {"Software": None}, "pil_kwargs": {"compress_level": 3}}
-        write_atomically(Path(path), lambda stream: figure.savefig(stream, format="png", dpi=DPI, **options))
+        canvas = FigureCanvasAgg(report_figure(parts, data))
+        canvas.draw()  # type: ignore[no-untyped-call]
+    pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+    # None of them is clear. Level 3 of zlib: 3 % more bytes than at 6 in two thirds of the time.
+    image = Image.fromarray(pixels).convert("RGB")
+    write_atomically(Path(path), lambda stream: image.save(stream, format="PNG", dpi=(DPI, DPI), compress_level=3))
 
 
-def report_figure(parts: ReportParts) -> Figure:
-    """The picture before it is drawn."""
+def report_figure(parts: ReportParts, data: ReportData | None = None) -> Figure:
+    """The picture before it is drawn; `data` is what `prepare(parts)` gave, where it is known already."""
     figure = Figure(figsize=(WIDTH, HEIGHT), dpi=DPI, facecolor=style.PAPER)
     FigureCanvasAgg(figure)
-    data, summary = prepare(parts), None if parts.metrics is None else ResultSummary.of(parts.metrics)
+    data = prepare(parts) if data is None else data
+    summary = None if parts.metrics is None else ResultSummary.of(parts.metrics)
     rows = [] if summary is None else list(summary.figures)
     extent, panels = shown_extent(data, parts.grid, parts.points), run_charts(data)[:MOST_PANELS]
     left, bottom, width, height = _place(figure, extent, panels, rows, data)
@@ -150,13 +155,14 @@ def _shortened(text: str, most: int) -> str:
 def _fit(line: Text, texts: list[str], width: float) -> None:
     """Show the first of the texts that is at most `width` (a part of the picture) wide, else the last."""
     low, high = 0, len(texts) - 1  # Each is shorter than the one before.
+    middle = 0  # Most lines have room: to measure a text takes as long as to draw it.
     while low < high:
-        middle = (low + high) // 2
         line.set_text(texts[middle])
         if line.get_window_extent().width / (WIDTH * DPI) <= width:
             high = middle
         else:
             low = middle + 1
+        middle = (low + high) // 2
     if texts:
         line.set_text(texts[low])
 

@@ -6,18 +6,21 @@ from math import floor, log10
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.font_manager import FontProperties
 from matplotlib.markers import MarkerStyle
+from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, StrMethodFormatter
+from matplotlib.textpath import TextPath
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator, StrMethodFormatter
 from matplotlib.transforms import Affine2D
 
 from hsloc.model import Status
 from hsloc.report import style
 from hsloc.report.data import Curve, with_gaps
-from hsloc.report.map_image import line_width, picture_of
+from hsloc.report.map_image import known_runs, line_width, picture_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
@@ -34,6 +37,8 @@ _PLACE = np.array(((13.0, 0.0), (-9.0, 8.0), (-5.0, 0.0), (-9.0, -8.0), (13.0, 0
 """An arrow, as vertices of a marker."""
 MOST_TO_CHECK = 40
 """Places to check that are drawn: more would hide the map."""
+_SIGN_OFFSET = np.array((0.36, 0.45))
+"""By which the "!" is left of and below the middle of its triangle (points): its parts then lie on whole pixels."""
 HALO = [withStroke(linewidth=3.0, foreground="white")]
 
 
@@ -72,8 +77,12 @@ def _draw_grid(axes: Axes, grid: OccupancyGrid, pixels: float) -> None:
     picture = picture_of(grid, pixels)
     if picture is None:
         return
+    # Opaque, on a panel of the colour of what is unknown, and as numbers from 0 to 1: matplotlib takes half the time.
+    # It cuts off what is behind the point of 255 times the number: this is the level itself or a little more.
+    levels = (picture.levels + np.float32(0.25)) / np.float32(255.25)
+    levels[..., 3] = 1.0
     image = axes.imshow(
-        picture.levels, origin="lower", zorder=1, interpolation="antialiased",
+        levels, origin="lower", zorder=1, interpolation="antialiased",
         extent=(0.0, picture.width, 0.0, picture.height), aspect="equal",
     )  # fmt: skip
     pose = picture.T_map_corner
@@ -157,11 +166,15 @@ def draw_places_to_check(axes: Axes, places: Sequence[tuple[float, float]]) -> N
         *shown.T, linestyle="none", marker="^", color="white", markersize=13, markeredgecolor=style.VERMILLION,
         markeredgewidth=1.6, label="place to check", zorder=10,
     )  # fmt: skip
-    for xy in shown:
-        axes.annotate(
-            "!", xy, xytext=(0, -1), textcoords="offset points", fontsize=8, fontweight="bold", color=style.VERMILLION,
-            ha="center", va="center", zorder=10, annotation_clip=True,
-        )  # fmt: skip
+    # One marker for all: as a text each would be laid out for itself.
+    sign = TextPath((0.0, 0.0), "!", size=8.0, prop=FontProperties(family=style.FONT, weight="bold"))
+    box, corners = sign.get_extents(), np.asarray(sign.vertices, dtype=np.float64)
+    corners = corners - 0.5 * (np.asarray(box.min) + np.asarray(box.max)) - _SIGN_OFFSET
+    size = 2.0 * float(np.abs(corners).max())  # matplotlib scales a shape by its largest coordinate
+    axes.plot(
+        *shown.T, linestyle="none", marker=Path(corners, sign.codes), color=style.VERMILLION, markersize=size,
+        markeredgewidth=0.0, zorder=10,
+    )  # fmt: skip
 
 
 def _draw_ends(axes: Axes, data: ReportData, extent: Extent) -> None:
@@ -240,10 +253,13 @@ def draw_panel(axes: Axes, chart: Chart, data: ReportData, *, with_time: bool) -
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
         axes.spines[side].set_color(style.RULE)
+    # Where a label is, matplotlib finds by measuring all numbers of the axis once more: not for those that are empty.
+    axes.yaxis.set_label_coords(0.0, 0.5)
     if with_time:
         axes.set_xlabel(f"time [{unit}]", fontsize=style.SMALL, color=style.MUTED, labelpad=2)
     else:
         axes.tick_params(labelbottom=False)
+        axes.xaxis.set_label_coords(0.5, 0.0)
 
 
 def _draw_line(axes: Axes, curve: Curve, chart: Chart) -> None:
@@ -255,8 +271,7 @@ def _draw_line(axes: Axes, curve: Curve, chart: Chart) -> None:
         floor = max(float(np.nanpercentile(curve.values, 1.0)), middle / 30.0)
         axes.set_ylim(floor, top * 1.4)
         axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axes.yaxis.set_minor_formatter(NullFormatter())
-        axes.tick_params(which="minor", length=0)
+        axes.yaxis.set_minor_locator(NullLocator())
         axes.plot(curve.seconds, np.maximum(curve.values, floor), color=style.BLUE, linewidth=1.1)
         return
     axes.fill_between(curve.seconds, 0.0, curve.values, color=style.BLUE, alpha=0.13, linewidth=0)
@@ -275,10 +290,11 @@ def draw_table(axes: Axes, rows: list[Row], *, line_height: float) -> None:
         for x, heading in ((0.74, "translation"), (1.0, "rotation")):
             axes.text(x, y, heading, ha="right", va="top", fontsize=style.SMALL, color=style.MUTED)
         y -= line_height
+    rules = []
     for row in rows:
         if y < 0.6 * line_height:
             break
-        axes.plot((0.0, 1.0), (y + 0.18 * line_height,) * 2, color=style.RULE, linewidth=0.7, clip_on=False)
+        rules.append(y + 0.18 * line_height)
         label = axes.text(0.0, y, row.label, ha="left", va="top", fontsize=style.TEXT, color=style.INK)
         for x, value in zip((0.74, 1.0) if len(row.values) == 2 else (1.0,), row.values, strict=True):
             text = axes.text(x, y, value, ha="right", va="top", fontsize=style.TEXT, color=style.INK, fontweight="bold")
@@ -287,11 +303,13 @@ def draw_table(axes: Axes, rows: list[Row], *, line_height: float) -> None:
                 text.set_y(y)
                 text.set_fontsize(style.TEXT * min(0.95 * axes.bbox.width / text.get_window_extent().width, 1.0))
         y -= line_height
+    ends = np.array([(x, rule) for rule in rules for x in (0.0, 1.0)]).reshape(-1, 2)
+    ends = with_gaps(ends, np.arange(len(ends)) % 2 == 0)
+    axes.plot(*ends.T, color=style.RULE, linewidth=0.7, clip_on=False)
 
 
 _BLOCK = 4096
-"""Points of a path that are Python's numbers at a time."""
-_BREAK = (float("nan"), float("nan"))
+"""Points of a path that are Python's numbers at a time: all of a long run would take ten times their memory."""
 
 
 def pieces_of(xy: Floats, finest: float) -> list[Floats]:
@@ -299,36 +317,24 @@ def pieces_of(xy: Floats, finest: float) -> list[Floats]:
 
     Distances are taken along the axes; the first and the last point of a piece are always kept.
     """
-    pieces: list[list[tuple[float, float]]] = [[]]
-    last = _BREAK
-    for x, y in _points(xy):
-        piece = pieces[-1]
-        if x != x or y != y:
-            if piece:
-                _end(piece, last)
-                pieces.append([])
-            continue
-        last = (x, y)
-        if not piece or abs(x - piece[-1][0]) + abs(y - piece[-1][1]) >= finest:
-            piece.append(last)
-    if pieces[-1]:
-        _end(pieces[-1], last)
-    return [np.array(piece) for piece in pieces if piece]
+    pieces = []
+    for begin, end in known_runs(xy):
+        rows = [begin]
+        x0, y0 = xy[begin].tolist()
+        for at in range(begin + 1, end, _BLOCK):
+            until = min(at + _BLOCK, end)
+            for row, x, y in zip(range(at, until), *xy[at:until].T.tolist(), strict=True):
+                if abs(x - x0) + abs(y - y0) >= finest:
+                    rows.append(row)
+                    x0, y0 = x, y
+        if (xy[end - 1] != (x0, y0)).any():
+            rows.append(end - 1)
+        pieces.append(xy[rows])
+    return pieces
 
 
 def joined(pieces: list[Floats]) -> Floats:
     """The pieces as one path again, NaN between them."""
-    gap = np.array([_BREAK])
+    gap = np.full((1, 2), np.nan)
     parts = [part for piece in pieces for part in (piece, gap)]
     return np.concatenate(parts[:-1]) if parts else gap[:0]
-
-
-def _end(piece: list[tuple[float, float]], last: tuple[float, float]) -> None:
-    if piece[-1] != last:
-        piece.append(last)
-
-
-def _points(xy: Floats) -> Iterator[tuple[float, float]]:
-    """Block by block: all points of a long run as Python's numbers would take ten times their memory."""
-    for at in range(0, len(xy), _BLOCK):
-        yield from xy[at : at + _BLOCK].tolist()

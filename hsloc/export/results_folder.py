@@ -30,7 +30,7 @@ from hsloc.report.map_image import THUMBNAIL_FILE, draw_thumbnail
 from hsloc.report.png import draw_report
 from hsloc.report.view import view_of
 from hsloc.slam.map_state import STATE_FILE, write_state
-from hsloc.trajectory_io.tum import format_stamp
+from hsloc.trajectory_io.tum import format_stamp, format_stamps
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -167,21 +167,19 @@ def report_parts(result: Result, analysis: Analysis) -> ReportParts:
 
 def write_states(path: Path, stamps_ns: NDArray[np.int64], rows: StateRows) -> None:
     """Write one line for each of the n stamps: seconds, metres and radians; nan where a figure is unknown."""
+    sigma = rows.sigma.T.tolist()
+    columns = (
+        format_stamps(stamps_ns),
+        [state.value for state in rows.state],
+        map("%.4f".__mod__, rows.probability.tolist()),
+        *(map(form.__mod__, column) for form, column in zip(("%.4f", "%.4f", "%.5f"), sigma, strict=True)),
+        map("%.3f".__mod__, rows.fitness.tolist()),
+        rows.reason,
+    )
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(STATES_HEADER)
-        columns = zip(
-            stamps_ns.tolist(),
-            rows.state,
-            rows.probability.tolist(),
-            rows.sigma.tolist(),
-            rows.fitness.tolist(),
-            rows.reason,
-            strict=True,
-        )
-        for stamp_ns, state, probability, (x, y, theta), fitness, reason in columns:
-            figures = (f"{probability:.4f}", f"{x:.4f}", f"{y:.4f}", f"{theta:.5f}", f"{fitness:.3f}")
-            writer.writerow((format_stamp(stamp_ns), state.value, *figures, reason))
+        writer.writerows(zip(*columns, strict=True))
 
 
 def write_hypotheses(path: Path, ambiguities: Sequence[Ambiguity]) -> None:
@@ -198,10 +196,8 @@ def write_covariances(path: Path, stamps_ns: NDArray[np.int64], covariances: NDA
     """Write one line for each of the n stamps: seconds, and the upper triangle of (n, 3, 3) in m^2, m rad and rad^2."""
     rows, columns = np.triu_indices(3)
     upper = covariances[:, rows, columns]
-    lines = [COVARIANCES_HEADER]
-    for stamp_ns, row in zip(stamps_ns.tolist(), upper.tolist(), strict=True):
-        lines.append(f"{format_stamp(stamp_ns)},%.4g,%.4g,%.4g,%.4g,%.4g,%.4g" % tuple(row))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    lines = map(("%s" + ",%.4g" * 6).__mod__, zip(format_stamps(stamps_ns), *upper.T.tolist(), strict=True))
+    path.write_text("\n".join((COVARIANCES_HEADER, *lines)) + "\n", encoding="utf-8")
 
 
 def merge_summary(merge: MapMerge) -> dict[str, Any]:

@@ -22,6 +22,8 @@ from hsloc.model import Trajectory
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from numpy.typing import NDArray
+
 NS_PER_S = 1_000_000_000
 MAX_NS = 2**63 - 1
 _BLOCK = 4096
@@ -33,6 +35,14 @@ def format_stamp(stamp_ns: int) -> str:
     """Integer nanoseconds as decimal seconds with 9 decimals: 1500000000 -> "1.500000000"."""
     seconds, rest = divmod(abs(stamp_ns), NS_PER_S)
     return f"{'-' if stamp_ns < 0 else ''}{seconds}.{rest:09d}"
+
+
+def format_stamps(stamps_ns: NDArray[np.int64]) -> list[str]:
+    """`format_stamp` of each of n stamps: in half the time, as long as none is before 1970."""
+    if len(stamps_ns) and stamps_ns.min() < 0:
+        return list(map(format_stamp, stamps_ns.tolist()))
+    parts = np.divmod(stamps_ns, NS_PER_S)
+    return list(map("%d.%09d".__mod__, zip(*(part.tolist() for part in parts), strict=True)))
 
 
 def parse_stamp(text: str) -> int:
@@ -72,11 +82,9 @@ def _lines(trajectory: Trajectory) -> str:
     half = trajectory.poses[:, 2] / 2.0
     # Adding 0.0 turns -0.0 into 0.0: the same pose always gives the same text.
     columns = np.round(np.column_stack((trajectory.poses[:, :2], np.sin(half), np.cos(half))), 12) + 0.0
-    stamps = trajectory.stamps_ns.tolist()
-    return "".join(
-        f"{format_stamp(stamp)} {x:.12f} {y:.12f} 0 0 0 {qz:.12f} {qw:.12f}\n"
-        for stamp, (x, y, qz, qw) in zip(stamps, columns.tolist(), strict=True)
-    )
+    form = "%s %.12f %.12f 0 0 0 %.12f %.12f\n"
+    rows = zip(format_stamps(trajectory.stamps_ns), *columns.T.tolist(), strict=True)
+    return "".join(map(form.__mod__, rows))
 
 
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:

@@ -14,14 +14,15 @@ demo: $(VENV)/.demo  ## replay a fixture recording on its map and show the error
 	$(BIN)/hsloc replay recordings/office.mcap --unknown-start --out results/demo --overwrite
 	@echo "Look at results/demo/report.png, or open results/demo/run.mcap in Lichtblick or Foxglove."
 
-# The kernels run twice: compiled, where coverage cannot see into them, and as plain Python, where it can. Each run has a
-# data file of its own, as pytest-cov erases what is beside its own.
+# The kernels run twice: compiled, where coverage cannot see into them, and as plain Python, where it can, beside the
+# others. Each run has a data file of its own, as pytest-cov erases what is beside its own.
 COVERAGE := build/coverage
 test: $(VENV)/.dev build/numba/.compiled  ## all tests on all cores, and the coverage gate (pyproject: fail_under)
 	rm -rf $(COVERAGE) && mkdir -p $(COVERAGE)/compiled $(COVERAGE)/plain
-	COVERAGE_FILE=$(COVERAGE)/compiled/data $(PYTEST) --cov --cov-report= --cov-fail-under=0
-	NUMBA_DISABLE_JIT=1 COVERAGE_FILE=$(COVERAGE)/plain/data \
-		$(PYTEST) -p no:cacheprovider --cov --cov-report= --cov-fail-under=0 tests/kernels
+	NUMBA_DISABLE_JIT=1 COVERAGE_FILE=$(COVERAGE)/plain/data $(BIN)/pytest -q -p no:cacheprovider \
+		--cov --cov-report= --cov-fail-under=0 tests/kernels >$(COVERAGE)/plain.txt 2>&1 & plain=$$!; \
+	COVERAGE_FILE=$(COVERAGE)/compiled/data $(PYTEST) --cov --cov-report= --cov-fail-under=0; failed=$$?; \
+	wait $$plain || failed=$$?; echo "-- the kernels as plain Python"; cat $(COVERAGE)/plain.txt; exit $$failed
 	$(BIN)/coverage combine -q --data-file=$(COVERAGE)/data $(COVERAGE)/compiled/data $(COVERAGE)/plain/data
 	$(BIN)/coverage report --data-file=$(COVERAGE)/data
 
@@ -53,6 +54,11 @@ $(VENV)/.demo: $(VENV)/bin/python pyproject.toml requirements.lock
 $(VENV)/.dev: $(VENV)/.demo
 	$(BIN)/python -m pip install -q --disable-pip-version-check -c requirements.lock -e '.[dev]'
 	touch $@
+
+# Both at once: pip builds and resolves once.
+$(VENV)/.all: $(VENV)/.demo
+	$(BIN)/python -m pip install -q --disable-pip-version-check -c requirements.lock -e '.[dev,docs]'
+	touch $(VENV)/.dev $(VENV)/.docs $@
 
 $(VENV)/.docs: $(VENV)/.demo
 	$(BIN)/python -m pip install -q --disable-pip-version-check -c requirements.lock -e '.[docs]'

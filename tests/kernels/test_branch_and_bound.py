@@ -178,7 +178,7 @@ def test_what_is_left_out_does_not_count_and_the_next_place_is_found(scene: Any)
     field = LikelihoodField.from_grid(OccupancyGrid(cells, 0.05, Pose2()))
     middle = field.to_cells(Pose2(2.0, 2.0, 0.3))
     side = 29.5
-    points = np.array([(side, t) for t in range(-28, 29, 2)] + [(-side, t) for t in range(-28, 29, 2)])
+    points = np.array([(end, t) for end in (side, -side) for t in range(-28, 29, 4)])
     points = np.concatenate((points, points[:, ::-1])).astype(np.float32)
     box = np.array([[*middle[:2], 0.0, 20.0, 20.0, pi]])
     places = NO_PLACES

@@ -21,7 +21,7 @@ TRUE = Pose2(1.3, 0.4, 0.7)
 def found() -> Any:
     grid, walls = naive.room()
     field = LikelihoodField.from_grid(grid)
-    points = naive.scan_points(walls, TRUE, 60)
+    points = naive.scan_points(walls, TRUE, 40)
     return grid, field, points, WholeMapSearch(grid, field).search(points)
 
 

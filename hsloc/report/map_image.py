@@ -71,24 +71,29 @@ class Extent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """The known part of a map as RGBA (height, width, 4), row 0 at the bottom; unknown is clear.
+    """The known part of a map (height, width) from 0 (free) to 100 (wall), -1 unknown, row 0 at the bottom.
 
     `T_map_corner` is the pose of its lower left corner, `side` the side of a pixel in metres.
     """
 
-    levels: NDArray[np.uint8]
+    values: NDArray[np.int8]
     T_map_corner: Pose2
     side: float
 
     @property
+    def levels(self) -> NDArray[np.uint8]:
+        """RGBA (height, width, 4); unknown is clear."""
+        return grey_levels()[self.values]
+
+    @property
     def width(self) -> float:
         """In metres."""
-        return float(self.levels.shape[1] * self.side)
+        return float(self.values.shape[1] * self.side)
 
     @property
     def height(self) -> float:
         """In metres."""
-        return float(self.levels.shape[0] * self.side)
+        return float(self.values.shape[0] * self.side)
 
 
 def picture_of(grid: OccupancyGrid, most_pixels: float) -> Picture | None:
@@ -101,7 +106,7 @@ def picture_of(grid: OccupancyGrid, most_pixels: float) -> Picture | None:
     factor = max(1, ceil(max(cells.shape) / most_pixels))
     corner = grid.origin @ (np.array((column, row)) * grid.resolution)
     return Picture(
-        grey_levels()[np.clip(darkest_of_blocks(cells, factor), -1, 100)],
+        np.clip(darkest_of_blocks(cells, factor), -1, 100),
         Pose2(float(corner[0]), float(corner[1]), grid.origin.theta),
         factor * grid.resolution,
     )
@@ -151,10 +156,10 @@ def draw_thumbnail(path: Path, parts: ReportParts, data: ReportData | None = Non
         y = extent.y1 - (np.arange(height) + 0.5) * pixel
         at = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         column, row = np.floor((picture.T_map_corner.inverse() @ at) / picture.side).astype(np.int64).T
-        rows, columns = picture.levels.shape[:2]
+        rows, columns = picture.values.shape
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         colours = np.zeros((width * height, 4), dtype=np.uint8)
-        colours[inside] = picture.levels[row[inside], column[inside]]
+        colours[inside] = grey_levels()[picture.values[row[inside], column[inside]]]
         levels = Image.fromarray(colours.reshape(height, width, 4))
         image.paste(levels, mask=levels.getchannel("A"))
     draw = ImageDraw.Draw(image)

@@ -10,6 +10,7 @@ import hashlib
 from base64 import b64encode
 from dataclasses import replace
 from io import BytesIO
+from math import isfinite
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from PIL import Image
 from hsloc.model import Status
 from hsloc.report.charts import convergence_charts, run_charts
 from hsloc.report.data import peak_rows, prepare, since, status_counts
-from hsloc.report.map_image import picture_of, shown_extent
+from hsloc.report.map_image import grey_levels, picture_of, shown_extent
 from hsloc.report.summary import ResultSummary
 from hsloc.report.table import STATUS_WORDS, format_probability
 
@@ -119,11 +120,15 @@ def _map(grid: OccupancyGrid | None) -> tuple[dict[str, Any] | None, bytes | Non
     picture = None if grid is None else picture_of(grid, MOST_PIXELS)
     if picture is None:
         return None, None
-    # Grey and clear, the top row first.
-    levels = np.ascontiguousarray(picture.levels[::-1, :, (0, 3)])
+    corner, (height, width) = picture.T_map_corner, picture.values.shape
+    # Grey and clear, the top row first. As places of a palette: two thirds of the bytes, in a third of the time.
+    greys = grey_levels()[:, 0]
+    clear = len(greys) - 1
+    places = np.minimum(picture.values[::-1].astype(np.uint8), clear)  # -1 is 255 then
+    image = Image.frombytes("P", (width, height), places.tobytes())
+    image.putpalette(np.repeat(greys, 3).tobytes())
     stream = BytesIO()
-    Image.fromarray(levels).save(stream, format="PNG")
-    corner, (height, width) = picture.T_map_corner, levels.shape[:2]
+    image.save(stream, format="PNG", transparency=clear)
     frame = {"side": picture.side, "width": width, "height": height, "corner": [corner.x, corner.y, corner.theta]}
     return frame, stream.getvalue()
 
@@ -366,12 +371,14 @@ def _numbers(values: Floats, decimals: int) -> list[float | None]:
     """Rounded; what is not a number is null."""
     rounded = np.round(np.asarray(values, dtype=np.float64), decimals)
     rounded += 0.0  # no -0.0
-    return [value if known else None for value, known in zip(rounded.tolist(), np.isfinite(rounded), strict=True)]
+    return [
+        value if known else None for value, known in zip(rounded.tolist(), np.isfinite(rounded).tolist(), strict=True)
+    ]
 
 
 def _significant(values: Floats) -> list[float | None]:
     """Five figures, which are enough to read."""
-    return [float(f"{value:.5g}") if np.isfinite(value) else None for value in values.tolist()]
+    return [float(f"{value:.5g}") if isfinite(value) else None for value in values.tolist()]
 
 
 def _round(value: float) -> float:

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 _BIN_M = 0.005
 _MAX_DISTANCE_M = 5.0
 _BINS = int(_MAX_DISTANCE_M / _BIN_M) + 1
+_COUNTED_AT_ONCE = 100
+"""Scans whose points are counted together: one by one most of the time goes into the calls."""
 NEAR_WALL_M = 0.15
 """A point within this distance of an occupied cell is explained by the map."""
 _MISFIT_RATIO = 0.8
@@ -74,6 +76,7 @@ class Residuals:
             self._distance[row : row + len(distance)] = distance * grid.resolution
         self._T_grid_map = grid.origin.inverse()
         self._by_laser: dict[str, NDArray[np.int64]] = {}
+        self._waiting: dict[str, list[NDArray[np.float32]]] = {}
 
     def distances(self, points: Floats, T_map_base: Pose2) -> NDArray[np.float32]:
         """Distance of each of a scan's points (n, 2) to the nearest occupied cell [m]; beyond the map, the largest."""
@@ -84,12 +87,21 @@ class Residuals:
 
     def add(self, scan: Scan, distance: NDArray[np.float32]) -> None:
         """Count the points of a scan with their `distances` (n,); those outside the map count as far from any wall."""
-        bins = np.minimum(distance / _BIN_M, _BINS - 1).astype(np.int64)
-        counts = self._by_laser.setdefault(scan.frame_id, np.zeros(_BINS, dtype=np.int64))
-        counts += np.bincount(bins, minlength=_BINS)
+        waiting = self._waiting.setdefault(scan.frame_id, [])
+        waiting.append(distance)
+        if len(waiting) >= _COUNTED_AT_ONCE:
+            self._count()
+
+    def _count(self) -> None:
+        for frame, distances in self._waiting.items():
+            bins = np.minimum(np.concatenate(distances) / _BIN_M, _BINS - 1).astype(np.int64)
+            counts = self._by_laser.setdefault(frame, np.zeros(_BINS, dtype=np.int64))
+            counts += np.bincount(bins, minlength=_BINS)
+        self._waiting = {}
 
     def metrics(self) -> ResidualMetrics:
         """The figures over all lasers; where there are several, also those of each."""
+        self._count()
         whole = _figures(sum(self._by_laser.values(), np.zeros(_BINS, dtype=np.int64)))
         by_laser = None
         if len(self._by_laser) > 1:
@@ -104,6 +116,7 @@ class Residuals:
 
     def warnings(self) -> list[RunWarning]:
         """A warning for each laser whose scans fit the map far worse than those of the best one."""
+        self._count()
         near = {frame: _figures(counts).within_15_cm for frame, counts in sorted(self._by_laser.items())}
         known = {frame: part for frame, part in near.items() if part is not None}
         if len(known) < 2:

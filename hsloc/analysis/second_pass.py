@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+from math import pi
 from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from hsloc.garbage_collection import rarely_collected
 from hsloc.log import open_log
 from hsloc.model.events import Odometry, PairedScan, Scan
-from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle
 from hsloc.preprocessing.odometry import ContinuousOdometry
 from hsloc.preprocessing.scans import ScanWatch, pair
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
+    from numpy.typing import NDArray
+
     from hsloc.model.events import Event
     from hsloc.replay.run import Result
+
+    F64 = NDArray[np.float64]
+
+_BLOCK = 4096
+"""Poses that are Python's numbers at a time."""
 
 
 class PosedEvent(NamedTuple):
@@ -35,16 +45,12 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
     part that is done.
     """
     log = result.log or open_log(result.request.logs, result.reading or result.request.reading())
-    poses, odometry = result.trajectory.poses, result.odometry.poses
+    poses = result.trajectory.poses
     localised = result.localised if result.tracked is None else result.tracked
-    first = None if result.follows_scans else Pose2.from_array(odometry[0])
+    first = None if result.follows_scans else Pose2.from_array(result.odometry.poses[0])
     row = -1
-    known: tuple[Pose2, Pose2] | None = None
-
-    def correction(row: int) -> tuple[Pose2, Pose2]:
-        # In Python's own numbers, which are ten times as fast as numpy's single ones.
-        T_map_base = Pose2(*poses[row].tolist())
-        return T_map_base @ Pose2(*odometry[row].tolist()).inverse(), T_map_base
+    corrections = _corrections(result)
+    T_map_odom: Pose2 | None = None
 
     with rarely_collected():
         events = _with_recorded_odometry(log.events(), result) if result.lidar_only else log.events()
@@ -56,14 +62,45 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
                     row += 1
                     yield PosedEvent(event, IDENTITY, Pose2(*poses[row].tolist()), True)
                 else:
-                    T_map_odom = (known or correction(0))[0]
+                    if T_map_odom is None:
+                        T_map_odom = next(_corrections(result))[0]
                     yield PosedEvent(event, T_map_odom, T_map_odom @ event.T_odom_base, bool(localised[max(row, 0)]))
             elif isinstance(event, Odometry) and not result.follows_scans:
                 row += 1
-                known = correction(row)
-                yield PosedEvent(event, *known, bool(localised[row]))
+                T_map_odom, T_map_base, known = next(corrections)
+                yield PosedEvent(event, T_map_odom, T_map_base, known)
             if progress is not None and row % 500 == 0:
                 progress(row / len(result.trajectory))
+
+
+def _corrections(result: Result) -> Iterator[tuple[Pose2, Pose2, bool]]:
+    """T_map_odom and T_map_base at each odometry message, and whether the pose follows a track.
+
+    Computed for a few thousand at once: for each alone it takes ten times as long, and a long run has many.
+    """
+    localised = result.localised if result.tracked is None else result.tracked
+    for at in range(0, len(result.odometry), _BLOCK):
+        rows = slice(at, at + _BLOCK)
+        poses = result.trajectory.poses[rows]
+        corrections = _after_inverse(poses, result.odometry.poses[rows]).tolist()
+        for T_map_odom, T_map_base, known in zip(corrections, poses.tolist(), localised[rows].tolist(), strict=True):
+            yield Pose2(*T_map_odom), Pose2(*T_map_base), known
+
+
+def _after_inverse(first: F64, second: F64) -> F64:
+    """`first @ second^-1` row by row (n, 3), to the last digit as `Pose2` has it."""
+    c, s = np.cos(second[:, 2]), np.sin(second[:, 2])
+    x, y = -c * second[:, 0] - s * second[:, 1], s * second[:, 0] - c * second[:, 1]
+    c, s = np.cos(first[:, 2]), np.sin(first[:, 2])
+    theta = _wrapped(first[:, 2] + _wrapped(-second[:, 2]))
+    return np.column_stack((first[:, 0] + c * x - s * y, first[:, 1] + s * x + c * y, theta))
+
+
+def _wrapped(angles: F64) -> F64:
+    """Angles (n,) in (-pi, pi], those that are there already as they were."""
+    outside = np.flatnonzero(~((angles > -pi) & (angles <= pi)))
+    angles[outside] = [wrap_angle(angle) for angle in angles[outside].tolist()]
+    return angles
 
 
 def _with_recorded_odometry(events: Iterable[Event], result: Result) -> Iterator[Event]:

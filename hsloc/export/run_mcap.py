@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -61,6 +62,7 @@ class RunRecording:
         self._start = int(result.trajectory.stamps_ns[0])
         self._mountings: set[str] = set()
         self._scans = 0
+        self._fitness: list[float] = result.diagnostics.fitness.tolist()
         self._writer = LogWriter(path)
         self.seconds = 0.0
 
@@ -100,8 +102,8 @@ class RunRecording:
             self._writer.scan(scan)
             if (covariance := self._covariance(self._scans)) is not None:
                 self._writer.pose_with_covariance(scan.stamp_ns, posed.T_map_base, covariance, "/pose_with_covariance")
-            fitness = float(self._result.diagnostics.fitness[self._scans])
-            if np.isfinite(fitness):
+            fitness = self._fitness[self._scans]
+            if isfinite(fitness):
                 self._writer.number(scan.stamp_ns, fitness, "/fitness")
             self._scans += 1
         else:

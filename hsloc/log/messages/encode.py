@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from math import cos, sin
 from struct import Struct, pack
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.errors import OutputError
-from hsloc.log.messages.decode import PLANE
 from hsloc.log.transforms import Transform3
 from hsloc.model import Pose2
 
@@ -32,6 +32,9 @@ _STAMP = Struct("<iI")
 _COUNT = Struct("<I")
 _SCAN = Struct("<7f")
 _POSE = Struct("<7d")
+_COVARIANCE = Struct("<36d")
+_NOTHING = (0.0,) * 18
+"""Rows of a covariance over (x, y, z, roll, pitch, yaw) that a robot in the plane does not know."""
 _MAP_INFO = Struct("<iIfII")
 
 
@@ -88,14 +91,15 @@ def laser_scan(scan: Scan, frame_id: str, scan_time: float) -> bytes:
 
 
 def _pose(pose: Pose2) -> bytes:
-    return _POSE.pack(pose.x, pose.y, 0.0, *pose.to_quaternion())
+    half = pose.theta / 2.0  # `to_quaternion`, without a call: each message of a run has a pose
+    return _POSE.pack(pose.x, pose.y, 0.0, 0.0, 0.0, sin(half), cos(half))
 
 
 def _covariance(covariance: NDArray[np.float64] | None) -> bytes:
-    full = np.zeros(36, dtype="<f8")
-    if covariance is not None:
-        full[PLANE] = np.asarray(covariance, dtype=np.float64).reshape(9)
-    return full.tobytes()
+    if covariance is None:
+        return bytes(_COVARIANCE.size)
+    (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = np.asarray(covariance, dtype=np.float64).tolist()
+    return _COVARIANCE.pack(xx, xy, 0, 0, 0, xt, yx, yy, 0, 0, 0, yt, *_NOTHING, tx, ty, 0, 0, 0, tt)
 
 
 _NO_COVARIANCE = _covariance(None)
@@ -178,10 +182,10 @@ def path(stamp_ns: int, trajectory: Trajectory, frame_id: str) -> bytes:
     parts = [ENCAPSULATION, stamp_bytes(stamp_ns), head, _COUNT.pack(len(trajectory))]
     offset = 8 + len(head) + 4
     cosines, sines = np.cos(trajectory.poses[:, 2] / 2.0), np.sin(trajectory.poses[:, 2] / 2.0)
-    rows = zip(trajectory.stamps_ns, trajectory.poses, sines, cosines, strict=True)
-    for stamp, (x, y, _), sine, cosine in rows:
+    columns = (trajectory.stamps_ns, trajectory.poses, sines, cosines)
+    for stamp, (x, y, _), sine, cosine in zip(*(column.tolist() for column in columns), strict=True):
         name = padded_string(frame_id, offset % 8, 8)
-        parts += (stamp_bytes(int(stamp)), name, _POSE.pack(x, y, 0.0, 0.0, 0.0, sine, cosine))
+        parts += (stamp_bytes(stamp), name, _POSE.pack(x, y, 0.0, 0.0, 0.0, sine, cosine))
         offset += 8 + len(name) + _POSE.size
     return b"".join(parts)
 

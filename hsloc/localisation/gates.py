@@ -59,17 +59,22 @@ class RestGate:
     """
 
     def __init__(self) -> None:
-        self.stands = False
+        self._before: Pose2 | None = None
         self._T_odom_base: Pose2 | None = None
         self._fitness = 0.0
         self._left_out = self._in_vain = 0
 
     def follow(self, T_odom_base: Pose2) -> None:
         """The next odometry message."""
-        if self._T_odom_base is not None:
-            step = self._T_odom_base.between(T_odom_base)
-            self.stands = hypot(step.x, step.y) < _STILL_M and abs(step.theta) < _STILL_RAD
-        self._T_odom_base = T_odom_base
+        self._before, self._T_odom_base = self._T_odom_base, T_odom_base
+
+    @property
+    def stands(self) -> bool:
+        """Whether the odometry stands still, by its last two messages. Few are asked for of all that come."""
+        if self._before is None or self._T_odom_base is None:
+            return False
+        step = self._before.between(self._T_odom_base)
+        return hypot(step.x, step.y) < _STILL_M and abs(step.theta) < _STILL_RAD
 
     def is_open(self, fitness: float) -> bool:
         """Whether a scan of this fitness at the place of the last match is worth a search."""

@@ -52,7 +52,8 @@ _LEAST_NOISE = 0.04
 """And at least: a fifth of the standard deviation, the 2 % of the distance of wheels that are calibrated well."""
 _MOST_NOISE = 30.0
 """Variance of the odometry by the assumed one, at most: half of the distance, more than its whole turn."""
-_NO_NOISE = 1e-10 * np.eye(3)
+_EYE = np.eye(3)
+_NO_NOISE = 1e-10 * _EYE
 
 
 def transition(pose: Pose2, motion: Pose2) -> F64:
@@ -74,7 +75,7 @@ def fuse(prediction: Pose2, covariance: F64, measured: Pose2, measured_covarianc
     """The EKF's update with a measured pose: `K = P (P + R)^-1`."""
     gain = np.linalg.solve((covariance + measured_covariance).T, covariance.T).T
     pose = Pose2.from_array(prediction.to_array() + gain @ difference(measured, prediction))
-    updated = (np.eye(3) - gain) @ covariance
+    updated = (_EYE - gain) @ covariance
     return pose, 0.5 * (updated + updated.T)
 
 
@@ -83,7 +84,7 @@ def update_with_information(prediction: Pose2, covariance: F64, measured: Pose2,
 
     Where the information is zero the prediction stays as it is, and so does its variance.
     """
-    updated = np.linalg.solve(np.eye(3) + covariance @ information, covariance)
+    updated = np.linalg.solve(_EYE + covariance @ information, covariance)
     updated = 0.5 * (updated + updated.T)
     pose = Pose2.from_array(prediction.to_array() + updated @ information @ difference(measured, prediction))
     return pose, updated
@@ -98,7 +99,7 @@ def fuse_match(prediction: Pose2, covariance: F64, match: Match, information: F6
 
 def is_slip(innovation: F64, covariance: F64, information: F64) -> bool:
     """Whether an innovation (3,), by covariance of the prediction and information of the match (3, 3), is no noise."""
-    weight = information @ np.linalg.inv(np.eye(3) + covariance @ information)
+    weight = information @ np.linalg.inv(_EYE + covariance @ information)
     return float(innovation @ weight @ innovation) > MAX_SQUARED
 
 
@@ -134,7 +135,7 @@ class Innovations:
         trace of the gain.
         """
         covariance = propagated + max(self.noise_scale, 1.0) * noise
-        weight: F64 = information @ np.linalg.inv(np.eye(3) + covariance @ information)
+        weight: F64 = information @ np.linalg.inv(_EYE + covariance @ information)
         found = weight
         squared = float(innovation @ weight @ innovation)
         freedom = float(np.trace(covariance @ weight))
@@ -143,7 +144,7 @@ class Innovations:
         self._excess += _EXCESS_GAIN * (min(squared / freedom, _MOST_EXCESS) - self._excess)
         if self.noise_scale < 1.0:
             scaled = propagated + self.noise_scale * noise
-            weight = information @ np.linalg.inv(np.eye(3) + scaled @ information)
+            weight = information @ np.linalg.inv(_EYE + scaled @ information)
             squared = float(innovation @ weight @ innovation)
         part = weight @ (self.noise_scale * noise)
         limited = min(1.0, MAX_SQUARED / squared) if squared > 0.0 else 1.0  # a slip is not noise

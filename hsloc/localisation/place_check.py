@@ -14,6 +14,7 @@ better than the scans: at the robot's own place, seen in the mirror.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -205,7 +206,7 @@ class PlaceCheck:
 
     def few(self, points: F64) -> F64:
         """The points of a scan that take part in a comparison, spread evenly over its beams."""
-        return np.asarray(points[low_discrepancy_order(len(points))[: self.parameters.points]])
+        return np.asarray(points[_spread(len(points), self.parameters.points)])
 
     @property
     def search(self) -> WholeMapSearch:
@@ -238,6 +239,14 @@ class PlaceCheck:
         mirrored = cloud * np.array((1.0, -1.0))
         place, fitness = fittest_other(self.search, self._field, mirrored, anywhere, self.parameters.max_boxes)
         return fitness / own if place is not None or fitness < own else float("nan")
+
+
+@lru_cache(maxsize=1024)
+def _spread(beams: int, count: int) -> NDArray[np.int64]:
+    """`count` of a number of beams, spread evenly; most scans of a lidar have as many hits as one before."""
+    chosen = low_discrepancy_order(beams)[:count].copy()
+    chosen.flags.writeable = False
+    return chosen
 
 
 def _polar(points: F64) -> F64:

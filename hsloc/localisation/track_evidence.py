@@ -285,7 +285,8 @@ def usual_explained(rows: Sequence[TrackRow]) -> float:
 
 def _product(first: States, second: States) -> States:
     """State by state, normalised to the sum 1; none becomes zero, so that no state is ruled out for ever."""
-    a, b, c = (max(x * y, _SMALLEST) for x, y in zip(first, second, strict=True))
+    (a, b, c), (x, y, z) = first, second
+    a, b, c = max(a * x, _SMALLEST), max(b * y, _SMALLEST), max(c * z, _SMALLEST)
     total = a + b + c
     return a / total, b / total, c / total
 

@@ -67,8 +67,8 @@ class UnstalledOdometry:
         """The first message of those that are the same."""
         self._repeated: Odometry | None = None
         """The last one of them, while they are held back."""
-        self._speeds = (0.0, 0.0)
-        """Those with which the odometry came to the last one (m/s, rad/s)."""
+        self._before: Odometry | None = None
+        """The one that moved on before that."""
         self._held: list[Event] = []
         self._jump: Odometry | None = None
         """The message after them, while it is not known whether the robot moves after it."""
@@ -119,9 +119,14 @@ class UnstalledOdometry:
         if self._last is None:
             self._start_ns = event.stamp_ns
         else:
-            self._speeds = _speeds(self._last, event)
+            self._before = self._last
         self._interpolations.follow(event)
         self._last, self._held, self._repeated, self._jump, self._is_at_rest = event, [], None, None, False
+
+    @property
+    def _speeds(self) -> tuple[float, float]:
+        """Those with which the odometry came to the last message that moved on (m/s, rad/s); only stalls need them."""
+        return _speeds(self._before, self._last)
 
     def _is_stall(self, last: Odometry, repeated: Odometry, event: Odometry) -> bool:
         """Whether the odometry jumps to `event` by what a robot drives since `last`, and not since `repeated`."""
@@ -186,7 +191,8 @@ class _LateOdometry:
         self._events = events
         self._intervals: deque[int] = deque(maxlen=_INTERVALS)
         self._latest: Odometry | None = None
-        self._speeds = (0.0, 0.0)
+        self._step: tuple[Odometry | None, Odometry | None] = None, None
+        """The last two messages that came in time."""
         self._scans = 0
         self._before: Odometry | None = None
         """The last message before the gap, while what comes after it is held back."""
@@ -221,7 +227,7 @@ class _LateOdometry:
                 self._held.append(event)
                 return
             self._intervals.append(interval)
-            self._speeds = _speeds(latest, event)
+            self._step = latest, event
         yield event
 
     def _released(self) -> list[Event]:
@@ -231,7 +237,8 @@ class _LateOdometry:
         if before is None or len(burst) < 2:
             return held
         first, last = burst[0], burst[-1]
-        if not (_is_impossible(first, last, self._speeds) and _is_possible(before, last, self._speeds)):
+        speeds = _speeds(*self._step)
+        if not (_is_impossible(first, last, speeds) and _is_possible(before, last, speeds)):
             return held
         whole_ns = last.stamp_ns - before.stamp_ns
         self.found.append((before.stamp_ns, whole_ns))
@@ -249,8 +256,10 @@ def _step(before: Odometry, after: Odometry) -> tuple[float, float, float]:
     return hypot(b.x - a.x, b.y - a.y), abs(wrap_angle(b.theta - a.theta)), (after.stamp_ns - before.stamp_ns) / 1e9
 
 
-def _speeds(before: Odometry, after: Odometry) -> tuple[float, float]:
-    """In m/s and rad/s; 0 where no time passed."""
+def _speeds(before: Odometry | None, after: Odometry | None) -> tuple[float, float]:
+    """In m/s and rad/s; 0 where no time passed, and where there is no message."""
+    if before is None or after is None:
+        return 0.0, 0.0
     way, turn, seconds = _step(before, after)
     return (way / seconds, turn / seconds) if seconds > 0.0 else (0.0, 0.0)
 

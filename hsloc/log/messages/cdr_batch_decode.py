@@ -8,6 +8,7 @@ the word.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from math import atan2
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
             ...
 
 
+_FORMATS = {"seconds": "<i4", "nanoseconds": "<u4", "pose": "7<f8", "covariance": "36<f8"}
 _STAMP = slice(4, 12)
 """Where the stamp is, the one field before the pose that differs from message to message."""
 
@@ -53,7 +55,7 @@ class PoseColumns(NamedTuple):
 
 def odometry(payloads: Sequence[Payload], *, covariances: bool = True) -> PoseColumns | None:
     """nav_msgs/Odometry from CDR; None where the messages are not laid out alike. Covariances are read if asked for."""
-    found = _rows(payloads, decode.odometry_pose_at, {"pose": "7<f8", "covariance": "36<f8"})
+    found = _rows(payloads, decode.odometry_pose_at, ("pose", "covariance"))
     if found is None:
         return None
     return _poses(found, _covariances(found["covariance"]) if covariances else (None,) * len(found))
@@ -62,12 +64,12 @@ def odometry(payloads: Sequence[Payload], *, covariances: bool = True) -> PoseCo
 def pose_stamped(payloads: Sequence[Payload], *, covariances: bool = False) -> PoseColumns | None:
     """geometry_msgs/PoseStamped or PoseWithCovarianceStamped from CDR; None where they are not laid out alike."""
     del covariances  # not read one by one either
-    found = _rows(payloads, decode.stamped_pose_at, {"pose": "7<f8"})
+    found = _rows(payloads, decode.stamped_pose_at, ("pose",))
     return None if found is None else _poses(found, (None,) * len(found))
 
 
 def _rows(
-    payloads: Sequence[Payload], pose_at: Callable[[Payload], int], fields: dict[str, str]
+    payloads: Sequence[Payload], pose_at: Callable[[Payload], int], fields: tuple[str, ...]
 ) -> NDArray[np.void] | None:
     """The stamps of the messages, and the fields from the pose on; None where the messages are not laid out alike."""
     length = len(payloads[0])
@@ -75,9 +77,8 @@ def _rows(
         at = pose_at(payloads[0])
     except decode.BAD_PAYLOAD:
         return None
-    formats = ["<i4", "<u4", *fields.values()]
-    offsets = [4, 8, at, at + decode.POSE_BYTES][: len(formats)]
-    if offsets[-1] + np.dtype(formats[-1]).itemsize > length or set(map(len, payloads)) != {length}:
+    layout = _layout(fields, at, length)
+    if layout is None or set(map(len, payloads)) != {length}:
         return None
     joined = b"".join(payloads)
     head = np.frombuffer(joined, np.uint8).reshape(len(payloads), length)[:, :at]
@@ -85,9 +86,18 @@ def _rows(
     alike[:, _STAMP] = True
     if not alike.all():
         return None
-    names = ["seconds", "nanoseconds", *fields]
-    layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": length})
     return np.frombuffer(joined, layout)
+
+
+@lru_cache(maxsize=16)
+def _layout(fields: tuple[str, ...], at: int, length: int) -> np.dtype[np.void] | None:
+    """The layout of messages of this length, whose pose is `at` this byte; None where the fields do not fit in."""
+    names = ("seconds", "nanoseconds", *fields)
+    offsets = [4, 8, at, at + decode.POSE_BYTES][: len(names)]
+    if offsets[-1] + np.dtype(_FORMATS[names[-1]]).itemsize > length:
+        return None
+    formats = [_FORMATS[name] for name in names]
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": length})
 
 
 def _poses(rows: NDArray[np.void], covariances: Sequence[NDArray[np.float64] | None]) -> PoseColumns:

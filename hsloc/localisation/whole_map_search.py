@@ -164,7 +164,7 @@ class WholeMapSearch:
             return Places(np.empty((0, 3)), np.empty(0), 0, False)
         scaled = self._field.scale(points)
         rows, boxes, is_complete = self._candidates(scaled, demand, max_boxes)
-        poses = rows[:, :3]
+        poses = _poses(rows)
         return Places(poses, fitness_many(self._field.packed, scaled, poses), boxes, is_complete)
 
     def _seed(self, scaled: NDArray[np.float32]) -> tuple[Mode | None, int]:
@@ -180,7 +180,7 @@ class WholeMapSearch:
             candidates, more, _ = self._candidates(few, demand)
             boxes += more
             if len(candidates):
-                fitness = fitness_many(self._field.packed, scaled, candidates[:, :3])
+                fitness = fitness_many(self._field.packed, scaled, _poses(candidates))
                 order = np.argsort(-fitness, kind="stable")[:_POLISHED]
                 best, _, more, pose = self._maximise(scaled, candidates[order], np.empty((0, 3)), 0.0)
                 boxes += more
@@ -282,6 +282,11 @@ def join_scans(scans: Sequence[F64], T_odom_base: Sequence[Pose2]) -> F64:
     """
     last = T_odom_base[-1]
     return np.concatenate([last.between(pose) @ scan for scan, pose in zip(scans, T_odom_base, strict=True)])
+
+
+def _poses(rows: F64) -> F64:
+    """The poses (m, 3) of boxes, in one piece: the kernel is loaded once for all that call it."""
+    return np.ascontiguousarray(rows[:, :3])
 
 
 def _open_entries(grid: OccupancyGrid, field: LikelihoodField, shift: int) -> NDArray[np.bool_]:

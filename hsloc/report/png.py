@@ -86,7 +86,8 @@ def draw_report(path: str | Path, parts: ReportParts, data: ReportData | None = 
     ):
         # A letter that the font lacks becomes a box in the picture: the user need not be warned.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
-        canvas = FigureCanvasAgg(report_figure(parts, data))
+        canvas = report_figure(parts, data).canvas
+        assert isinstance(canvas, FigureCanvasAgg)  # that on which texts were measured already
         canvas.draw()  # type: ignore[no-untyped-call]
     pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
     # None of them is clear. Level 3 of zlib: 3 % more bytes than at 6 in two thirds of the time.

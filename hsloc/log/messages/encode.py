@@ -38,6 +38,7 @@ _NOTHING = (0.0,) * 18
 _MAP_INFO = Struct("<iIfII")
 
 
+@lru_cache(maxsize=16)  # Messages of one moment follow each other.
 def stamp_bytes(stamp_ns: int) -> bytes:
     """builtin_interfaces/Time. Raises OutputError for a time that 32-bit seconds cannot hold."""
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)

@@ -26,12 +26,13 @@ test: $(VENV)/.dev build/numba/.compiled  ## all tests on all cores, and the cov
 	$(BIN)/coverage combine -q --data-file=$(COVERAGE)/data $(COVERAGE)/compiled/data $(COVERAGE)/plain/data
 	$(BIN)/coverage report --data-file=$(COVERAGE)/data
 
-# Each process that runs tests would compile all kernels, which takes it a minute: here two compile a half each.
+# Each process that runs tests would compile all kernels, which takes it a minute: here two compile a half each. In half a
+# minute of the office a loop is closed.
 build/numba/.compiled: hsloc/kernels/*.py requirements.lock | $(VENV)/.dev
 	mkdir -p $(@D) && rm -rf build/compiled
 	export NUMBA_CACHE_DIR=$(CURDIR)/build/numba MPLCONFIGDIR=$(CURDIR)/build/matplotlib; \
 	$(BIN)/hsloc replay recordings/office.mcap --end 15 --unknown-start --certify -q --out build/compiled/replay & \
-	$(BIN)/hsloc map recordings/office.mcap --end 15 -q --out build/compiled/map && wait $$!
+	$(BIN)/hsloc map recordings/office.mcap --end 30 --time-offset auto -q --out build/compiled/map && wait $$!
 	touch $@
 
 lint: $(VENV)/.dev  ## style, types and the direction of imports

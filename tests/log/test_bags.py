@@ -150,6 +150,7 @@ def test_a_packed_log_that_was_cut_is_read_as_far_as_it_goes(tmp_path: Path, mca
     assert any("as far as it goes" in reason for reason in log.losses.reasons)
 
 
+@pytest.mark.unmeasured
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_bags_raise_nothing_but_our_errors(

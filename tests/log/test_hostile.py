@@ -94,6 +94,7 @@ def mutate(content: bytearray, place: int, kind: str, value: Any) -> None:
         content[at:at] = content[source : source + 200]
 
 
+@pytest.mark.unmeasured
 @settings(max_examples=EXAMPLES)
 @given(
     seed=st.integers(0, 7),

@@ -146,6 +146,7 @@ def test_what_goes_wrong_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "defect" in (tmp_path / "out" / "office-default-seed7.error.txt").read_text()
 
 
+@pytest.mark.unmeasured
 def test_a_run_that_ends_its_process_ends_no_other(tmp_path: Path) -> None:
     runs = plan([OFFICE], DEFAULT, range(3), read=SHORT)
     runs[1] = replace(runs[1], request=replace(runs[1].request, labels=(Bomb(),)))  # type: ignore[arg-type]
@@ -261,6 +262,7 @@ def test_an_interrupted_sweep_ends_with_its_threads() -> None:
     assert not [each for each in left if not each.daemon]
 
 
+@pytest.mark.unmeasured
 @pytest.mark.parametrize("after_s", [0.0, 1.0, 2.3])
 def test_an_interrupt_ends_a_sweep_with_one_line(tmp_path: Path, after_s: Any) -> None:
     """Workers that were still importing ended in tracebacks of 60 to 97 lines."""

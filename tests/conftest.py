@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-_LONGEST_FIRST = ("docs", "system", "sweep")
+_LONGEST_FIRST = ("docs", "system", "sweep", "analysis", "slam", "localisation", "reproduction")
 """Folders whose files take longest: begun last, they would leave one core with nothing to do at the end."""
 
 
@@ -46,7 +46,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     files = list(dict.fromkeys(item.path for item in items))
     waiting = [file for file in files if file.parent.name == "service"]
-    computing = sorted(set(files) - set(waiting), key=lambda file: (file.parent.name not in _LONGEST_FIRST, file))
+    ranks = {name: rank for rank, name in enumerate(_LONGEST_FIRST)}
+    computing = sorted(set(files) - set(waiting), key=lambda file: (ranks.get(file.parent.name, len(ranks)), file))
     mixed = [file for pair in zip_longest(computing, waiting) for file in pair if file is not None]
     items.sort(key=lambda item: mixed.index(item.path))
 

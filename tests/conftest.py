@@ -49,7 +49,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     ranks = {name: rank for rank, name in enumerate(_LONGEST_FIRST)}
     computing = sorted(set(files) - set(waiting), key=lambda file: (ranks.get(file.parent.name, len(ranks)), file))
     mixed = [file for pair in zip_longest(computing, waiting) for file in pair if file is not None]
-    items.sort(key=lambda item: mixed.index(item.path))
+    places = {file: place for place, file in enumerate(mixed)}
+    items.sort(key=lambda item: places[item.path])
 
 
 @cache

@@ -14,8 +14,9 @@ from hsloc.localisation.states import localisation_reasons
 from hsloc.model.pose2 import Pose2
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
 from hsloc.replay.clock_offset import KNOWN, matched_headings
+from hsloc.slam.heading_offset import find_offset
 from hsloc.slam.mounting_choice import laser_pose_option, right_mounting
-from hsloc.slam.time_offset import clock_warnings, drift_warning, find_drift, find_offset, offsets_of_log
+from hsloc.slam.time_offset import clock_warnings, drift_warning, find_drift, offsets_of_log
 from hsloc.trajectory_io.tum import NS_PER_S
 from hsloc.warnings import RunWarning, WarningCode
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from hsloc.model.calibration import OdometryCorrection
 from hsloc.model.pose2 import Pose2, compose_poses, relative_poses, wrap_angle, wrap_angles
-from hsloc.slam.time_offset import RANGE_S, Headings, find_offset
+from hsloc.slam.heading_offset import Headings, find_offset
+from hsloc.slam.time_offset import RANGE_S
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from hsloc.log import CheckReport, Finding, Log, ReadOptions
-    from hsloc.slam.time_offset import Offset
+    from hsloc.slam.heading_offset import Offset
 
 HELP = "check a log for what spoils results"
 EXAMPLES = """

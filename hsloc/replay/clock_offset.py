@@ -17,14 +17,9 @@ import numpy as np
 from hsloc.log import LONGEST_OFFSET_S, open_log
 from hsloc.options import AUTO
 from hsloc.replay.matched_scans import are_matched, is_lost
+from hsloc.slam.heading_offset import Headings, find_offset
 from hsloc.slam.mounting_choice import direction_warnings, right_mounting, with_chosen_mountings
-from hsloc.slam.time_offset import (
-    HINT_S,
-    Headings,
-    clock_warnings,
-    find_offset,
-    offsets_of_log,
-)
+from hsloc.slam.time_offset import HINT_S, clock_warnings, offsets_of_log
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -38,7 +33,7 @@ if TYPE_CHECKING:
     from hsloc.model.trajectory import Trajectory
     from hsloc.replay.run_history import RunHistory
     from hsloc.request import RunRequest
-    from hsloc.slam.time_offset import Offset
+    from hsloc.slam.heading_offset import Offset
 
 R = TypeVar("R")
 _TRANSFORMS = ("TFMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")

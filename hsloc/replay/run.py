@@ -63,9 +63,9 @@ if TYPE_CHECKING:
     from hsloc.model.trajectory import Trajectory
     from hsloc.replay.engine import Estimator
     from hsloc.replay.progress import Report
+    from hsloc.slam.heading_offset import Offset
     from hsloc.slam.mapper import Mapper
     from hsloc.slam.result import MappingResult
-    from hsloc.slam.time_offset import Offset
 
     Correction = tuple[MapScale, Pose2] | OdometryScale | None
     """Scale of the map, and the pose from which on it is right; or that of the odometry."""

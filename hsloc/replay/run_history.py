@@ -25,16 +25,8 @@ from hsloc.model.pose2 import Pose2, compose_poses
 from hsloc.model.trajectory import Trajectory
 from hsloc.preprocessing.scans import half_sweep_ns
 from hsloc.replay.matched_scans import are_matched, is_lost, mean_fitness
-from hsloc.slam.time_offset import (
-    LEAST_AGREEMENT,
-    NANOSECONDS,
-    UNKNOWN,
-    Headings,
-    agreement,
-    find_drift,
-    find_offset,
-    thinned,
-)
+from hsloc.slam.heading_offset import NANOSECONDS, UNKNOWN, Headings, find_offset, thinned
+from hsloc.slam.time_offset import LEAST_AGREEMENT, agreement, find_drift
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -46,8 +38,8 @@ if TYPE_CHECKING:
     from hsloc.model.certificate import Certificate
     from hsloc.model.estimate import Ambiguity, Estimate
     from hsloc.model.occupancy_grid import OccupancyGrid
+    from hsloc.slam.heading_offset import Offset
     from hsloc.slam.result import MappingResult
-    from hsloc.slam.time_offset import Offset
 
     F64 = NDArray[np.float64]
 

@@ -22,8 +22,9 @@ from hsloc.model.pose2 import Pose2, relative_poses, wrap_angle, wrap_angles
 from hsloc.options import AUTO
 from hsloc.preprocessing.odometry import ContinuousOdometry
 from hsloc.preprocessing.scans import half_sweep_ns
+from hsloc.slam.heading_offset import Headings, find_offset
 from hsloc.slam.laser_odometry import with_laser_odometry
-from hsloc.slam.time_offset import LEAST_AGREEMENT, Headings, find_offset
+from hsloc.slam.time_offset import LEAST_AGREEMENT
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ does not determine it. The odometry's errors in single turns average out over ma
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import isfinite, sqrt
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,11 +19,22 @@ from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.options import AUTO
 from hsloc.preprocessing.odometry_stalls import UnstalledOdometry
 from hsloc.preprocessing.scans import half_sweep_ns
+from hsloc.slam.heading_offset import (
+    MIN_STEPS,
+    NANOSECONDS,
+    NEAR_S,
+    UNKNOWN,
+    Headings,
+    Offset,
+    find_offset,
+    is_sparse,
+    thinned,
+)
 from hsloc.slam.laser_odometry import with_laser_odometry
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from numpy.random import Generator
@@ -36,21 +47,8 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
-NANOSECONDS = 1e9
 RANGE_S = 40.0
 """Offsets that are searched (s), either way; clocks that are farther apart are of different epochs."""
-_GRID_S = 0.05
-"""Step of the coarse search (s): a lidar turns at 5 to 40 Hz, and headings are interpolated between."""
-_NEAR_S = 0.5
-"""Half-width of the search where nothing is known of the clocks but that the run did not get lost (s)."""
-_LEAST_TURNED = 1.0
-"""Sum of rotation (rad) without which the offset is not determined."""
-_MIN_STEPS = 20
-_SPARSE_S = 0.25
-"""Time (s) between messages beyond which the odometry is not interpolated: half-way it would miss 8 mrad of a turn that
-starts with 1 rad/s^2, several times the noise of a matched scan, and show an offset that is none."""
-_HUBER = 1.345
-"""Scale of the robust weights in standard deviations (Huber 1981): 95 % efficient on Gaussian errors."""
 LEAST_AGREEMENT = 0.8
 """Correlation of the rotations of scans and odometry from which on an offset is believed: what is left explains a third
 of the rotation at most. Offsets of scans whose angles are wrong reach less."""
@@ -58,137 +56,11 @@ _GAP = 5.0
 """Ratio of the time between scans to the usual one from which on it is a gap: matches say little across it."""
 _CORRELATED_S = 0.5
 """Time (s) over which rotations are correlated: longer than the noise of a scan, shorter than a turn."""
-SIGNIFICANT = 4.0
-"""Minimum ratio of an offset to its standard deviation; under Gaussian errors once in 16,000 runs."""
-_CERTAIN = 10.0
-"""The same for an offset that is removed without being asked for: odometry that is 20 times noisier than usual shows
-offsets of 4 to 6 standard deviations where there are none, as its errors last for a turn."""
 HINT_S = 0.15
 """Difference of stamps and log times between scans and odometry (s) from which on the offset is estimated before a run:
 drivers and networks delay messages by less."""
 LARGE_S = 0.1
 """From here on (s) poses are wrong by 10 cm at 1 m/s and by 6 degrees at 1 rad/s: a wrong result by any standard."""
-SMALLEST_S = 0.02
-"""Offsets below this (s) are not worth a word: they move a beam by 2 cm at 1 m/s."""
-
-
-class Offset(NamedTuple):
-    """The scans' stamps are `seconds` later than the odometry's; `sigma` is the standard deviation (s).
-
-    0.1 means that a scan stamped t shows the robot where the odometry has it at t - 0.1 s.
-    """
-
-    seconds: float
-    sigma: float
-    drift_s: float = 0.0
-    """By how much it grows from the first scan to the last (s), where that matters and is not chance."""
-    is_mirrored: bool = False
-    """The scans turn the other way than the odometry: then there is no offset."""
-    half_sweep_s: float = 0.0
-    """From the first beam, whose stamp is meant, to the middle of a scan (s)."""
-
-    @property
-    def is_significant(self) -> bool:
-        """Whether it is neither chance nor too small to matter."""
-        return isfinite(self.sigma) and abs(self.seconds) > max(SIGNIFICANT * self.sigma, SMALLEST_S)
-
-    @property
-    def is_certain(self) -> bool:
-        """Whether it may be removed without being asked for: it is far from chance, and the same all the time."""
-        return self.is_significant and abs(self.seconds) > _CERTAIN * self.sigma and not self.drift_s
-
-    @property
-    def is_of_sweep(self) -> bool:
-        """Whether an offset from the middle of the sweeps, if there is one, may be that of scans in which robots moved.
-
-        They show the time at which the lidar looked at what fixes the heading, the middle only where walls are all
-        round. What is nearer to the ends of the sweep than to its middle is an offset of the clocks.
-        """
-        return not self.is_significant or abs(self.seconds) < 0.5 * self.half_sweep_s
-
-
-UNKNOWN = Offset(0.0, float("inf"))
-"""What is known of a robot that does not turn."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Headings:
-    """Headings (n,) in radians, unwrapped, at stamps (n,) in nanoseconds that do not run backwards."""
-
-    stamps_ns: I64
-    theta: F64
-
-    @staticmethod
-    def of(stamps_ns: I64, theta: F64) -> Headings:
-        """Sorted by time, and of each stamp the first."""
-        order = np.argsort(stamps_ns, kind="stable")
-        stamps, first = np.unique(stamps_ns[order], return_index=True)
-        return Headings(stamps, np.unwrap(theta[order])[first])
-
-
-def find_offset(scans: Headings, odometry: Headings, near_s: float = _NEAR_S, start_s: float = 0.0) -> Offset:
-    """The offset at which steps of the scans' heading agree best with those of the odometry.
-
-    Searched within `near_s` of `start_s`: first on a grid, then by robust least squares on the steps, whose residuals
-    give the standard deviation. Sparse odometry is compared where it is, with the scans interpolated.
-    """
-    if len(scans.theta) < _MIN_STEPS or len(odometry.theta) < _MIN_STEPS:
-        return UNKNOWN
-    if _is_sparse(odometry, scans):
-        found = find_offset(odometry, scans, near_s, -start_s)
-        return found._replace(seconds=-found.seconds)
-    origin = int(odometry.stamps_ns[0])
-    t_odom = (odometry.stamps_ns - origin) / NANOSECONDS
-    t_scan = (scans.stamps_ns - origin) / NANOSECONDS
-    seen = np.diff(scans.theta)
-
-    def steps(offset: float) -> tuple[F64, NDArray[np.bool_]]:
-        """The odometry's steps between the scans, and which of them lie within its time."""
-        at = t_scan - offset
-        inside = (at >= t_odom[0]) & (at <= t_odom[-1])
-        return np.diff(np.interp(at, t_odom, odometry.theta)), inside[1:] & inside[:-1]
-
-    def cost(offset: float) -> float:
-        predicted, inside = steps(offset)
-        if inside.sum() < max(_MIN_STEPS, len(seen) // 4):
-            return float("inf")
-        return float(np.mean(np.minimum(np.abs(seen - predicted)[inside], 0.5)))
-
-    if float(np.abs(seen).sum()) < _LEAST_TURNED:
-        return UNKNOWN
-    # Steps are taken between scans, wherever these are; a grid finer than they are finds the valley.
-    grid = start_s + np.arange(-near_s, near_s + _GRID_S / 2.0, _GRID_S)
-    costs = np.array([cost(float(offset)) for offset in grid])
-    if not np.isfinite(costs).any():
-        return UNKNOWN
-    best = float(grid[int(np.argmin(costs))])
-    return _refined(best, seen, steps)
-
-
-def _refined(best: float, seen: F64, steps: Callable[[float], tuple[F64, NDArray[np.bool_]]]) -> Offset:
-    """Gauss-Newton on the offset, with Huber's weights; the standard deviation from the spread of the residuals."""
-    half = 0.5 * _GRID_S
-    sigma = float("inf")
-    for _ in range(20):
-        predicted, inside = steps(best)
-        later, earlier = steps(best + half)[0], steps(best - half)[0]
-        slope = ((later - earlier) / (2.0 * half))[inside]
-        residual = (seen - predicted)[inside]
-        scale = max(1.4826 * float(np.median(np.abs(residual - np.median(residual)))), 1e-5)
-        weight = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(residual), 1e-12))
-        information = float(np.sum(weight * slope**2))
-        if information <= 0.0:
-            return UNKNOWN
-        change = float(np.sum(weight * slope * residual)) / information
-        change = min(max(change, -_GRID_S), _GRID_S)
-        best += change
-        # Sandwich estimate: steps that follow each other share the error of the scan between them.
-        moments = weight * slope * residual
-        spread = float(np.sum(moments**2) + 2.0 * np.sum(moments[1:] * moments[:-1]))
-        sigma = sqrt(max(spread, float(np.sum(moments**2)))) / information
-        if abs(change) < 1e-5:
-            break
-    return Offset(best, sigma)
 
 
 def estimate_offset(
@@ -237,10 +109,10 @@ def estimate_offset(
 def best_offset(turns: Headings, odometry: Headings) -> Offset:
     """The offset over the whole range of `RANGE_S`; a small one, unless it explains the rotation much worse."""
     # By steps of half a second and more the rotation stands out of the noise of single scans.
-    steps = turns if _is_sparse(odometry, turns) else thinned(turns)
+    steps = turns if is_sparse(odometry, turns) else thinned(turns)
     near = find_offset(steps, odometry)
     # Turns in a building are alike: what scans got wrong at one of them is no reason to look for the next one.
-    is_near = isfinite(near.sigma) and abs(near.seconds) < _NEAR_S
+    is_near = isfinite(near.sigma) and abs(near.seconds) < NEAR_S
     if is_near and agreement(turns, odometry, near.seconds) >= LEAST_AGREEMENT:
         return near
     whole = find_offset(steps, odometry, near_s=RANGE_S)
@@ -255,7 +127,7 @@ def find_drift(scans: Headings, odometry: Headings, offset_s: float) -> float:
 
     The offsets of both halves of the scans are compared, each as far from the other as half of the whole.
     """
-    scans = scans if _is_sparse(odometry, scans) else thinned(scans)
+    scans = scans if is_sparse(odometry, scans) else thinned(scans)
     middle = len(scans.theta) // 2
     halves = [
         find_offset(Headings(scans.stamps_ns[part], scans.theta[part]), odometry, start_s=offset_s)
@@ -277,27 +149,10 @@ def _headings(pairs: list[tuple[int, float]]) -> Headings:
     return Headings.of(np.array([stamp for stamp, _ in pairs], dtype=np.int64), np.array([theta for _, theta in pairs]))
 
 
-def _is_sparse(headings: Headings, others: Headings) -> bool:
-    """Whether headings are too far apart to be interpolated, and farther than others."""
-    if min(len(headings.theta), len(others.theta)) < 2:
-        return False
-    interval_ns, other_ns = (float(np.median(np.diff(each.stamps_ns))) for each in (headings, others))
-    return interval_ns > max(other_ns, _SPARSE_S * NANOSECONDS)
-
-
-def thinned(headings: Headings, step_s: float = 0.2) -> Headings:
-    """Headings at least `step_s` apart."""
-    kept = [0] if len(headings.theta) else []
-    for k, stamp in enumerate(headings.stamps_ns.tolist()):
-        if stamp - int(headings.stamps_ns[kept[-1]]) >= step_s * NANOSECONDS:
-            kept.append(k)
-    return Headings(headings.stamps_ns[kept], headings.theta[kept])
-
-
 def _misfit(scans: Headings, odometry: Headings, offset_s: float) -> float:
     """Mean difference of the steps (rad), large ones bounded."""
     seen, turned = _rotations(scans, odometry, offset_s)
-    if len(seen) + 1 < _MIN_STEPS:
+    if len(seen) + 1 < MIN_STEPS:
         return float("inf")
     return float(np.mean(np.minimum(np.abs(seen - turned), 0.5)))
 

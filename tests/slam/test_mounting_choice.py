@@ -18,8 +18,8 @@ from hsloc.simulation.sensors import Lidar
 from hsloc.simulation.simulator import events
 from hsloc.simulation.world_files import load_world
 from hsloc.slam.front_end import FrontEndParameters
+from hsloc.slam.heading_offset import UNKNOWN
 from hsloc.slam.mounting_choice import direction_warnings, with_chosen_mountings
-from hsloc.slam.time_offset import UNKNOWN
 from hsloc.warnings import WarningCode
 
 if TYPE_CHECKING:

@@ -35,6 +35,10 @@ _EMPTY = -(1 << 62)
 """A column of cells that no point lies in."""
 _STEPS = 64
 """Entries of the decay table per squared cell."""
+_BLOCK = 16
+"""Cells along a block. Internal: time."""
+_RINGS = 64
+"""Rings of cells that are looked at before blocks. Internal: time."""
 
 
 @njit(cache=True, nogil=True)
@@ -69,6 +73,8 @@ def wall_distances(occupied: B, points: F64, distances: F64) -> None:
     Points are (column, row), whole numbers being the centres of cells. Infinite where no cell is occupied.
     """
     height, width = occupied.shape
+    # Far from walls whole blocks of cells are passed over: rings of cells alone grow with the square of the distance.
+    blocks = np.zeros((0, 0), dtype=np.bool_)
     for k in range(len(points)):
         x = points[k, 0]
         y = points[k, 1]
@@ -76,7 +82,7 @@ def wall_distances(occupied: B, points: F64, distances: F64) -> None:
         u = int(min(max(np.floor(x + 0.5), 0.0), width - 1.0))
         v = int(min(max(np.floor(y + 0.5), 0.0), height - 1.0))
         best = np.inf
-        for ring in range(max(u, width - 1 - u, v, height - 1 - v) + 1):
+        for ring in range(min(max(u, width - 1 - u, v, height - 1 - v), _RINGS) + 1):
             # No centre in the ring is nearer than this.
             if ring - 0.5 > best:
                 break
@@ -85,7 +91,43 @@ def wall_distances(occupied: B, points: F64, distances: F64) -> None:
                 for column in range(u - ring, u + ring + 1, step):
                     if 0 <= column < width and occupied[row, column]:
                         best = min(best, hypot(column - x, row - y))
+        if best > _RINGS + 0.5:
+            if blocks.size == 0:
+                blocks = _occupied_blocks(occupied)
+            best = _among_blocks(occupied, blocks, x, y, best)
         distances[k] = best
+
+
+@njit(cache=True, nogil=True)
+def _occupied_blocks(occupied: B) -> B:
+    """Which blocks of `_BLOCK` by `_BLOCK` cells have an occupied one."""
+    height, width = occupied.shape
+    blocks = np.zeros(((height + _BLOCK - 1) // _BLOCK, (width + _BLOCK - 1) // _BLOCK), dtype=np.bool_)
+    for row in range(height):
+        for column in range(width):
+            if occupied[row, column]:
+                blocks[row // _BLOCK, column // _BLOCK] = True
+    return blocks
+
+
+@njit(cache=True, nogil=True)
+def _among_blocks(occupied: B, blocks: B, x: float, y: float, best: float) -> float:
+    """The smaller of `best` and the distance from (x, y) to the nearest centre of an occupied cell, by blocks."""
+    height, width = occupied.shape
+    rows, columns = blocks.shape
+    for i in range(rows):
+        below = max(i * _BLOCK - y, y - (min((i + 1) * _BLOCK, height) - 1), 0.0)
+        if below >= best:
+            continue
+        for j in range(columns):
+            beside = max(j * _BLOCK - x, x - (min((j + 1) * _BLOCK, width) - 1), 0.0)
+            if not blocks[i, j] or hypot(below, beside) >= best:
+                continue
+            for row in range(i * _BLOCK, min((i + 1) * _BLOCK, height)):
+                for column in range(j * _BLOCK, min((j + 1) * _BLOCK, width)):
+                    if occupied[row, column]:
+                        best = min(best, hypot(column - x, row - y))
+    return best
 
 
 @njit(cache=True, nogil=True)

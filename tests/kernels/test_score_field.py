@@ -95,11 +95,15 @@ def naive_scores(
     return scores
 
 
-@pytest.mark.parametrize("shape", [(12, 17), (1, 20), (20, 1)])
-def test_a_point_anywhere_has_the_distance_to_the_nearest_occupied_cell(rng: Any, shape: tuple[int, int]) -> None:
-    occupied = rng.random(shape) < 0.1
+@pytest.mark.parametrize(
+    ("shape", "share"), [((12, 17), 0.1), ((1, 20), 0.1), ((20, 1), 0.1), ((290, 230), 0.0001), ((290, 230), 0.0)]
+)
+def test_a_point_anywhere_has_the_distance_to_the_nearest_occupied_cell(
+    rng: Any, shape: tuple[int, int], share: float
+) -> None:
+    occupied = rng.random(shape) < share
     occupied[-1, -1] = True
-    points = rng.uniform(-15.0, 30.0, size=(300, 2))
+    points = rng.uniform(-15.0, 10.0 + max(shape), size=(300, 2))
     distances = np.empty(300)
     wall_distances(occupied, points, distances)
     centres = np.argwhere(occupied)[:, ::-1]

@@ -7,6 +7,7 @@ import difflib
 import json
 import typing
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -23,7 +24,7 @@ from hsloc.options import MAPPERS, MATCHER_ALIASES, MATCHERS, PRESETS
 from hsloc.parameters import LARGEST, NonNegative, OneOf, Parameters, Positive, check, hints, plain
 from hsloc.slam.parameters import GraphMapperParameters
 from hsloc.slam.point_mapper import PointMapperParameters
-from hsloc.yaml_table import load_table, written
+from hsloc.yaml_table import load_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -354,4 +355,19 @@ def _get(values: Any, path: tuple[str, ...]) -> Any:
 
 def dump(config: Config) -> str:
     """A configuration as YAML, which `load` reads back."""
-    return written(to_dict(config))
+    return _as_yaml(json.dumps(to_dict(config)))
+
+
+@lru_cache(maxsize=16)
+def _as_yaml(values: str) -> str:
+    """JSON as YAML: three files of a run hold its configuration, and ruamel takes 20 ms for each."""
+    from io import StringIO
+
+    from ruamel.yaml import YAML
+
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = False
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    stream = StringIO()
+    yaml.dump(json.loads(values), stream)
+    return stream.getvalue()

@@ -11,12 +11,12 @@ import sys
 import textwrap
 import types
 import typing
+from io import StringIO
 from typing import Any
 
 from hsloc.config import Config, preset, to_dict
 from hsloc.options import PRESETS
 from hsloc.parameters import OneOf, Range, describe, hints, number, plain, summary
-from hsloc.yaml_table import written
 
 if typing.TYPE_CHECKING:
     from collections.abc import Iterator
@@ -82,7 +82,7 @@ def _lines(values: Any, indent: str) -> Iterator[str]:
             yield from _lines(value, indent + "  ")
         else:
             yield from _comment(_sentences(parameter), indent)
-            yield from (indent + line for line in written({name: to_dict(value)}).splitlines())
+            yield from (indent + line for line in _scalar(name, value))
 
 
 def _comment(text: str, indent: str) -> list[str]:
@@ -93,6 +93,16 @@ def _sentences(parameter: Parameter) -> str:
     if parameter.range is None:
         return parameter.description
     return f"{parameter.description} Range: {str(parameter.range).removeprefix('from ')}."
+
+
+def _scalar(name: str, value: Any) -> list[str]:
+    from ruamel.yaml import YAML
+
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = False
+    stream = StringIO()
+    yaml.dump({name: to_dict(value)}, stream)
+    return stream.getvalue().splitlines()
 
 
 def page() -> str:

@@ -23,7 +23,7 @@ OTHER_WORK = {
     "hsloc.simulation",
     "hsloc.sweep",
 }
-PACKAGES = {"http.client", "matplotlib.pyplot", "rosbags", "ruamel", "scipy.optimize", "scipy.spatial"}
+PACKAGES = {"http.client", "matplotlib.pyplot", "rosbags", "scipy.optimize", "scipy.spatial"}
 """Not scipy.linalg: where kernels have to be compiled first, their compiler needs it."""
 MAPPER = {"hsloc.slam.mapper", "hsloc.slam.back_end", "hsloc.slam.loop_closer", "hsloc.slam.submaps"}
 

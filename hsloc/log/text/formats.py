@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.log.text.line_format import Line, pose, rounded, stamp_ns
-from hsloc.model import Odometry, Scan, Truth
+from hsloc.model import IDENTITY, Odometry, Scan, Truth
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
+
+    from hsloc.model import Pose2
 
 MAX_BEAMS = 20_000
 """Maximum number of beams of a scan. Internal: guards the memory against a damaged file."""
@@ -60,13 +62,15 @@ class Carmen:
         TRUEPOS x y theta odom_x odom_y odom_theta ipc_timestamp ipc_hostname logger_timestamp
 
     The stamp is the ipc_timestamp, third from the end. The odometry of laser lines is used only in logs without ODOM
-    lines (it repeats them); the x, y, theta of FLASER are not used: depending on the log they are the laser's pose, or
-    that of a mapper's correction. Where a line has no room for its stamp, IndexError says so.
+    lines (it repeats them); the x, y, theta of FLASER are, depending on the log, the laser's pose or that of a mapper's
+    correction: the mounting of the scan counts where it is the same in all lines. Where a line has no room for its
+    stamp, IndexError says so.
     """
 
     name = "CARMEN"
     keywords = frozenset(("ODOM", "FLASER", "ROBOTLASER1", "TRUEPOS"))
     states_mounting = frozenset(("ROBOTLASER1",))
+    may_state_mounting = frozenset(("FLASER",))
     laser_odometry = False
 
     def parse(self, words: Sequence[str]) -> Line:
@@ -91,8 +95,18 @@ def _front_laser(words: Sequence[str]) -> Line:
         raise ValueError("too short")
     stamp = stamp_ns(words[-3])
     angle_min, increment = beam_angles(len(ranges))
-    scan = Scan(stamp, ranges, angle_min, increment, 0.0, 0.0, frame_id="laser")
-    return Line(odometry=Odometry(stamp, pose(rest[3:6])), scan=scan)
+    T_odom_base = pose(rest[3:6])
+    mounting = IDENTITY if rest[:3] == rest[3:6] else _stated(rest[:3], T_odom_base)
+    scan = Scan(stamp, ranges, angle_min, increment, 0.0, 0.0, T_base_laser=mounting, frame_id="laser")
+    return Line(odometry=Odometry(stamp, T_odom_base), scan=scan)
+
+
+def _stated(words: Sequence[str], T_odom_base: Pose2) -> Pose2:
+    """The laser in the base frame, if the words are its pose; what is no pose states nothing, and loses no scan."""
+    try:
+        return rounded(T_odom_base.between(pose(words)))
+    except ValueError:
+        return IDENTITY
 
 
 def _robot_laser(words: Sequence[str]) -> Line:
@@ -137,6 +151,7 @@ class Wean:
     name = "Wean"
     keywords = frozenset(("O", "L"))
     states_mounting = frozenset(("L",))
+    may_state_mounting = frozenset[str]()
     laser_odometry = True
 
     def parse(self, words: Sequence[str]) -> Line:

@@ -26,13 +26,15 @@ class Line(NamedTuple):
 class LineFormat(Protocol):
     """A format that says one thing a line, its first word telling what.
 
-    `states_mounting` are the keywords whose lines say where the laser stands, `laser_odometry` whether the odometry
-    of laser lines counts in place of that of odometry lines.
+    `states_mounting` are the keywords whose lines say where the laser stands, `may_state_mounting` those that do if
+    all lines say the same, `laser_odometry` whether the odometry of laser lines counts in place of that of odometry
+    lines.
     """
 
     name: str
     keywords: frozenset[str]
     states_mounting: frozenset[str]
+    may_state_mounting: frozenset[str]
     laser_odometry: bool
 
     def parse(self, words: Sequence[str]) -> Line:

@@ -22,6 +22,7 @@ from hsloc.log.range_codes import NO_RETURN_CM, RANGE_MIN, NoReturnCode, RangeRu
 from hsloc.log.source import Observation
 from hsloc.log.summary import LogSummary, Losses, ReadOptions, TopicStatistics, TopicSummary
 from hsloc.log.text.formats import Carmen, Wean
+from hsloc.log.text.stated_mounting import StatedMounting
 from hsloc.model import IDENTITY, Odometry, Scan
 from hsloc.model.calibration import LidarCalibration
 from hsloc.warnings import RunWarning, WarningCode
@@ -107,6 +108,7 @@ class TextSource:
         self._rule = RangeRule()
         self._code = NoReturnCode()
         self._laser_lines_count = False
+        self._stated_mounting: Pose2 | None = None
         self._scan_offset_ns = self._odometry_offset_ns = 0
         self._kept: list[tuple[str, Line]] = []
         self._kept_events: list[tuple[str, tuple[Event, ...]]] | None = None
@@ -122,10 +124,10 @@ class TextSource:
     def _parsed(self, losses: Losses) -> Iterator[tuple[str, tuple[Event, ...]]]:
         """Keyword and events of each line; of lines that are kept the events are kept in their place."""
         if self._kept_losses is None:
-            return ((keyword, tuple(self._events_of(line))) for keyword, line in self._parsed_file(losses))
+            return ((keyword, tuple(self._events_of(keyword, line))) for keyword, line in self._parsed_file(losses))
         losses.add(self._kept_losses)
         if self._kept_events is None:
-            self._kept_events = [(keyword, tuple(self._events_of(line))) for keyword, line in self._kept]
+            self._kept_events = [(keyword, tuple(self._events_of(keyword, line))) for keyword, line in self._kept]
             self._kept = []
         return iter(self._kept_events)
 
@@ -157,7 +159,12 @@ class TextSource:
                 continue
             yield words[0], line
 
-    def _events_of(self, line: Line) -> Iterator[Event]:
+    def _mounting(self, keyword: str, scan: Scan) -> Pose2:
+        """The laser in the base frame, by the user, by this line or by all lines."""
+        of_lines = self._stated_mounting or IDENTITY if keyword in self._format.may_state_mounting else None
+        return self._given_mounting or of_lines or scan.T_base_laser
+
+    def _events_of(self, keyword: str, line: Line) -> Iterator[Event]:
         if line.odometry is not None and (line.scan is not None) == self._laser_lines_count:
             offset_ns = self._odometry_offset_ns
             odometry = line.odometry
@@ -172,7 +179,7 @@ class TextSource:
                 range_min=RANGE_MIN,
                 range_max=scan.range_max or self._rule.range_max,
                 time_increment=scan.time_increment,
-                T_base_laser=self._given_mounting or scan.T_base_laser,
+                T_base_laser=self._mounting(keyword, scan),
                 frame_id=scan.frame_id,
                 intensities=scan.intensities,
             )
@@ -200,6 +207,7 @@ class TextSource:
         latest = 0
         first_scan: Scan | None = None
         scan_keyword = ""
+        stated = StatedMounting()
         for keyword, line in self._kept_lines():
             for event in line:
                 if event is not None:
@@ -214,8 +222,11 @@ class TextSource:
                 self._code.learn(line.scan.ranges, line.scan.angle_increment, (RANGE_MIN, largest))
                 if first_scan is None:
                     first_scan, scan_keyword = line.scan, keyword
+                if keyword in self._format.may_state_mounting and line.odometry is not None:
+                    stated.learn(line.scan.T_base_laser, line.odometry.T_odom_base.theta)
             topics.setdefault(keyword, TopicStatistics()).add(latest, latest, 1, 0)
         self._check(bool(kinds["scan"]), bool(kinds["odometry"]))
+        self._stated_mounting = stated.mounting()
         # One of the two kinds of lines is used: both give the same path with different delays.
         of_lasers = [keyword for keyword in kinds["odometry"] if keyword in kinds["scan"]]
         others = [keyword for keyword in kinds["odometry"] if keyword not in kinds["scan"]]
@@ -254,7 +265,7 @@ class TextSource:
         extrinsics, warnings = "identity", list[RunWarning]()
         if self._given_mounting is not None:
             extrinsics = "calibration" if self._options.laser_pose is None else "option"
-        elif scan_keyword in self._format.states_mounting:
+        elif scan_keyword in self._format.states_mounting or self._stated_mounting is not None:
             extrinsics = "file format"
         elif scan is not None:
             warnings.append(
@@ -268,7 +279,7 @@ class TextSource:
         clip = self._rule.clip
         if self._code.is_known and not (clip is not None and self._code.low <= clip <= self._code.high):
             warnings.append(RunWarning(WarningCode.SCAN_NO_RETURN_CODE, f"{scan_keyword}: {self._code}"))
-        mounting = self._given_mounting or (scan.T_base_laser if scan else IDENTITY)
+        mounting = self._mounting(scan_keyword, scan) if scan else self._given_mounting or IDENTITY
         return LogSummary(
             paths=(self._shown,),
             format=self._format.name,

@@ -49,7 +49,7 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
     localised = result.localised if result.tracked is None else result.tracked
     first = None if result.follows_scans else Pose2.from_array(result.odometry.poses[0])
     row = -1
-    corrections = _corrections(result)
+    corrections = _corrections(result, localised)
     T_map_odom: Pose2 | None = None
 
     with rarely_collected():
@@ -63,7 +63,7 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
                     yield PosedEvent(event, IDENTITY, Pose2(*poses[row].tolist()), True)
                 else:
                     if T_map_odom is None:
-                        T_map_odom = next(_corrections(result))[0]
+                        T_map_odom = next(_corrections(result, localised))[0]
                     yield PosedEvent(event, T_map_odom, T_map_odom @ event.T_odom_base, bool(localised[max(row, 0)]))
             elif isinstance(event, Odometry) and not result.follows_scans:
                 row += 1
@@ -73,12 +73,11 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
                 progress(row / len(result.trajectory))
 
 
-def _corrections(result: Result) -> Iterator[tuple[Pose2, Pose2, bool]]:
+def _corrections(result: Result, localised: NDArray[np.bool_]) -> Iterator[tuple[Pose2, Pose2, bool]]:
     """T_map_odom and T_map_base at each odometry message, and whether the pose follows a track.
 
     Computed for a few thousand at once: for each alone it takes ten times as long, and a long run has many.
     """
-    localised = result.localised if result.tracked is None else result.tracked
     for at in range(0, len(result.odometry), _BLOCK):
         rows = slice(at, at + _BLOCK)
         poses = result.trajectory.poses[rows]

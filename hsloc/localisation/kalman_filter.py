@@ -71,6 +71,18 @@ def predict_covariance(covariance: F64, pose: Pose2, motion: Pose2, motion_covar
     return result
 
 
+def predict_covariances(covariances: F64, headings: F64, motions: F64, noise: F64) -> F64:
+    """`predict_covariance` of n poses with these `headings` (n,) at once: `F P F^T + V M V^T`, (n, 3, 3)."""
+    c, s = np.cos(headings), np.sin(headings)
+    f, turn = np.tile(_EYE, (2, len(motions), 1, 1))
+    f[:, 0, 2] = -s * motions[:, 0] - c * motions[:, 1]
+    f[:, 1, 2] = c * motions[:, 0] - s * motions[:, 1]
+    turn[:, 0, 0] = turn[:, 1, 1] = c
+    turn[:, 0, 1], turn[:, 1, 0] = -s, s
+    predicted: F64 = f @ covariances @ f.transpose(0, 2, 1) + turn @ noise @ turn.transpose(0, 2, 1)
+    return predicted
+
+
 def fuse(prediction: Pose2, covariance: F64, measured: Pose2, measured_covariance: F64) -> tuple[Pose2, F64]:
     """The EKF's update with a measured pose: `K = P (P + R)^-1`."""
     gain = np.linalg.solve((covariance + measured_covariance).T, covariance.T).T

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.kalman_filter import predict_covariances
 from hsloc.model.pose2 import Pose2, relative_poses
 
 if TYPE_CHECKING:
@@ -44,17 +45,5 @@ def pose_covariances(
     anchors = poses[first][of]
     motions = relative_poses(anchors, poses)
     noise = np.array([motion_covariance(Pose2(*motion)) for motion in motions.tolist()])
-    found[rows] = _predicted(scans.covariance[scan][of], anchors[:, 2], motions, noise)
+    found[rows] = predict_covariances(scans.covariance[scan][of], anchors[:, 2], motions, noise)
     return found
-
-
-def _predicted(covariances: F64, headings: F64, motions: F64, noise: F64) -> F64:
-    """`predict_covariance` of n poses with these `headings` (n,) at once: `F P F^T + V M V^T`, (n, 3, 3)."""
-    c, s = np.cos(headings), np.sin(headings)
-    f, turn = np.tile(np.eye(3), (2, len(motions), 1, 1))
-    f[:, 0, 2] = -s * motions[:, 0] - c * motions[:, 1]
-    f[:, 1, 2] = c * motions[:, 0] - s * motions[:, 1]
-    turn[:, 0, 0] = turn[:, 1, 1] = c
-    turn[:, 0, 1], turn[:, 1, 0] = -s, s
-    predicted: F64 = f @ covariances @ f.transpose(0, 2, 1) + turn @ noise @ turn.transpose(0, 2, 1)
-    return predicted

@@ -3,8 +3,8 @@
 Steps of one heading are compared with those of the other, which is interpolated. Interpolation averages noise, most of
 all half-way between two samples: a search for the smallest residual prefers offsets of half an interval to none, and
 does so the more the noisier the odometry is. A B-spline as wide as the samples are apart averages alike at every
-offset, but does not see what one message tells of the other where both share the faults of their stamps. So the offset
-is found without it, and again with it; by how much the two differ is a part of the uncertainty.
+offset, but blurs what is sharp where scans and odometry were recorded together and share the jitter of their stamps.
+So the offset is found without it, and again with it; by how much the two differ is a part of the uncertainty.
 """
 
 from __future__ import annotations
@@ -45,9 +45,8 @@ SMALLEST_S = 0.02
 """Offsets below this (s) are not worth a word: they move a beam by 2 cm at 1 m/s."""
 _NODES = 4
 """Times within a width at which a heading is looked up. Internal: sums over them are integrals enough."""
-_SPLINE = np.convolve(
-    np.convolve(np.full(_NODES, 1.0 / _NODES), np.full(_NODES, 1.0 / _NODES)), np.full(_NODES, 1.0 / _NODES)
-)
+_BOX = np.full(_NODES, 1.0 / _NODES)
+_SPLINE = np.convolve(np.convolve(_BOX, _BOX), _BOX)
 """Weights of the nodes: a box, smoothed by itself twice."""
 _APART = 0.5
 """Standard deviation of an offset as a part of the difference between what is found with the spline and without. In

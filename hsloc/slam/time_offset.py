@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from hsloc.slam.front_end import FrontEndParameters
 
     F64 = NDArray[np.float64]
-    I64 = NDArray[np.int64]
 
 RANGE_S = 40.0
 """Offsets that are searched (s), either way; clocks that are farther apart are of different epochs."""

@@ -172,8 +172,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("hsloc: interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:
-        sys.stderr.close()
+    except BrokenPipeError:  # Whoever read the output has enough; `program` leaves the rest.
         return EXIT_FAILED
     except OSError as error:
         if error.errno not in _NO_SPACE:

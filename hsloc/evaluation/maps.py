@@ -207,6 +207,8 @@ class MapChanges:
     vanished: Bools
     shared: float
     """Part of the first map's known cells that the second knows as well, from 0 to 1."""
+    gone: float
+    """Part of the walls of the first map that vanished, of those at places that the second knows, from 0 to 1."""
 
 
 def map_changes(
@@ -235,8 +237,9 @@ def map_changes(
         kept.append(cells)
     known = first.cells != UNKNOWN
     shared = float((known & (seen != UNKNOWN)).sum() / max(int(known.sum()), 1))
+    gone = float(kept[1].sum() / max(int((before & (seen != UNKNOWN)).sum()), 1))
     changes.sort(key=lambda change: (-change.size, change.x, change.y))
-    return MapChanges(tuple(changes), kept[0], kept[1], shared)
+    return MapChanges(tuple(changes), kept[0], kept[1], shared, gone)
 
 
 def _resampled(first: OccupancyGrid, second: OccupancyGrid, pose: Pose2) -> NDArray[np.int8]:

@@ -225,6 +225,19 @@ def test_a_log_that_ends_behind_its_first_bytes(tmp_path: Path, capsys: pytest.C
     assert "the log holds no messages" in err
 
 
+def test_of_a_log_that_is_cut_off_in_its_first_chunk_is_said_that(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(source.read_bytes()[:300])
+    for command in ("replay", "map"):
+        code, out, err = run(capsys, command, path)
+        assert (code, out) == (1, "")
+        assert "1 file ends too early" in err
+        assert "copy the file again" in err
+        assert err.count("\n") == 1
+
+
 @pytest.fixture(scope="module")
 def bag(source: Path) -> Path:
     return formats.bag2(source, source.with_name("bag"))

@@ -47,6 +47,16 @@ def empty(folder: Path) -> bool:
     return not [path for path in folder.rglob("*") if path.is_file() and path.suffix not in (".yaml", ".txt", ".mcap")]
 
 
+def test_whoever_reads_the_output_may_have_enough_of_it() -> None:
+    command = [sys.executable, "-u", "-m", "hsloc.cli.main", "config"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        assert running.stderr is not None
+        running.stdout.close()
+        assert running.stderr.read() == ""
+    assert running.returncode == 1
+
+
 @pytest.mark.parametrize("argv", [["info", OFFICE, "--json"], ["config"], ["record", "--list"], ["completion", "bash"]])
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_full_disk_behind_stdout_is_one_line(argv: list[str], unbuffered: str) -> None:

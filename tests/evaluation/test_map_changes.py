@@ -67,3 +67,21 @@ def test_the_command_lists_changes_and_draws_them(tmp_path: Path, capsys: pytest
     assert json.loads(capsys.readouterr().out)["changes"][0]["kind"] == "vanished"
     assert main(["diff", names[0], str(tmp_path / "none.yaml")]) == 1
     assert "none.yaml" in capsys.readouterr().err
+
+
+def test_of_maps_that_hardly_agree_is_warned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """However little of the first map the second knows: what neither says anything about is no agreement."""
+    small = room()
+    cells = np.full((100, 400), -1, dtype=np.int8)
+    cells[:, :120] = small.cells
+    cells[10:90, 150:390] = 0
+    cells[10:90:4, 150:390] = 100
+    moved = OccupancyGrid(small.cells, small.resolution, small.origin @ Pose2(0.7, 0.4, 0.0))
+    for name, grid in (("large", OccupancyGrid(cells, 0.05, small.origin)), ("same", small), ("moved", moved)):
+        (tmp_path / name).mkdir()
+        save_map(grid, tmp_path / name)
+    large, same, other = (str(tmp_path / name / "map.yaml") for name in ("large", "same", "moved"))
+    assert main(["diff", large, same]) == 0
+    assert capsys.readouterr().err == ""
+    assert main(["diff", large, other]) == 0
+    assert "is it the same building" in capsys.readouterr().err

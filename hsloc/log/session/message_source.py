@@ -8,6 +8,7 @@ from math import inf
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
+from hsloc.errors import TopicError
 from hsloc.log.container import in_runs
 from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import Undecodable, canonical_type, column_decoder_for, is_decodable
@@ -51,9 +52,15 @@ class RosSource:
 
     def __init__(self, containers: Sequence[Container], options: ReadOptions) -> None:
         self._containers = containers
-        self._survey = LogSession(containers, options)
-        self.summary = self._survey.summary
         self.losses_at_opening = _added(container.losses_at_opening for container in containers)
+        try:
+            self._survey = LogSession(containers, options)
+        except TopicError as error:
+            lost = ", ".join(self.losses_at_opening.lines())
+            if not lost:
+                raise
+            raise TopicError(f"{error}; {lost}: copy the file again, if the copy was cut off") from None
+        self.summary = self._survey.summary
 
     def events(self, losses: Losses) -> Iterator[tuple[int, Event]]:
         """As `Source.events`."""

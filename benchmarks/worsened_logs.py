@@ -1,8 +1,9 @@
 """A CARMEN log, worsened in one of the ways in which recorders, lidars and wheels are wrong.
 
-    python benchmarks/worsened_logs.py LOG.clf.gz KIND OUT.clf
+    python benchmarks/worsened_logs.py LOG.clf.gz OUT.clf KIND
 
 What is wrong is known, so the result of `hsloc map OUT.clf` is compared with that of the log as it was.
+`real_maps.py --degrade benchmarks/worsened_logs.py --kinds gap reset` maps such logs and judges the results.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class Line:
 
 
 def stamps_of(decimals: int) -> Callable[[list[Line]], None]:
-    """Stamps are cut to so many decimals."""
+    """Stamps are cut to this number of decimals."""
 
     def change(lines: list[Line]) -> None:
         for line in lines:
@@ -151,8 +152,8 @@ KINDS: dict[str, Callable[[list[Line]], None]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("log", type=Path)
-    parser.add_argument("kind", choices=KINDS)
     parser.add_argument("out", type=Path)
+    parser.add_argument("kind", choices=KINDS)
     arguments = parser.parse_args()
     opened = gzip.open if arguments.log.suffix == ".gz" else open
     with opened(arguments.log, "rt", errors="replace") as file:

@@ -56,6 +56,8 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
         events = _with_recorded_odometry(log.events(), result) if result.lidar_only else log.events()
         joined = ContinuousOdometry(events)
         watched = joined if result.lidar_only else ScanWatch(joined)
+        # The odometry as the run had it: poses of scans are composed with it.
+        watched = watched if result.odometry_correction is None else result.odometry_correction.applied(watched)
         for event in pair(watched, deskew=result.deskewed, first=first):
             if isinstance(event, PairedScan):
                 if result.follows_scans:

@@ -110,6 +110,8 @@ class Result:
     """Side of a cell of the map as it was given (m), where that was wrong and `grid` has another."""
     odometry_scale: OdometryScale | None = None
     """How much more a metre and a radian of `odometry` are, by a localiser on a given map."""
+    odometry_correction: OdometryScale | None = None
+    """The scale by which `odometry` differs from that of the log; None where it is as recorded."""
     mounting_error: MountingError | None = None
     ambiguities: tuple[Ambiguity, ...] = ()
     lidar_only: bool = False
@@ -321,8 +323,9 @@ def _run_with(
     watched = events if lidar_only else watch
     # Turns that were joined of segments are known beam by beam; a whole turn is deskewed if the user asks for it.
     deskew = request.read.deskew or (log.summary.segments > 1 and not lidar_only)
+    of_odometry = correction if isinstance(correction, OdometryScale) else None
     with rarely_collected():
-        counted = correction.applied(watched) if isinstance(correction, OdometryScale) else watched
+        counted = watched if of_odometry is None else of_odometry.applied(watched)
         reported = with_progress(log, counted, history, progress)
         for event, estimate in replay(reported, estimator, deskew=deskew, first=first):
             history.add(event, estimate)
@@ -369,6 +372,7 @@ def _run_with(
         tracked=tracked,
         map_scale=scale,
         odometry_scale=None if localiser is None else localiser.odometry_scale,
+        odometry_correction=of_odometry,
         given_resolution=given_resolution,
         mounting_error=mounting,
         ambiguities=history.ambiguities(states),

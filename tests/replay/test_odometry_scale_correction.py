@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from paths import RECORDINGS
 
+from hsloc.analysis.analyse import analyse
 from hsloc.localisation.odometry_scale import OdometryScale
 from hsloc.log import LogWriter, Transform3, open_log
 from hsloc.maps import save_map
@@ -48,3 +49,6 @@ def test_distances_that_are_counted_0_8_times_are_corrected(tmp_path: Path) -> N
     off = found.trajectory.poses - true.interpolated(found.trajectory.stamps_ns)
     assert np.hypot(off[:, 0], off[:, 1]).max() < 0.05
     assert found.localised.all()
+    near = analyse(found).metrics.map.residuals.within_15_cm
+    assert near is not None
+    assert near > 0.95, "the scans are read again with the odometry as it was corrected"

@@ -57,8 +57,8 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
         joined = ContinuousOdometry(events)
         watched = joined if result.lidar_only else ScanWatch(joined)
         # The odometry as the run had it: poses of scans are composed with it.
-        watched = watched if result.odometry_correction is None else result.odometry_correction.applied(watched)
-        for event in pair(watched, deskew=result.deskewed, first=first):
+        counted = watched if result.odometry_correction is None else result.odometry_correction.applied(watched)
+        for event in pair(counted, deskew=result.deskewed, first=first):
             if isinstance(event, PairedScan):
                 if result.follows_scans:
                     row += 1

@@ -63,12 +63,14 @@ def _sha256(path: Path) -> str:
 def command(request: RunRequest) -> str:
     """The command line that repeats the run, in the folder in which it was made; but for --out it is complete.
 
-    With an own matcher, or the server's files (`bare_names`), it says what to put in.
+    Of a map that was asked for it is `hsloc map`. With an own matcher, or the server's files (`bare_names`), it says
+    what to put in.
     """
     values = request.to_values()
-    words = ["hsloc", "replay", *request.paths()]
+    maps = request.mode == "slam"
+    words = ["hsloc", "map" if maps else "replay", *request.paths()]
     for option in OPTIONS:
-        if option.place != "check":
+        if option.place != "check" and not (maps and option.name == "mode"):
             words += written(option, _default_matcher(option.name, values))
     return " ".join(_quoted(word) for word in words)
 

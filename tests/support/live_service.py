@@ -156,7 +156,7 @@ class Live:
 def without_command(name: str, content: bytes) -> Any:
     """A file of the results without the line "run it again with": the service names no folders in it."""
     if name != "run.mcap":
-        return re.sub(rb"hsloc replay [^\n<]*", b"", content)
+        return re.sub(rb"hsloc (?:replay|map) [^\n<]*", b"", content)
     reader = make_reader(BytesIO(content))
     config = [without_command(each.name, each.data) for each in reader.iter_attachments()]
     return config, [(channel.topic, message.log_time, message.data) for _, channel, message in reader.iter_messages()]

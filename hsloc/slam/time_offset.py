@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.log import LONGEST_OFFSET_S, open_log
+from hsloc.log import LONGEST_OFFSET_S, ReadOptions, open_log
 from hsloc.model.events import Heading, Odometry, Scan
 from hsloc.options import AUTO
 from hsloc.preprocessing.odometry_stalls import UnstalledOdometry
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from numpy.random import Generator
     from numpy.typing import NDArray
 
-    from hsloc.log import ReadOptions
     from hsloc.model.events import Event
     from hsloc.slam.front_end import FrontEndParameters
 
@@ -58,6 +57,8 @@ _CORRELATED_S = 0.5
 HINT_S = 0.15
 """Difference of stamps and log times between scans and odometry (s) from which on the offset is estimated before a run:
 drivers and networks delay messages by less."""
+_WORTH_A_WORD_S = 0.005
+"""Difference of an offset and its correction (s) that is explained: less is 5 mm at 1 m/s."""
 LARGE_S = 0.1
 """From here on (s) poses are wrong by 10 cm at 1 m/s and by 6 degrees at 1 rad/s: a wrong result by any standard."""
 
@@ -218,13 +219,38 @@ def clock_warnings(
             warnings.append((topic, RunWarning(WarningCode.SCANS_MIRRORED, text, remedy)))
         if offset.is_significant and removed is not None:
             by = f"which was corrected (--time-offset {removed})"
-            text = f"the stamps of {topic} were {in_words(offset)} those of the odometry, {by}"
+            kept = _kept_in_words(offset, offset.seconds + _added_s(topic, found, removed))
+            text = f"the stamps of {topic} were {in_words(offset)} those of the odometry, {by}{kept}"
             warnings.append((topic, RunWarning(WarningCode.CLOCK_OFFSET_APPLIED, text)))
         elif offset.is_significant:
             warnings.append((topic, offset_warning(topic, offset, (given or {}).get(topic.lstrip("/"), 0.0))))
         if offset.drift_s:
             warnings.append((topic, drift_warning(topic, offset.drift_s)))
     return warnings
+
+
+def _added_s(topic: str, found: Mapping[str, Offset], removed: str) -> float:
+    """What `--time-offset` adds to the stamps of a scan topic more than to those of the odometry (s)."""
+    added, scans = ReadOptions(time_offset=removed).offsets_s(), [_name(each) for each in found]
+    return added.get(_name(topic), 0.0) - sum(seconds for name, seconds in added.items() if name not in scans)
+
+
+def _name(topic: str) -> str:
+    """As `--time-offset` has it: of joined kinds of lines the first, without a leading slash."""
+    return topic.partition(" + ")[0].lstrip("/")
+
+
+def _kept_in_words(offset: Offset, kept_s: float) -> str:
+    """Why a correction is not the whole offset."""
+    half_s = offset.half_sweep_s
+    if abs(kept_s) < _WORTH_A_WORD_S:
+        return ""
+    if abs(kept_s - half_s) < _WORTH_A_WORD_S:
+        return (
+            f"; half a sweep, {half_s:.3f} s, is kept: without --deskew a scan shows the robot in the middle of the "
+            "sweep, and is stamped at its first beam"
+        )
+    return f"; {kept_s:.3f} s of it are left, as the corrected run shows"
 
 
 def drift_warning(topic: str, drift_s: float) -> RunWarning:

@@ -188,6 +188,18 @@ def test_what_is_late_is_moved() -> None:
     assert as_option({"/front": sound, "/rear": early}, "/odom", deskew=True) == "/rear=0.200"
 
 
+@pytest.mark.parametrize("seconds", [0.164, -0.164])
+@pytest.mark.parametrize("odometry", ["/odom", None])
+def test_why_a_correction_is_not_the_whole_offset_is_said(seconds: float, odometry: str | None) -> None:
+    """Scans that are not deskewed are moved to the middle of their sweep, 0.067 s after the stamp of the first beam."""
+    found = {"/scan": UNKNOWN._replace(seconds=seconds, sigma=0.002, half_sweep_s=0.067)}
+    for deskew in (False, True):
+        ((_, warning),) = clock_warnings(found, removed=as_option(found, odometry, deskew=deskew))
+        assert ("half a sweep, 0.067 s, is kept" in warning.text) is not deskew
+    ((_, warning),) = clock_warnings(found, removed="/scan=0.0")
+    assert warning.text.endswith(f"; {seconds:.3f} s of it are left, as the corrected run shows")
+
+
 def test_odometry_that_is_late_is_moved(tmp_path: Path) -> None:
     late = tmp_path / "late.mcap"
     convert_log(open_log((OFFICE,), replace(END, time_offset="/odom=0.3", end_s=20.0)), late)

@@ -132,8 +132,8 @@ class ScanCounts:
     used: int
     """Number of scans whose match was accepted: matched and relocalised."""
     by_status: dict[str, int]
-    """Number of scans by status: matched, relocalised, predicted (held by the motion gate), rejected, no_returns,
-    searching."""
+    """Number of scans by status: matched, relocalised (pose found by search), predicted (skipped by the motion gate,
+    the robot had hardly moved), rejected, no_returns, searching (during a search for the pose)."""
     by_reason: dict[str, int]
     """Number of scans by status and reason, figures left out of the reasons."""
 

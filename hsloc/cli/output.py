@@ -89,7 +89,9 @@ def print_job(summary: Mapping[str, Any]) -> None:
     lines += [summary["headline"]] if "headline" in summary else []
     reasons = [from_json(VerdictReason, each) for each in summary.get("verdict_reasons", ())]
     lines += [f"  {each}" for each in reason_texts(reasons)]
-    print_lines(lines + _table([Row(each["name"], tuple(each["values"])) for each in summary.get("figures", ())]))
+    figures = summary.get("figures", ())
+    rows = [Row(each["name"], tuple(each["values"]), usual=each.get("usual", "")) for each in figures]
+    print_lines(lines + _table(rows))
 
 
 def print_summary(metrics: RunMetrics, timings: RunTimings, folder: Path) -> None:
@@ -136,7 +138,7 @@ def _table(rows: Sequence[Row]) -> list[str]:
     lines = [f"{'':<{width}}{'translation':>12}{'rotation':>12}"] if any(len(row.values) == 2 for row in rows) else []
     for row in rows:
         values = "".join(f"{value:>12}" for value in row.values) if len(row.values) == 2 else f"  {row.values[0]}"
-        lines.append(f"{row.label:<{width}}{values}")
+        lines.append(f"{row.label:<{width}}{values}" + (f"  (usual: {row.usual})" if row.usual else ""))
     return lines
 
 

@@ -110,6 +110,14 @@ class Hypothesis:
         return self.total / self.scans
 
 
+def search_text(best: Hypothesis, places: int, lead: float) -> str:
+    """How far a search for the pose is; `lead` is the best place's sum of fitness less that of the next one."""
+    over = f"fitness {best.mean:.2f} over {best.scans} {'scan' if best.scans == 1 else 'scans'}"
+    if places == 1:
+        return f"one place possible, with {over}"
+    return f"{places} places possible; the best has {over}, in sum {lead:.2f} more than the next"
+
+
 def fits_better(best: list[float], other: list[float], confidence: float) -> bool:
     """Student's paired t-test, one-sided, over means of blocks of scans.
 

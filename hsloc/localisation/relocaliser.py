@@ -29,6 +29,7 @@ from hsloc.localisation.hypotheses import (
     fits_better,
     likely_places,
     quick_matcher,
+    search_text,
 )
 from hsloc.localisation.kalman_filter import fuse_match, predict_covariance
 from hsloc.localisation.place_check import USUAL_EXPLAINED, PlaceCheck
@@ -296,7 +297,6 @@ class Relocaliser:
         ratio = 0.0 if alone else self._hypotheses[1].mean / max(best.mean, 1e-9)
         ahead = len(best.history) >= p.min_scans and best.mean >= p.min_fitness and lead >= p.min_margin
         pose = best.pose @ motion
-        reason = f"places: {len(self._hypotheses)}; fitness {best.mean:.2f} of {best.scans} scans, {lead:.2f} ahead"
         evidence: Evidence | None = None
         if fresh:
             self._state = self._judge(best, pose)
@@ -319,7 +319,7 @@ class Relocaliser:
             best.fitness if fresh else None,
             evaluations,
             sure,
-            reason,
+            search_text(best, len(self._hypotheses), lead),
             track,
             whole,
             self._state,

@@ -19,7 +19,7 @@ from hsloc.errors import EvaluationError
 from hsloc.evaluation.metrics import format_json
 from hsloc.report.data import prepare, reason_counts
 from hsloc.report.seeds import figure_names, is_number, seed_groups, seed_rows
-from hsloc.report.summary import VERDICT_WORDS, ResultSummary
+from hsloc.report.summary import REASONS_HEADING, VERDICT_WORDS, WARNINGS_HEADING, ResultSummary
 from hsloc.report.table import DASH, STATUS_WORDS, error_statistics
 from hsloc.report.view import data_url, view_of
 
@@ -99,14 +99,21 @@ def _head(summary: ResultSummary) -> str:
         f'<dd class="muted">{escape(row.explanation)}</dd></div>'
         for row in summary.key_figures
     )
-    reasons = f'<h2>Look at this</h2><ul class="reasons">{_items(summary.reasons)}</ul>' if summary.reasons else ""
-    warnings = f"<h2>Warnings</h2><ul>{_items(summary.warnings)}</ul>" if summary.warnings else ""
+    reasons = _texts(REASONS_HEADING, summary.reasons, "reasons")
+    warnings = _texts(WARNINGS_HEADING, summary.warnings, "others")
     return (
         f'<p class="headline"><strong class="verdict {summary.verdict}">{summary.verdict}</strong> '
         f"<span>{escape(summary.headline)}</span></p>"
         f'<p class="muted">{escape(VERDICT_WORDS[summary.verdict])}</p><ul class="facts">{_items(summary.facts)}</ul>'
         f'<dl class="key-figures">{key_figures}</dl><section class="warnings">{reasons}{warnings}</section>'
     )
+
+
+def _texts(heading: tuple[str, str], texts: Sequence[str], kind: str) -> str:
+    """A list below its heading, which says what is in it; nothing where there is no text."""
+    name, what = map(escape, heading)
+    head = f'<h2>{name} <small class="muted">{what}</small></h2>'
+    return f'{head}<ul class="{kind}">{_items(texts)}</ul>' if texts else ""
 
 
 def _figures(summary: ResultSummary) -> str:
@@ -118,7 +125,8 @@ def _figures(summary: ResultSummary) -> str:
             rows.append('<tr><td></td><th scope="col">translation</th><th scope="col">rotation</th></tr>')
         cells = "".join(f"<td>{escape(value)}</td>" for value in row.values)
         if len(row.values) == 1:
-            cells = f'<td colspan="2">{escape(row.values[0])}</td>'
+            usual = f' <small class="muted">usual: {escape(row.usual)}</small>' if row.usual else ""
+            cells = f'<td colspan="2">{escape(row.values[0])}{usual}</td>'
         rows.append(f'<tr title="{escape(row.explanation)}"><th scope="row">{escape(row.label)}</th>{cells}</tr>')
     explained = "".join(f"<dt>{escape(row.label)}</dt><dd>{escape(row.explanation)}</dd>" for row in summary.figures)
     return (

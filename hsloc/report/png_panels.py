@@ -18,6 +18,7 @@ from hsloc.model import Status
 from hsloc.report import style
 from hsloc.report.data import Curve, with_gaps
 from hsloc.report.map_image import known_runs, line_width, picture_of
+from hsloc.report.table import MARK_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -125,16 +126,16 @@ def _draw_paths(axes: Axes, data: ReportData, width: float, pixel: float) -> Non
 def _draw_marks(axes: Axes, data: ReportData) -> None:
     if data.scans is None:
         return
-    for statuses, label, marker, colour, size, zorder in (
-        ((Status.NO_RETURNS,), "scan without returns", "v", style.ORANGE, 5.0, 7),
-        ((Status.REJECTED,), "scan rejected", "x", style.VERMILLION, 5.0, 8),
-        ((Status.RELOCALISED,), "pose found", "*", style.ORANGE, 13.0, 12),
+    for status, marker, colour, size, zorder in (
+        (Status.NO_RETURNS, "v", style.ORANGE, 5.0, 7),
+        (Status.REJECTED, "x", style.VERMILLION, 5.0, 8),
+        (Status.RELOCALISED, "*", style.ORANGE, 13.0, 9),
     ):
-        xy = data.scans.xy[data.scans.where(*statuses)]
+        xy = data.scans.xy[data.scans.where(status)]
         if len(xy):
             axes.plot(
-                *xy.T, linestyle="none", marker=marker, color=colour, markersize=size, label=label, zorder=zorder,
-                markeredgewidth=1.4 if marker == "x" else 0.7,
+                *xy.T, linestyle="none", marker=marker, color=colour, markersize=size, label=MARK_WORDS[status],
+                zorder=zorder, markeredgewidth=1.4 if marker == "x" else 0.7,
                 markeredgecolor=colour if marker == "x" else style.INK,
             )  # fmt: skip
 

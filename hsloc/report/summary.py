@@ -19,6 +19,9 @@ VERDICT_WORDS: dict[str, str] = {
     Verdict.FAILED: "the result is not usable",
 }
 """What a verdict means."""
+REASONS_HEADING = ("Look at this", "what speaks against the result: why the verdict is not good")
+WARNINGS_HEADING = ("Warnings", "what was assumed, corrected, doubtful or lost: the verdict does not rest on it")
+"""Headings of the two lists of texts, and by what these differ."""
 _KEY_FIGURES: dict[str, tuple[str, ...]] = {
     "localise": ("localised", "APE rmse where localised", "APE rmse", "points within 15 cm of a wall"),
     "slam": ("loops closed", "relations, mean", "APE rmse", "points within 15 cm of a wall"),
@@ -75,7 +78,7 @@ class ResultSummary:
         return f"{self.verdict}: {VERDICT_WORDS[self.verdict]}"
 
     def to_json(self) -> dict[str, Any]:
-        """For the web page: figures as {name, values, numbers, explanation}, the names of the key figures, texts."""
+        """For the web page: figures as {name, values, numbers, explanation, usual}, names of key figures, texts."""
         return {
             "verdict": str(self.verdict),
             "mode": self.mode,
@@ -88,6 +91,7 @@ class ResultSummary:
                     "values": list(row.values),
                     "numbers": list(row.numbers),
                     "explanation": row.explanation,
+                    "usual": row.usual,
                 }
                 for row in self.figures
             ],

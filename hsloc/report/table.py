@@ -22,13 +22,19 @@ LENGTHS = ((0.00095, 1e3, "mm"), (0.9995, 1e2, "cm"), (1e3, 1.0, "m"), (np.inf, 
 """Units of lengths: below which number of metres each is used, how many of it are a metre, its name."""
 STATUS_WORDS: dict[str, str] = {
     Status.MATCHED: "matched",
-    Status.RELOCALISED: "relocalised",
-    Status.PREDICTED: "held by the motion gate",
+    Status.RELOCALISED: "pose found by search",
+    Status.PREDICTED: "skipped (robot had hardly moved)",
     Status.REJECTED: "rejected",
     Status.NO_RETURNS: "without returns",
-    Status.SEARCHING: "searching",
+    Status.SEARCHING: "during the search for the pose",
 }
 """What a scan's status is called."""
+MARK_WORDS: dict[str, str] = {
+    Status.NO_RETURNS: "scan without returns",
+    Status.REJECTED: "scan rejected",
+    Status.RELOCALISED: "pose found by search",
+}
+"""What a scan that is marked on the map is called."""
 _LISTED = 3
 """Times and places of a reason that are listed in words."""
 
@@ -45,6 +51,8 @@ class Row:
     """Where metrics.json holds the numbers, as JSON pointers without the first slash: `ape/trans_part/rmse`."""
     numbers: tuple[float | None, ...] = ()
     """These numbers, in the units of metrics.json."""
+    usual: str = ""
+    """What is usual, in a few words to stand beside the value; empty where that depends on the run."""
 
 
 def table_rows(metrics: RunMetrics) -> list[Row]:
@@ -220,7 +228,7 @@ def _single_rows(metrics: RunMetrics) -> list[Row]:
     rows += scan_rows(metrics.scans)
     if metrics.run.mode == "localise" and metrics.fitness.median is not None:
         values = f"{metrics.fitness.median:.3f}"
-        rows.append(Row("fitness of the matches, median", (values,), _FITNESS, ("fitness/median",)))
+        rows.append(Row("fitness of the matches, median", (values,), _FITNESS, ("fitness/median",), usual="above 0.8"))
     return [*rows, *_map_rows(metrics.map)]
 
 
@@ -244,8 +252,9 @@ def scan_rows(scans: ScanCounts) -> list[Row]:
     if unused:
         words = ", ".join(f"{scans.by_status[name]} {STATUS_WORDS.get(name, name)}" for name in unused)
         explanation = (
-            "What became of the other scans. Held by the motion gate: the robot had hardly moved since the last match, "
-            "so the scan was not needed; this is no fault."
+            "What became of the other scans. Skipped: the robot had hardly moved since the last match, so the scan "
+            "was not needed (the motion gate); this is no fault. During the search for the pose: it was not known "
+            "yet; once it is found, the poses before are computed backwards from there."
         )
         rows.append(
             Row(
@@ -262,11 +271,13 @@ def _map_rows(found: MapMetrics) -> list[Row]:
     rows, residuals = [], found.residuals
     if residuals.within_15_cm is not None:
         values = format_share(residuals.within_15_cm)
-        rows.append(Row("points within 15 cm of a wall", (values,), _NEAR_WALL, ("map/residuals/within_0.15_m",)))
+        within = Row("points within 15 cm of a wall", (values,), _NEAR_WALL, ("map/residuals/within_0.15_m",))
+        rows.append(replace(within, usual="above 95 %"))
     if residuals.p95 is not None:
         # The distance is that from cell to cell: a point in an occupied cell has no smaller distance.
         near = "less than a cell" if residuals.p95 == 0.0 else format_length(residuals.p95)
-        rows.append(Row("scan to map, 95 % of points", (near,), _SCAN_TO_MAP, ("map/residuals/p95",)))
+        distance = Row("scan to map, 95 % of points", (near,), _SCAN_TO_MAP, ("map/residuals/p95",))
+        rows.append(replace(distance, usual="up to 10 cm"))
     mapping = found.mapping
     if mapping is not None:
         loops = f"{mapping.loops} of {mapping.loops + mapping.loops_refused} candidates"
@@ -282,7 +293,8 @@ def _map_rows(found: MapMetrics) -> list[Row]:
             rows.append(Row("standard deviation, median, max", (values,), _SIGMA, sources))
         if isfinite(mapping.conflict):
             values = format_share(mapping.conflict)
-            rows.append(Row("points seen through", (values,), _CONFLICT, ("map/mapping/conflict",)))
+            conflict = Row("wall points other scans see through", (values,), _CONFLICT, ("map/mapping/conflict",))
+            rows.append(replace(conflict, usual="below 5 %"))
     if found.odometry is not None:
         errors = found.odometry
         way = f"{100.0 * errors.translation:+.1f} ± {100.0 * errors.translation_sigma:.1f} % of the way"
@@ -291,7 +303,8 @@ def _map_rows(found: MapMetrics) -> list[Row]:
         rows.append(Row("added to the odometry", (f"{way}, {turns}",), _ODOMETRY_ERRORS, sources))
     if found.crispness is not None and isfinite(found.crispness.wall_thickness_median):
         values = format_length(found.crispness.wall_thickness_median)
-        rows.append(Row("wall thickness", (values,), _THICKNESS, ("map/crispness/wall_thickness_median",)))
+        thickness = Row("wall thickness", (values,), _THICKNESS, ("map/crispness/wall_thickness_median",))
+        rows.append(replace(thickness, usual="9 to 21 cm, 2 to 4 cells"))
     if found.plan is not None:
         rows += _plan_rows(found.plan)
     compared = found.comparison
@@ -339,7 +352,7 @@ _NEAR_WALL = (
 )
 _SCAN_TO_MAP = (
     "Distance to the nearest occupied cell of the map that 95 of 100 scan points stay below. One or two cells are "
-    "usual, 5 to 10 cm on most maps."
+    "usual, up to 10 cm on most maps."
 )
 _LOOPS = (
     "Places that were recognised when the robot came back, of all that were compared. A map without a loop keeps the "
@@ -354,12 +367,13 @@ _ODOMETRY_ERRORS = (
     "wheels and their distance."
 )
 _CONFLICT = (
-    "Part of the points of the map where another scan looked through. Below 5 % is usual; more means that walls are "
-    "doubled, or that things moved."
+    "Part of the points of the map's walls where another scan has a beam that goes through to something behind. "
+    "Below 5 % is usual; more means that walls are doubled, or that things moved."
 )
 _THICKNESS = (
-    "Median thickness of what is occupied in the built map. 10 to 20 cm are usual, as furniture and both faces of a "
-    "wall count; more than in another run of the same log means that the visits to a place do not lie on each other."
+    "Median thickness of what is occupied in the built map. Right maps have 9 to 21 cm, 2 to 4 cells of 5 cm, as "
+    "furniture and both faces of a wall count. More, or more than in another run of the same log, means that visits to "
+    "a place do not lie on each other, or that the lidar is noisy. The verdict does not rest on it."
 )
 _PRECISION = (
     "Precision: part of the built walls that are in the true map. Recall: part of the seen walls of the true map that "

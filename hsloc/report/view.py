@@ -21,7 +21,7 @@ from hsloc.report.charts import convergence_charts, run_charts
 from hsloc.report.data import peak_rows, prepare, since, status_counts
 from hsloc.report.map_image import grey_levels, picture_of, shown_extent
 from hsloc.report.summary import ResultSummary
-from hsloc.report.table import STATUS_WORDS, format_probability
+from hsloc.report.table import MARK_WORDS, STATUS_WORDS, format_probability
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -86,7 +86,7 @@ def view_of(parts: ReportParts, data: ReportData | None = None) -> ReportView:
         "reference": _path(data.reference, data.reference_jumps),
         "points": None if parts.points is None else _columns(x=parts.points[:, 0], y=parts.points[:, 1]),
         "lost": [[_round(begin), _round(end)] for begin, end in data.lost],
-        "scans": _scans(parts, data.start_ns),
+        "scans": _scans(parts, data),
         "coverage": None if parts.coverage is None else _coverage(parts.coverage),
         "marks": [*([] if scans is None else _marks(scans)), *_places_to_check(parts.metrics)],
         "loops": loops,
@@ -185,7 +185,7 @@ def _path(xy: Floats | None, jumps: NDArray[np.bool_] | None) -> dict[str, Any] 
     return {**_columns(x=xy[rows, 0], y=xy[rows, 1], decimals=3), "breaks": breaks}
 
 
-def _scans(parts: ReportParts, start_ns: int) -> dict[str, Any] | None:
+def _scans(parts: ReportParts, data: ReportData) -> dict[str, Any] | None:
     """Scans with points: poses, status, and all points as centimetres in the base frame (int16), distances as bytes."""
     overlay = parts.overlay
     if overlay is None or not len(overlay.rows):
@@ -199,12 +199,18 @@ def _scans(parts: ReportParts, start_ns: int) -> dict[str, Any] | None:
     status: dict[int, tuple[str, str]] = {}
     if parts.diagnostics is not None:
         diagnostics = parts.diagnostics
-        triples = zip(diagnostics.stamps_ns.tolist(), diagnostics.status, diagnostics.reason, strict=True)
-        status = {stamp: (STATUS_WORDS.get(name, str(name)), reason) for stamp, name, reason in triples}
+        stamps = diagnostics.stamps_ns
+        # A pose that is known at a scan that was searching became so when the search had ended.
+        at = np.searchsorted(data.seconds, since(stamps, data.start_ns))
+        later = data.localised[np.minimum(at, len(data.localised) - 1)] if len(data.localised) else at < 0
+        found = zip(stamps.tolist(), diagnostics.status, diagnostics.reason, later.tolist(), strict=True)
+        for stamp, name, reason, is_known in found:
+            after = ", and placed once it had ended" if is_known and name == Status.SEARCHING else ""
+            status[stamp] = f"{STATUS_WORDS.get(name, name)}{after}", reason
     words = [status.get(stamp, ("", "")) for stamp in overlay.stamps_ns[rows].tolist()]
     poses = overlay.poses[rows]
     return {
-        **_columns(t=since(overlay.stamps_ns[rows], start_ns), x=poses[:, 0], y=poses[:, 1], decimals=3),
+        **_columns(t=since(overlay.stamps_ns[rows], data.start_ns), x=poses[:, 0], y=poses[:, 1], decimals=3),
         **_columns(theta=poses[:, 2], far=overlay.far[rows], decimals=4),
         "count": [len(cloud) for cloud in clouds],
         "status": [f"{name}: {reason}" if reason and reason not in name else name for name, reason in words],
@@ -236,7 +242,7 @@ def _marks(scans: Scans) -> list[dict[str, Any]]:
         marks = _columns(t=scans.seconds[rows], x=scans.xy[rows, 0], y=scans.xy[rows, 1], decimals=3)
         if len(rows):
             reasons = [scans.reason[row] for row in rows]
-            found.append({"status": str(status), "label": STATUS_WORDS[status], **marks, "reason": reasons})
+            found.append({"status": str(status), "label": MARK_WORDS[status], **marks, "reason": reasons})
     return found
 
 

@@ -225,7 +225,7 @@ def test_counts_of_scans_add_up(run: Any, metrics: Any) -> None:
     assert sum(scans.by_status.values()) == sum(scans.by_reason.values()) == scans.total
     matched, others = (row.values[0] for row in table_rows(metrics) if row.label.startswith("scans"))
     assert matched == f"{scans.used} of {scans.total}"
-    assert "held by the motion gate" in others
+    assert "skipped (robot had hardly moved)" in others
     assert scans.used + sum(int(n) for n in re.findall(r"(\d+) [a-z]", others)) == scans.total
 
 

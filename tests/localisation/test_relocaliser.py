@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -108,6 +109,14 @@ def test_a_scan_without_motion_adds_no_evidence() -> None:
         verdict = subject.update(seen(L_SHAPE, START, Pose2(), float(k)), k)
         assert not verdict.is_sure
         assert verdict.evaluations == 0
+
+
+def test_a_search_says_how_far_it_is() -> None:
+    _, verdicts, _ = search(L_SHAPE, ONE, 4)
+    fits = r"fitness [01]\.\d\d over \d+ scans?"
+    several = rf"\d+ places possible; the best has {fits}, in sum \d+\.\d\d more than the next"
+    assert all(re.fullmatch(rf"{several}|one place possible, with {fits}", verdict.reason) for verdict in verdicts)
+    assert re.search(r"over 1 scan\b", verdicts[0].reason)
 
 
 def test_start_removes_all_hypotheses() -> None:

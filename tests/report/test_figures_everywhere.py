@@ -6,21 +6,24 @@ import json
 import re
 from dataclasses import replace
 from html import unescape
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from report_parts import view_in
+from sample_metrics import mapped
 
 from hsloc.cli.main import main
 from hsloc.cli.output import print_job, summary_lines
 from hsloc.evaluation.metrics import format_json
-from hsloc.model.verdict import Verdict
+from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.report.data import ReportParts
 from hsloc.report.html import comparison_rows, read_runs, write_report_html
 from hsloc.report.seeds import Spread, seed_groups, spread_text
-from hsloc.report.summary import ResultSummary
+from hsloc.report.summary import REASONS_HEADING, WARNINGS_HEADING, ResultSummary
 from hsloc.run_metrics import RunTimings
+from hsloc.warnings import RunWarning
 from hsloc_service.execution.worker import summarise
 
 if TYPE_CHECKING:
@@ -30,10 +33,11 @@ UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3, "°": 1.0, "%": 1e-2, "": 
 
 
 def in_table(text: str) -> dict[str, tuple[str, ...]]:
-    """By name, the cells of the figures in a report."""
+    """By name, the cells of the figures in a report; what is usual stands in small letters behind the value."""
     (table,) = re.findall(r'<table class="figures">(.*?)</table>', text, flags=re.S)
     rows = re.findall(r'<tr title="[^"]*"><th scope="row">(.*?)</th>(.*?)</tr>', table)
-    return {unescape(name): tuple(map(unescape, re.findall(r"<td[^>]*>(.*?)</td>", cells))) for name, cells in rows}
+    cell = re.compile(r"<td[^>]*>(.*?)(?: <small .*?)?</td>")
+    return {unescape(name): tuple(map(unescape, cell.findall(cells))) for name, cells in rows}
 
 
 def on_lines(lines: list[str], names: dict[str, Any]) -> dict[str, str]:
@@ -42,7 +46,7 @@ def on_lines(lines: list[str], names: dict[str, Any]) -> dict[str, str]:
     for line in lines:
         for name in sorted(names, key=len, reverse=True):
             if line.startswith(f"{name}  "):
-                found[name] = " ".join(line.removeprefix(name).split())
+                found[name] = " ".join(line.removeprefix(name).partition("  (usual: ")[0].split())
                 break
     return found
 
@@ -88,6 +92,36 @@ def test_the_same_figure_is_the_same_everywhere(
     rows = {name: cells for name, *cells in comparison_rows(runs)}
     assert {name: rows[name] for name in shown} == {name: [" / ".join(values)] * 2 for name, values in shown.items()}
     assert rows["verdict"] == [metrics.verdict, view["verdict"]]
+
+
+def test_what_is_usual_stands_beside_the_value_and_in_its_explanation(
+    run: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    metrics = mapped(run["metrics"])
+    timings = RunTimings(seconds={"replay": 1.0}, times_real_time=None, evaluations_per_second=None)
+    rows = {row.label: row for row in ResultSummary.of(metrics).figures}
+    usual = {label: row.usual for label, row in rows.items() if row.usual}
+    assert {"wall thickness", "wall points other scans see through", "points within 15 cm of a wall"} <= set(usual)
+    for label, text in usual.items():
+        assert set(re.findall(r"\d+", text)) <= set(re.findall(r"\d+", rows[label].explanation)), label
+    print_job(summarise(metrics, timings))
+    terminals = [summary_lines(metrics, timings, tmp_path), capsys.readouterr().out.splitlines()]
+    write_report_html(tmp_path / "report.html", ReportParts(title="office.mcap", **{**run, "metrics": metrics}))
+    report = unescape((tmp_path / "report.html").read_text())
+    for lines in terminals:
+        assert any(line.split("  ")[0] == "wall thickness" and "20.9 cm  (usual: 9 to 21 cm" in line for line in lines)
+    assert '>20.9 cm <small class="muted">usual: 9 to 21 cm, 2 to 4 cells</small>' in report
+
+
+def test_headings_say_how_reasons_and_warnings_differ_in_report_and_page(run: dict[str, Any], tmp_path: Path) -> None:
+    reason = VerdictReason(Verdict.CHECK, "slip", "the wheels slipped")
+    metrics = replace(run["metrics"], verdict_reasons=(reason,), warnings=(RunWarning("clock_set", "a clock was set"),))
+    write_report_html(tmp_path / "report.html", ReportParts(title="office.mcap", **{**run, "metrics": metrics}))
+    report = unescape((tmp_path / "report.html").read_text())
+    page = (files("hsloc_service") / "web" / "result.js").read_text()
+    for (name, what), text in ((REASONS_HEADING, "the wheels slipped"), (WARNINGS_HEADING, "a clock was set")):
+        assert re.search(f'<h2>{name} <small class="muted">{re.escape(what)}</small></h2><ul[^>]*><li>{text}', report)
+        assert re.search(f'"{name}".*"{re.escape(what)}"', page)
 
 
 def test_over_seeds_runs_are_one_column(

@@ -232,6 +232,24 @@ def test_scans_lie_where_they_were_taken(run: dict[str, Any]) -> None:
     assert (far["t"], far["v"]) == ([2.0, 10.0], [2.0, None])  # the line breaks where the pose was lost
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_a_pose_that_is_known_during_a_search_was_found_later(run: dict[str, Any], known: bool) -> None:
+    path, diagnostics = run["trajectory"], run["diagnostics"]
+    row = diagnostics.status.index("searching")
+    stamps = diagnostics.stamps_ns[[row]]
+    cloud, near = np.array([[1.0, 0.0]]), np.array([0.0])
+    overlay = ScanOverlay(
+        stamps_ns=stamps, poses=path.poses[:1], far=near, rows=np.array([0]), points=(cloud,), distances=(near,)
+    )
+    localised = np.full(len(path), known)
+    view, _ = view_of(
+        ReportParts(title="", trajectory=path, diagnostics=diagnostics, overlay=overlay, localised=localised)
+    )
+    (status,) = view["scans"]["status"]
+    assert status.startswith("during the search for the pose")
+    assert ("placed once it had ended" in status) is known
+
+
 def test_coverage_holds_counts_of_any_size(run: dict[str, Any], tmp_path: Path) -> None:
     counts = np.array([[0, 1, 7], [1000, 60_000, 0]], dtype=np.int32)
     shown = {**run, "coverage": Coverage(counts, 0.25, Pose2(-1.0, 2.0, 0.5))}

@@ -112,7 +112,7 @@
         ["refused", `refused loops (${refused})`, refused, false], ["graph", `pose graph (${d.graph?.total} edges)`, d.graph, false], ["ellipses", "2σ ellipses", d.ellipses, false],
         ["places", `places that may be right (${d.ambiguities?.reduce((n, each) => n + each.p.length, 0)})`, d.ambiguities?.length, true],
         ["heat", "distance of scans to the map", d.scans && d.map, false], ["coverage", "coverage: what the lidar has seen", d.coverage, false],
-        ...d.marks.map((mark) => [mark.status, `${mark.status === "to_check" ? "" : "scan "}${mark.label} (${mark.t.length})`, true, true]),
+        ...d.marks.map((mark) => [mark.status, `${mark.label} (${mark.t.length})`, true, true]),
       ];
       this.shown = new Set();
       for (const [name, text, there, on, ink] of layers) {

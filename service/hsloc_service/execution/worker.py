@@ -184,7 +184,8 @@ def summarise(metrics: RunMetrics, timings: RunTimings) -> dict[str, Any]:
         "verdict_text": summary.verdict_text,
         "key_figures": [row.label for row in summary.key_figures],
         "figures": [
-            {"name": row.label, "values": list(row.values), "numbers": list(row.numbers)} for row in summary.figures
+            {"name": row.label, "values": list(row.values), "numbers": list(row.numbers), "usual": row.usual}
+            for row in summary.figures
         ],
         "verdict_reasons": [
             {**_shortened(to_json(each)), "line": line[:500]}

@@ -26,11 +26,13 @@ export function heading(scope, text) {
 }
 
 // A list below its title, of [text, class]; nothing where there is no line.
-export function list(title, lines) {
+export function list(title, lines, what = "") {
   if (!lines.length) return [];
   const all = element("ul");
   all.append(...lines.map(([text, kind]) => element("li", text, kind)));
-  return [element("h3", title), all];
+  const head = element("h3", title);
+  if (what) head.append(" ", element("small", what, "quiet"));
+  return [head, all];
 }
 
 export function button(text, work, className = "") {

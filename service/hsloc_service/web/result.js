@@ -289,7 +289,10 @@ function summary(job, whole) {
   const reasons = short.verdict_reasons ?? [], known = new Set(reasons.map((reason) => reason.text));
   const warnings = whole?.warnings ?? [...(short.warnings ?? []).filter((warning) => !known.has(warning.text)).map(warningText), ...(short.notes ?? [])];
   const lines = (texts) => texts.map((text) => [text]);
-  $("notes").replaceChildren(...list("Look at this", lines(whole?.reasons ?? reasons.map((reason) => reason.line))), ...list("Warnings", lines(warnings)));
+  // The headings are those of hsloc.report.summary.
+  $("notes").replaceChildren(
+    ...list("Look at this", lines(whole?.reasons ?? reasons.map((reason) => reason.line)), "what speaks against the result: why the verdict is not good"),
+    ...list("Warnings", lines(warnings), "what was assumed, corrected, doubtful or lost: the verdict does not rest on it"));
   const rows = [];
   const row = (name, values, explanation = "") => {
     const line = element("tr");

@@ -68,6 +68,8 @@ EXAMPLES = """
 exit codes:
   0 done    1 failed    2 wrong use    3 done, part of the log lost    4 done, a limit not kept
 """
+_CLOSE = 0.7
+"""How alike (0 to 1) a flag must be to the wrong one to be suggested: `out` is none for `bogus`, `seed` for `sede`."""
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -106,8 +108,11 @@ class Parser(argparse.ArgumentParser):
         unknown = message.removeprefix("unrecognized arguments: ")
         if unknown == message:
             return ""
-        close = difflib.get_close_matches(unknown.split()[0].partition("=")[0], self.flags(), 1)
-        return f"; did you mean {close[0]}?" if close else ""
+        # Without the dashes, which all have in common.
+        word, names = unknown.split()[0].partition("=")[0].lstrip("-"), [flag[2:] for flag in self.flags()]
+        close = difflib.get_close_matches(word, names, 1, _CLOSE)
+        close += [name for name in names if min(len(word), len(name)) > 2 and (word in name or name in word)]
+        return f"; did you mean --{close[0]}?" if close else ""
 
     def flags(self) -> list[str]:
         """The long flags."""
@@ -175,6 +180,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # Whoever read the output has enough; `program` leaves the rest.
         return EXIT_FAILED
     except OSError as error:
+        if isinstance(error, PermissionError) and error.filename is not None:
+            remedy = "check its rights, and those of the folders above it"
+            print(f"hsloc: error: {error.filename}: cannot be reached ({error.strerror}); {remedy}", file=sys.stderr)
+            return EXIT_FAILED
         if error.errno not in _NO_SPACE:
             raise
         where = error.filename or "standard output"

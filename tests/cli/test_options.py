@@ -118,6 +118,15 @@ def test_a_pose_may_begin_with_a_minus(flag: str, text: str) -> None:
             ["replay", "run.mcap", "--intial-pose", "1,2,0"],
             "hsloc replay: error: unrecognized arguments: --intial-pose 1,2,0; did you mean --initial-pose?",
         ),
+        (["replay", "run.mcap", "--bogus"], "hsloc replay: error: unrecognized arguments: --bogus"),
+        (
+            ["replay", "run.mcap", "--output"],
+            "hsloc replay: error: unrecognized arguments: --output; did you mean --out?",
+        ),
+        (
+            ["check", "run.mcap", "--quite"],
+            "hsloc check: error: unrecognized arguments: --quite; did you mean --quiet?",
+        ),
         (
             ["replay", "run.mcap", "--matcher", "hid"],
             "hsloc replay: error: argument --matcher: invalid choice 'hid'; did you mean hide?",

@@ -15,6 +15,14 @@ if TYPE_CHECKING:
     from typing import BinaryIO
 
 
+def is_there(path: Path) -> bool:
+    """Whether a file or folder to be written exists already; raises `OutputError` where that cannot be found out."""
+    try:
+        return path.exists()
+    except OSError as error:
+        raise OutputError(not_written(path, error)) from error
+
+
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Let `write` fill a file beside `path`, then move it there: a reader never sees half a file.
 

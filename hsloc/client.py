@@ -23,7 +23,7 @@ import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from hsloc.errors import HslocError, no_such, not_written
+from hsloc.errors import HslocError, no_such, not_read, not_written
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -90,7 +90,7 @@ class Client:
         except FileNotFoundError as error:
             raise ClientError(no_such(path)) from error
         except OSError as error:
-            raise ClientError(f"{path}: cannot be read: {error.strerror or error}") from error
+            raise ClientError(not_read(path, error)) from error
         ident = place.rsplit("/", 1)[1]
         if self.request("GET", f"/v1/files/{ident}").json()["sha256"] != digest.hexdigest():
             raise ClientError(f"{path}: arrived changed; was it written to meanwhile?")

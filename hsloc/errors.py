@@ -57,7 +57,20 @@ class OutputError(HslocError):
 
 def not_written(path: object, error: OSError) -> str:
     """The message for a file or folder that cannot be written."""
-    return f"{path}: cannot be written ({error.strerror or error}); check the folder, its rights and free space"
+    reason = f"{path}: cannot be written ({error.strerror or error})"
+    return f"{reason}; check the folder, its rights and free space, or name another one"
+
+
+def not_read(path: object, error: OSError) -> str:
+    """The message for a file or folder that is there and cannot be read."""
+    denied = isinstance(error, PermissionError)
+    remedy = "check its rights, and those of the folders above it" if denied else "check the path and its disk"
+    return f"{path}: cannot be read ({error.strerror or error}); {remedy}"
+
+
+def _stem(name: str) -> str:
+    """A name without its endings: alike for these alone, no two files are alike."""
+    return name.partition(".")[0]
 
 
 def no_such(path: Path, what: str = "file", remedy: str = "; check the path") -> str:
@@ -66,5 +79,5 @@ def no_such(path: Path, what: str = "file", remedy: str = "; check the path") ->
         names = [each.name for each in path.parent.iterdir()]
     except OSError:
         names = []
-    close = get_close_matches(path.name, names, 1)
+    close = [each for each in get_close_matches(path.name, names) if get_close_matches(_stem(path.name), [_stem(each)])]
     return f"{path}: no such {what}" + (f"; did you mean {path.parent / close[0]}?" if close else remedy)

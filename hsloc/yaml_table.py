@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
-from hsloc.errors import ConfigError, HslocError, no_such
+from hsloc.errors import ConfigError, HslocError, no_such, not_read
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -43,6 +43,8 @@ def load_table(
     except FileNotFoundError as error:
         raise kind(no_such(path, what, remedy or "; check the path")) from error
     except OSError as error:
+        if isinstance(error, PermissionError) or not remedy:
+            raise kind(not_read(path, error)) from error
         raise kind(f"{path}: cannot be read ({error.strerror or error}){remedy}") from error
     except (YAMLError, ValueError, RecursionError, AttributeError) as error:
         reason = (str(error).splitlines() or [""])[0]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hsloc.cli.arguments import add_options, add_read_arguments, run_request
-from hsloc.cli.output import print_warnings
+from hsloc.cli.output import need_writable, print_warnings
 from hsloc.cli.progress import ProgressLine
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Calibrate; returns the exit code."""
     from json import dumps
 
-    from hsloc.atomic_write import write_text_atomically
+    from hsloc.atomic_write import is_there, write_text_atomically
     from hsloc.calibration.calibrate import calibrate
     from hsloc.calibration.written import as_json, as_lines, as_static_transform, as_urdf, as_yaml
     from hsloc.errors import ConfigError, OutputError
@@ -56,10 +56,11 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out.suffix == ".urdf":
         raise OutputError(f"{arguments.out}: the URDF is written beside the YAML; name a .yaml file")
     for target in targets:
-        if target.exists() and not arguments.force:
+        if is_there(target) and not arguments.force:
             raise OutputError(f"{target}: exists; give --force to overwrite it, or name another file with --out")
         if not target.parent.is_dir():
             raise OutputError(f"{target}: its folder does not exist; create it, or name another file with --out")
+        need_writable(target)
     request = run_request(arguments)
     if request.map_path is None and (request.initial_pose is not None or request.unknown_start):
         raise ConfigError("--initial-pose and --unknown-start are for a map; give one with --map, or leave them out")

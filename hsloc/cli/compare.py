@@ -27,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the table, write the page."""
+    from hsloc.atomic_write import is_there
     from hsloc.cli.main import EXIT_OK
     from hsloc.cli.output import print_lines
     from hsloc.errors import OutputError
@@ -35,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.text_table import table
 
     out: Path | None = arguments.out
-    if out is not None and out.exists() and not arguments.overwrite:
+    if out is not None and is_there(out) and not arguments.overwrite:
         raise OutputError(f"{out}: exists already; choose another --out, or pass --overwrite")
     runs = read_runs(arguments.results)
     if arguments.json:

@@ -38,6 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
     from pathlib import Path
 
+    from hsloc.atomic_write import is_there
     from hsloc.errors import OutputError
     from hsloc.log import convert_log, open_log
     from hsloc.slam.front_end import FrontEndParameters
@@ -45,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.warnings import WarningCode
 
     target = Path(arguments.out)
-    if target.exists() and not target.is_dir():
+    if is_there(target) and not target.is_dir():
         if Path(arguments.log).exists() and target.samefile(arguments.log):
             raise OutputError(f"{target}: is the input itself; name another file")
         if not arguments.force:

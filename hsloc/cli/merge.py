@@ -35,12 +35,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Merge and write; returns the exit code."""
     from json import dumps
 
+    from hsloc.atomic_write import is_there
     from hsloc.errors import OutputError
     from hsloc.export.results_folder import merge_summary, write_merged_map
     from hsloc.replay.map_merge import merge_maps
 
     out = Path(arguments.out)
-    if out.exists():
+    if is_there(out):
         raise OutputError(f"{out}: exists already; choose another --out")
     refuse_early(out, overwrite=False)
     with ProgressLine(arguments.quiet or arguments.json or arguments.no_progress) as line:

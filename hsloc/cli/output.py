@@ -45,16 +45,22 @@ def import_matplotlib() -> None:
 
 def refuse_early(folder: Path, overwrite: bool) -> None:
     """Raise OutputError for a folder that cannot be written, before the work and not after it."""
-    from hsloc.errors import OutputError
     from hsloc.export.results_folder import refuse_folder
 
     refuse_folder(folder, overwrite)
-    parent = folder.resolve().parent
+    need_writable(folder)
+
+
+def need_writable(target: Path) -> None:
+    """Raise OutputError where the folder that a file or folder is to be made in cannot be written to."""
+    from hsloc.errors import OutputError
+
+    parent = target.resolve().parent
     while not parent.exists():
         parent = parent.parent
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         reason = f"{parent} is not a folder that may be written to"
-        raise OutputError(f"{folder}: cannot be written ({reason}); choose another --out")
+        raise OutputError(f"{target}: cannot be written ({reason}); choose another --out")
 
 
 def link_latest(folder: Path) -> None:

@@ -97,7 +97,7 @@ def refuse_folder(folder: Path, overwrite: bool) -> None:
             return
         is_results = any(all((folder / name).is_file() for name in names) for names in _OF_RESULTS)
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be read: {error.strerror or error}") from error
+        raise OutputError(f"{folder}: cannot be written ({error.strerror or error}); choose another --out") from error
     if not overwrite:
         raise OutputError(f"{folder}: exists already; choose another --out, or pass --overwrite")
     if not is_results:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from hsloc.errors import HslocError, LogFormatError
+from hsloc.log.no_log import COPY_AGAIN
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -146,7 +147,7 @@ def guarded(complaint: str, remedy: str, losses: Losses | None) -> Iterator[None
         raise
     except Exception as error:
         reason = (str(error).splitlines() or [""])[0][:160]
-        line = f"{complaint} ({reason}); if its recorder was stopped hard, {remedy} saves what is whole"
+        line = f"{complaint} ({reason}); {COPY_AGAIN}; if its recorder was stopped hard, {remedy} saves what is whole"
         if losses is None:
             raise LogFormatError(line) from error
         losses.truncated_files += 1

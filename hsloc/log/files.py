@@ -19,14 +19,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, BinaryIO, NamedTuple, cast
 
-from hsloc.errors import LogError, LogFormatError, no_such
+from hsloc.errors import LogError, LogFormatError, no_such, not_read
 from hsloc.log.mcap.records import MAGIC
+from hsloc.log.no_log import EMPTY, no_logs_inside, why_no_log
 from hsloc.log.packing import GZIP, STREAMS, ZSTD, opened
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-NO_LOG = "is not an MCAP, a ROS bag or a CARMEN log"
 _BAG_MAGIC = b"#ROSBAG V"
 _SQLITE_MAGIC = b"SQLite format 3\0"
 _HEAD_BYTES = 4096
@@ -88,7 +88,7 @@ def expand(path: Path, scratch: Scratch, shown: Path | None = None) -> list[LogF
             return _of_file(path, scratch, shown)
         inside = sorted((part for part in path.iterdir() if not part.name.startswith(".")), key=natural)
     except OSError as error:
-        raise LogError(f"{shown}: cannot be read ({error.strerror or error})") from error
+        raise LogError(not_read(shown, error)) from error
     for ending in _ENDINGS:
         found = [part for part in inside if Path(plain_name(part)).suffix.lower() == ending and part.is_file()]
         names = {part.name for part in found}
@@ -97,6 +97,11 @@ def expand(path: Path, scratch: Scratch, shown: Path | None = None) -> list[LogF
         if found:
             return [file for part in found for file in expand(part, scratch, _name_inside(part, path, shown))]
     return _by_content(inside, path, scratch, shown)
+
+
+def _has_ending(name: str) -> bool:
+    """Whether a file is a log by its name, packed or not."""
+    return Path(plain_name(Path(name))).suffix.lower() in _ENDINGS and not name.startswith(".")
 
 
 def natural(path: Path) -> list[tuple[int, str]]:
@@ -115,8 +120,9 @@ def _by_content(inside: Sequence[Path], path: Path, scratch: Scratch, shown: Pat
     if not files:
         if any(part.name.endswith(".db3-wal") for part in inside):
             raise LogFormatError(f"{shown}: holds the write-ahead log of a .db3 file without that; copy both")
-        what = "a folder" if shown == path or shown.is_dir() else "an archive"
-        raise LogFormatError(f"{shown}: is {what} without .mcap, .db3 or .bag files; name a log file")
+        if shown == path or shown.is_dir():
+            raise LogFormatError(f"{shown}: {no_logs_inside(path, _has_ending)}")
+        raise LogFormatError(f"{shown}: is an archive without .mcap, .db3 or .bag files; name a log file")
     return [file for part in files for file in expand(part, scratch, _name_inside(part, path, shown))]
 
 
@@ -128,12 +134,12 @@ def _is_bag(path: Path) -> bool:
 
 def _of_file(path: Path, scratch: Scratch, shown: Path, layers: int = 0) -> list[LogFile]:
     if not path.is_file():
-        raise LogFormatError(f"{shown}: is not a regular file")
+        raise LogFormatError(f"{shown}: is not a regular file; copy what it holds into one")
     head = _head(path)
     if not head:
         has_log = path.with_name(f"{path.name}-wal").is_file()
-        more = "; its write-ahead log beside it cannot be read without the database" if has_log else ""
-        raise LogFormatError(f"{shown}: is empty{more}")
+        of_log = "is empty; its write-ahead log beside it cannot be read without the database: copy both again"
+        raise LogFormatError(f"{shown}: {of_log if has_log else EMPTY}")
     if is_packed(head):
         inner = unpacked_head(path, head)
         # Text logs are read through gzip line by line; all else is unpacked.
@@ -148,7 +154,7 @@ def _of_file(path: Path, scratch: Scratch, shown: Path, layers: int = 0) -> list
         return [file._replace(is_cut=file.is_cut or is_cut) for file in inside]
     kind = kind_of(head)
     if not kind:
-        raise LogFormatError(f"{shown}: {_why_no_log(path, head)}")
+        raise LogFormatError(f"{shown}: {why_no_log(path, head)}")
     return [LogFile(path, kind, shown)]
 
 
@@ -157,7 +163,17 @@ def _head(path: Path) -> bytes:
         with path.open("rb") as stream:
             return stream.read(_HEAD_BYTES)
     except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
+        raise LogError(not_read(path, error)) from error
+
+
+def why_no_text_log(path: Path) -> str:
+    """What a file of kind `text` is that no format of text logs can read, and what to do: the end of a message."""
+    head = _head(path)
+    if is_packed(head):
+        head = unpacked_head(path, head)
+        if not head:
+            return "nothing of it can be unpacked; copy it again, or record anew"
+    return why_no_log(path, head)
 
 
 def kind_of(head: bytes) -> str:
@@ -169,30 +185,6 @@ def kind_of(head: bytes) -> str:
     if head.startswith(_SQLITE_MAGIC):
         return "db3"
     return "text" if head and b"\0" not in head else ""
-
-
-_FOREIGN = {
-    b"7z\xbc\xaf\x27\x1c": "7z",
-    b"Rar!": "rar",
-    b"\x1f\x9d": "compress (.Z)",
-    b"\x89LZO": "lzop",
-    b"LZIP": "lzip",
-    b"\xff\x06\x00\x00sNaPpY": "snappy",
-}
-"""How files begin that are packed in a way that is not read, and its name."""
-_WAL = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
-"""How the write-ahead log of an SQLite database begins."""
-
-
-def _why_no_log(path: Path, head: bytes) -> str:
-    """What a file is that is no log, and what to do."""
-    packed = next((name for magic, name in _FOREIGN.items() if head.startswith(magic)), None)
-    if packed is not None:
-        return f"is packed by {packed}, which is not read; unpack it first"
-    if head.startswith(_WAL):
-        name = path.name.removesuffix("-wal")
-        return f"is the write-ahead log of a ROS 2 bag: name the database, {name}, which must lie beside it"
-    return NO_LOG
 
 
 _ZIP = b"PK\x03\x04"

@@ -8,8 +8,8 @@ from itertools import tee
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hsloc.errors import LogError, LogFormatError
-from hsloc.log.files import NO_LOG, LogFile, Scratch
+from hsloc.errors import LogError, LogFormatError, not_read
+from hsloc.log.files import LogFile, Scratch, why_no_text_log
 from hsloc.log.files import expand as _expand
 from hsloc.log.summary import NANOSECONDS, LogSummary, Losses, ReadOptions
 from hsloc.model.calibration import NO_CORRECTION, corrected_odometry
@@ -108,7 +108,7 @@ class Log:
                     while block := stream.read(1 << 20):
                         digest.update(block)
             except OSError as error:
-                raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
+                raise LogError(not_read(path, error)) from error
         return digest.hexdigest()
 
 
@@ -180,7 +180,7 @@ def _text_source(file: LogFile, options: ReadOptions) -> TextSource:
 
     line_format = find_format(file.path)
     if line_format is None:
-        raise LogFormatError(f"{file.shown}: {NO_LOG}")
+        raise LogFormatError(f"{file.shown}: {why_no_text_log(file.path)}")
     return TextSource(file.path, line_format, options, file.shown)
 
 

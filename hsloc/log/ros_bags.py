@@ -33,6 +33,7 @@ from hsloc.log.container import (
 )
 from hsloc.log.files import Scratch
 from hsloc.log.messages.definitions import long_name
+from hsloc.log.no_log import missing_of_database
 from hsloc.log.summary import Losses, TopicStatistics
 from hsloc.warnings import RunWarning, WarningCode
 
@@ -395,6 +396,5 @@ class Db3Container(_Bag):
             self._wrong = set(written["id"][wrong].tolist())
 
     def _guarded(self, losses: Losses | None = None) -> AbstractContextManager[None]:
-        return guarded(
-            f"{self.path}: cannot be read as a {self.format}", f"`sqlite3 {self.path.name} .recover`", losses
-        )
+        complaint = f"{self.path}: {missing_of_database(self._file)}cannot be read as a {self.format}"
+        return guarded(complaint, f"`sqlite3 {self.path.name} .recover`", losses)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from hsloc.atomic_write import whole_folder, write_text_atomically
+from hsloc.atomic_write import is_there, whole_folder, write_text_atomically
 from hsloc.errors import OutputError
 from hsloc.evaluation.metrics import write_json
 from hsloc.reproduction import published
@@ -41,7 +41,7 @@ def write_results(
 
     Raises OutputError where the folder is there already (unless `overwrite`), or cannot be written.
     """
-    if folder.exists() and not overwrite and (not folder.is_dir() or any(folder.iterdir())):
+    if is_there(folder) and not overwrite and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder}: exists already; choose another --out, or pass --overwrite")
     text = markdown(reproduction, notes)
     with whole_folder(folder) as partial:

@@ -8,6 +8,7 @@ from hashlib import file_digest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hsloc.atomic_write import is_there
 from hsloc.errors import OutputError
 from hsloc.log import LogWriter, Transform3
 from hsloc.model import Pose2, Scan
@@ -58,7 +59,7 @@ def record(
     that is unknown, OutputError where the file exists (unless `overwrite`) or cannot be written.
     """
     target = Path(path)
-    if target.exists() and not overwrite:
+    if is_there(target) and not overwrite:
         raise OutputError(f"{target}: exists already; name another file, or overwrite it with --force")
     world = load_world(scenario.world) if world is None else world
     with LogWriter(target) as writer:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hsloc.errors import MapError, OutputError, not_written
+from hsloc.errors import MapError, OutputError, not_read, not_written
 from hsloc.model.occupancy_grid import OccupancyGrid
 from hsloc.model.pose2 import Pose2
 from hsloc.slam.keyscans import KeyScans
@@ -112,7 +112,7 @@ def read_state(path: Path) -> MapState:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             arrays: dict[str, Any] = dict(archive)
     except OSError as error:
-        raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise MapError(not_read(path, error)) from error
     except Exception as error:  # zipfile, zlib and NumPy raise what they like at damaged files
         raise MapError(f"{path}: not a saved map, or damaged; give the map.npz of a mapping run") from error
     if "version" not in arrays:

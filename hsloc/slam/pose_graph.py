@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.errors import LogFormatError, OutputError, not_written
+from hsloc.errors import LogFormatError, OutputError, not_read, not_written
 from hsloc.kernels.normal_equations import Equations, add_edges
 from hsloc.model.pose2 import pose_differences, relative_poses, wrap_angles
 from hsloc.slam.sparse_solver import BlockSystem
@@ -107,7 +107,7 @@ class PoseGraph:
         try:
             text = path.read_text(encoding="utf-8", errors="replace")
         except OSError as error:
-            raise LogFormatError(f"{path}: cannot be read: {error.strerror or error}") from error
+            raise LogFormatError(not_read(path, error)) from error
         index: dict[str, int] = {}
         poses: list[list[float]] = []
         edges: list[tuple[str, str, list[float]]] = []

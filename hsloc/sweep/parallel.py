@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hsloc.atomic_write import write_text_atomically
-from hsloc.errors import HslocError
+from hsloc.errors import HslocError, not_read
 from hsloc.interrupts import interrupts_held_back
 from hsloc.sweep.remote import UrlFolder
 from hsloc.sweep.runs import BROKEN, DONE, FAILED, SKIPPED, STOP, Outcome, SweepRun, request_values, sweep
@@ -320,7 +320,7 @@ def _read(path: Path | UrlFolder) -> dict[str, Any]:
         good = len(part["rows"]) == len(range(shard.index, total, shard.count)) and isinstance(part["sweep"], str)
         good = good and all(set(row) == set(COLUMNS) for row in part["rows"])
     except OSError as error:
-        raise HslocError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise HslocError(not_read(path, error)) from error
     except (ValueError, KeyError, TypeError):
         good = False
     if not good:

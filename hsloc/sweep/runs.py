@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from hsloc.analysis.quality import exceeded_limits
 from hsloc.config import to_dict
-from hsloc.errors import HslocError, no_such
+from hsloc.errors import HslocError, no_such, not_read
 from hsloc.export.results_folder import write_results
 from hsloc.log import open_log
 from hsloc.options import OPTIONS
@@ -271,7 +271,7 @@ def _digest(path: Path, hashes: dict[Path, str]) -> str:
         except FileNotFoundError as error:
             raise HslocError(no_such(path)) from error
         except OSError as error:
-            raise HslocError(f"{path}: cannot be read: {error.strerror or error}") from error
+            raise HslocError(not_read(path, error)) from error
     return hashes[path]
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.atomic_write import write_atomically
-from hsloc.errors import EvaluationError, no_such
+from hsloc.errors import EvaluationError, no_such, not_read
 from hsloc.model import Trajectory
 
 if TYPE_CHECKING:
@@ -119,7 +119,9 @@ def _text(path: Path) -> str:
     except UnicodeDecodeError:
         raise EvaluationError(f"{path}: not a text file; expected lines of numbers") from None
     except (OSError, EOFError, zlib.error) as error:
-        raise EvaluationError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+        if isinstance(error, OSError) and error.strerror:
+            raise EvaluationError(not_read(path, error)) from error
+        raise EvaluationError(f"{path}: cannot be read ({error}); copy it again, or unpack it first") from error
     return text
 
 

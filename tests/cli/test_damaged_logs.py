@@ -238,6 +238,34 @@ def test_of_a_log_that_is_cut_off_in_its_first_chunk_is_said_that(
         assert err.count("\n") == 1
 
 
+@pytest.mark.parametrize("kept", [300, 5000])
+def test_the_check_of_a_log_without_a_whole_chunk_names_the_loss_and_nothing_that_cannot_help(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kept: int
+) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(source.read_bytes()[:kept])
+    code, out, _ = run(capsys, "check", path)
+    assert code == 1
+    assert f"bytes were lost; 1 file ends too early (cut off, or never closed) ({path}: ends at byte {kept}" in out
+    assert "remedy: copy the file again, if the copy was cut off; else record anew: no scan" in out
+    assert "no scans (sensor_msgs/msg/LaserScan) in what is left of the log" in out
+    assert not re.search("convert|--odom-topic|--no-odom", out)
+
+
+def test_the_check_of_a_log_that_is_cut_later_offers_a_new_copy_and_what_is_whole(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run.mcap"
+    data = source.read_bytes()
+    path.write_bytes(data[: middle(data)[0] + 100])
+    code, out, _ = run(capsys, "check", path)
+    assert code == 3
+    assert (
+        "remedy: copy the file again, if the copy was cut off; else what is whole is used, and `hsloc convert`" in out
+    )
+    assert "in what is left of the log" not in out
+
+
 @pytest.fixture(scope="module")
 def bag(source: Path) -> Path:
     return formats.bag2(source, source.with_name("bag"))
@@ -302,6 +330,9 @@ def test_a_database_that_is_cut_is_read_as_far_as_it_is_whole(
     code, out, err = run(capsys, "info", folder, "--json")
     assert code in (1, 3)
     assert "cannot be read as a ROS 2 bag" in out + err
+    missing = len(data) - len(data) * 2 // 3
+    assert f"{missing} of its {len(data)} bytes are missing" in out + err
+    assert "copy the file again, if the copy was cut off" in out + err
 
 
 def test_payloads_that_are_cut_are_counted_one_by_one(

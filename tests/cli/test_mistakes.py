@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from imports import need_no_import
 from paths import RECORDINGS
-from processes import has_open
+from processes import has_open, heed_rights
 from waiting import LIMIT_S, until
 
 from hsloc.cli.main import main
@@ -92,6 +92,7 @@ def test_a_name_that_is_no_text_is_read_and_reported(here: Path, capsys: pytest.
     [
         (["nowhere.mcap"], "nowhere.mcap: no such file or folder; check the path"),
         ([OFFICE.replace("office", "ofice")], f"no such file or folder; did you mean {OFFICE}?"),
+        ([OFFICE.replace("office", "away")], "away.mcap: no such file or folder; check the path"),
         ([OFFICE, "--map", "nowhere.yaml"], "nowhere.yaml"),
         ([OFFICE, "--scan-topic", "/lidar"], "/lidar"),
         ([OFFICE, "--odom-topic", "/wheels"], "/wheels"),
@@ -115,6 +116,93 @@ def test_not_a_log(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (here / "empty.mcap").write_bytes(b"")
     assert "empty.mcap" in fails(capsys, "replay", "empty.mcap")
     assert empty(here)
+
+
+_MAP = "image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n"
+
+
+@pytest.mark.parametrize("command", ["replay", "map", "check", "info"])
+@pytest.mark.parametrize(
+    ("name", "content", "expected"),
+    [
+        ("plan.png", b"\x89PNG\r\n\x1a\n" + bytes(99), "is an image, not a log; name the recording, and give a map by"),
+        ("plan.pgm", b"P5\n4 4\n255\n" + bytes(16), "is an image, not a log"),
+        ("plain.pgm", b"P2\n# by hand\n2 1\n255\n0 254\n", "is an image, not a log"),
+        ("photo.jpg", b"\xff\xd8\xff\xe0" + bytes(99), "is an image, not a log"),
+        ("map.yaml", _MAP.encode(), "is the YAML of a map, not a log; name the recording, and give the map with --map"),
+        ("notes.txt", b"dear diary\n", "name the recording: a .mcap, .db3 or .bag file"),
+        ("empty.mcap", b"", "is empty (0 bytes); copy it again, or record anew"),
+    ],
+)
+def test_what_is_no_log_is_called_what_it_is_with_a_remedy(
+    here: Path, capsys: pytest.CaptureFixture[str], command: str, name: str, content: bytes, expected: str
+) -> None:
+    (here / name).write_bytes(content)
+    assert expected in fails(capsys, command, name)
+
+
+def test_of_a_folder_whose_logs_lie_further_down_one_is_named(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for folder in ("day/b", "day/a/deep", "day/c"):
+        (here / folder).mkdir(parents=True)
+    (here / "day" / "c" / "notes.txt").write_text("none")
+    assert "name a log file" in fails(capsys, "check", "day")
+    (here / "day" / "b" / "run.mcap").write_bytes(Path(OFFICE).read_bytes())
+    assert "name the folder of one recording, such as day/b" in fails(capsys, "check", "day")
+    (here / "day" / "a" / "deep" / "run.db3.zst").write_bytes(b"x")
+    assert "such as day/a/deep (2 folders have some)" in fails(capsys, "replay", "day")
+
+
+@pytest.mark.parametrize("command", ["replay", "check"])
+def test_what_may_not_be_read_is_said_with_a_remedy(here: Path, command: str) -> None:
+    for name in ("closed/run.mcap", "closed.mcap"):
+        (here / name).parent.mkdir(exist_ok=True)
+        (here / name).write_bytes(Path(OFFICE).read_bytes())
+    (here / "closed.mcap").chmod(0)
+    (here / "closed").chmod(0)
+    for name in ("closed.mcap", "closed", "closed/run.mcap"):
+        line = fails_by_rights(command, name)
+        assert line == (
+            f"hsloc: error: {name}: cannot be read (Permission denied); "
+            "check its rights, and those of the folders above it"
+        )
+    line = fails_by_rights("replay", OFFICE, "--map", "closed/map.yaml", "--out", "out")
+    assert "closed/map.yaml" in line
+    assert "check its rights" in line
+    (here / "closed").chmod(0o700)
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["replay", OFFICE, "--end", "1", "--out"],
+        ["map", OFFICE, "--end", "1", "--out"],
+        ["merge", "a", "b", "--out"],
+        ["compare", "a", "b", "--out"],
+        ["calibrate", OFFICE, "--end", "1", "--out"],
+        ["sweep", OFFICE, "--out"],
+        ["reproduce", "E1", "--own", "--out"],
+        ["convert", OFFICE],
+        ["record", "--world", "hall"],
+    ],
+)
+def test_an_output_that_may_not_be_written_is_no_input(here: Path, argv: list[str]) -> None:
+    (here / "closed").mkdir(mode=0)
+    for target in ("closed/out", "closed/below/out"):
+        line = fails_by_rights(*argv, target)
+        assert line.startswith(f"hsloc: error: {target}: cannot be written (Permission denied); ")
+        assert line.endswith(("choose another --out", "or name another one"))
+    (here / "closed").chmod(0o500)
+    if argv[0] in ("replay", "calibrate"):
+        assert "is not a folder that may be written to); choose another --out" in fails_by_rights(*argv, "closed/out")
+
+
+def fails_by_rights(*argv: str) -> str:
+    """As `fails`, in a process that heeds the rights of files."""
+    command = [sys.executable, "-m", "hsloc.cli.main", *argv]
+    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=heed_rights)
+    assert (done.returncode, done.stdout) == (1, ""), done.stderr
+    (line,) = done.stderr.splitlines()
+    return line
 
 
 def write_log(path: Path, scans: tuple[Any, ...] = ("/scan",), odometry: bool = True, grid: bool = False) -> None:

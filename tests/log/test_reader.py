@@ -335,8 +335,8 @@ def test_each_mistake_is_one_line_that_names_the_file(tmp_path: Path) -> None:
         ("missing.mcap", LogError, "no such file"),
         ("empty.mcap", LogFormatError, "is empty"),
         ("notes.txt", LogFormatError, "is not an MCAP, a ROS bag or a CARMEN log"),
-        ("photo.mcap", LogFormatError, "is not an MCAP, a ROS bag or a CARMEN log"),
-        ("zipped.gz", LogFormatError, "is not an MCAP, a ROS bag or a CARMEN log"),
+        ("photo.mcap", LogFormatError, "is an image, not a log"),
+        ("zipped.gz", LogFormatError, "nothing of it can be unpacked; copy it again"),
         ("folder", LogFormatError, r"is a folder without \.mcap, \.db3 or \.bag"),
         ("bare.mcap", TopicError, "no scan topic .*the log holds no messages"),
     ]:

@@ -13,6 +13,7 @@ from hsloc.log.checks.findings import NANOSECONDS, Finding, Findings, Intervals,
 from hsloc.log.checks.topics import OdometryCheck, ScanCheck, TopicCheck
 from hsloc.log.messages.decode import OdometryMessage, ScanMessage
 from hsloc.log.messages.definitions import POINT_CLOUD2
+from hsloc.log.no_log import COPY_AGAIN
 from hsloc.log.session.transform_topics import MAP_FRAME
 from hsloc.warnings import WarningCode
 
@@ -90,8 +91,8 @@ def check_log(log: Log, progress: Callable[[int], None] | None = None) -> CheckR
     for check in odometry:
         if check.frame != MAP_FRAME:
             transforms.compare_odometry(check.topic, check.frame, check.child)
-    _check_summary(log.summary, bool(scans), findings)
-    _check_damage(log, losses, findings)
+    _check_damage(log, losses, not topics and not _clouds(log.summary), findings)
+    _check_summary(log.summary, bool(scans), losses, findings)
     intervals = {f"{check.topic} {check.what}": check.intervals for check in topics.values()}
     frames = {
         check.topic: (getattr(check, "frame", "") or "", getattr(check, "child", "") or "") for check in topics.values()
@@ -140,25 +141,38 @@ _CHECKED_HERE = (WarningCode.TOPIC_MISSING, WarningCode.TOPIC_AMBIGUOUS, Warning
 """Warnings of the opening that the checks have findings of their own for."""
 
 
-def _check_summary(summary: LogSummary, has_scans: bool, findings: Findings) -> None:
-    """What was missing or had to be assumed when the log was opened."""
-    clouds = [topic.topic for topic in summary.topics if topic.typename == POINT_CLOUD2 and topic.count]
+def _clouds(summary: LogSummary) -> list[str]:
+    """The topics of point clouds."""
+    return [topic.topic for topic in summary.topics if topic.typename == POINT_CLOUD2 and topic.count]
+
+
+def _check_summary(summary: LogSummary, has_scans: bool, losses: Losses, findings: Findings) -> None:
+    """What was missing or had to be assumed when the log was opened.
+
+    What is missing of a log that is cut off may have been in the part that is lost: then that is said first.
+    """
+    is_cut = bool(losses.truncated_files or losses.bytes_lost or losses.damaged_chunks)
+    left = " in what is left of the log" if is_cut else ""
+    first = f"{COPY_AGAIN}; else " if is_cut else ""
+    clouds = _clouds(summary)
     if not has_scans and not (clouds and summary.scan_topic):
         findings.add(
-            Severity.ERROR, "no_scan", "", "no scans (sensor_msgs/msg/LaserScan)",
+            Severity.ERROR, "no_scan", "", f"no scans (sensor_msgs/msg/LaserScan){left}",
             f"read the point clouds on {clouds[0]} with --slice LOW,HIGH, the heights of walls above the base [m]"
             if clouds
-            else "record the laser's topic; `hsloc info` lists what there is",
+            else f"{first}record anew, with the laser's topic; `hsloc info` lists what there is",
         )  # fmt: skip
     elif summary.scan_topic is None:
         findings.add(
             Severity.WARNING, "scan_ambiguous", "", "several scan topics", "choose with --scan-topic, or name them all"
         )
     is_fixed = any(warning.code == WarningCode.ODOMETRY_UNUSABLE for warning in summary.warnings)
-    if summary.odom_topic is None and summary.heading_topic is None and not is_fixed:
+    has_any = has_scans or not is_cut
+    if summary.odom_topic is None and summary.heading_topic is None and not is_fixed and has_any:
         findings.add(
-            Severity.WARNING, "no_odometry", "", "no odometry on a topic of its own or in /tf that would be chosen",
-            "choose with --odom-topic, or map without it: --no-odom",
+            Severity.WARNING, "no_odometry", "",
+            f"no odometry on a topic of its own or in /tf that would be chosen{left}",
+            f"{first}choose with --odom-topic, or map without it: --no-odom",
         )  # fmt: skip
     for laser in summary.lasers:
         if laser.extrinsics == "identity":
@@ -175,7 +189,7 @@ def _check_summary(summary: LogSummary, has_scans: bool, findings: Findings) -> 
             findings.add(severity, warning.code, "", warning.text, warning.remedy or "see `hsloc info`")
 
 
-def _check_damage(log: Log, losses: Losses, findings: Findings) -> None:
+def _check_damage(log: Log, losses: Losses, is_empty: bool, findings: Findings) -> None:
     """What could not be read: of the topics above, and, chunk by chunk, of everything."""
     everything = log.verify()
     for name in ("damaged_chunks", "unknown_compression", "bytes_lost", "truncated_files"):
@@ -184,10 +198,12 @@ def _check_damage(log: Log, losses: Losses, findings: Findings) -> None:
         losses.note(reason)
     if losses.data_lost:
         first = f" ({losses.reasons[0]})" if losses.reasons else ""
-        findings.add(
-            Severity.DAMAGE, "damage", "", "; ".join(losses.lines()) + first,
-            "what is whole is used; `hsloc convert` writes it into a sound file",
-        )  # fmt: skip
+        used = "what is whole is used, and `hsloc convert` writes it into a sound file"
+        if is_empty:
+            used = f"{COPY_AGAIN}; else record anew: no scan and no odometry of it is whole"
+        elif losses.truncated_files or losses.bytes_lost or losses.damaged_chunks:
+            used = f"{COPY_AGAIN}; else {used}"
+        findings.add(Severity.DAMAGE, "damage", "", "; ".join(losses.lines()) + first, used)
 
 
 MAX_FRAMES = 1000

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from hsloc.errors import LogError, LogFormatError
+from hsloc.errors import LogError, LogFormatError, not_read
 from hsloc.log.container import Channel, RawMessage, out_of_line
 from hsloc.log.mcap import records
 from hsloc.log.mcap.index_scan import IndexScan, Segment
@@ -56,7 +56,7 @@ class McapContainer:
                 self._directory = IndexScan(self.path, stream, self._size).run()
             self._read_what_the_index_does_not_tell()
         except OSError as error:
-            raise LogFormatError(f"{self.path}: cannot be read ({error.strerror or error})") from error
+            raise LogFormatError(not_read(self.path, error)) from error
         self.profile = self._directory.profile
         self.statistics = self._directory.statistics
         self.warnings += self._directory.clock.warnings(self.path, self.statistics.values())
@@ -109,7 +109,7 @@ class McapContainer:
                     if ready:
                         yield ready
         except OSError as error:
-            raise LogError(f"{self.path}: cannot be read ({error.strerror or error})") from error
+            raise LogError(not_read(self.path, error)) from error
 
     def verify(self) -> Losses:
         """Read every segment and count what is damaged."""

@@ -18,6 +18,7 @@ from hsloc.errors import LogFormatError
 from hsloc.log.container import RecorderClock, plausible_times
 from hsloc.log.mcap import records
 from hsloc.log.mcap.records import ChunkHead, Damage, Opcode
+from hsloc.log.no_log import COPY_AGAIN, EMPTY
 from hsloc.log.summary import Losses, TopicStatistics
 
 if TYPE_CHECKING:
@@ -115,9 +116,9 @@ class IndexScan:
         """From the magic to the footer, or as far as it goes."""
         path = self.directory.path
         if self.size == 0:
-            raise LogFormatError(f"{path}: is empty")
+            raise LogFormatError(f"{path}: {EMPTY}")
         if self.stream.read(len(records.MAGIC)) != records.MAGIC:
-            raise LogFormatError(f"{path}: is not an MCAP file")
+            raise LogFormatError(f"{path}: is not an MCAP file; {COPY_AGAIN}")
         at = len(records.MAGIC)
         finished = False
         while at < self.size:

@@ -12,6 +12,7 @@ from hsloc.errors import TopicError
 from hsloc.log.container import in_runs
 from hsloc.log.messages import definitions
 from hsloc.log.messages.decoders import Undecodable, canonical_type, column_decoder_for, is_decodable
+from hsloc.log.no_log import COPY_AGAIN
 from hsloc.log.session.event_builders import CloudFeed, MotionFeed, OdometryFeed, ScanFeed, TransformFeed
 from hsloc.log.session.log_session import FirstMessage, LogSession
 from hsloc.log.session.ordering import KIND_ODOMETRY, KIND_SCAN, KIND_TRUTH, Arrivals, Reorder, TopicClock, one_by_one
@@ -59,7 +60,7 @@ class RosSource:
             lost = ", ".join(self.losses_at_opening.lines())
             if not lost:
                 raise
-            raise TopicError(f"{error}; {lost}: copy the file again, if the copy was cut off") from None
+            raise TopicError(f"{error}; {lost}: {COPY_AGAIN}") from None
         self.summary = self._survey.summary
 
     def events(self, losses: Losses) -> Iterator[tuple[int, Event]]:

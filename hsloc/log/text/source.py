@@ -14,7 +14,7 @@ from heapq import heappop, heappush
 from io import BufferedReader
 from typing import TYPE_CHECKING, BinaryIO, cast
 
-from hsloc.errors import LogFormatError, TopicError
+from hsloc.errors import LogFormatError, TopicError, not_read
 from hsloc.log.container import AGREEING, STEP_NS
 from hsloc.log.messages.decode import OdometryMessage, ScanMessage
 from hsloc.log.packing import GZIP
@@ -77,7 +77,7 @@ def _lines(path: Path, losses: Losses, limit: int | None = None) -> Iterator[lis
         losses.truncated_files += 1
         losses.note(f"{path}: its compression is damaged or ends too early ({error})")
     except OSError as error:
-        raise LogFormatError(f"{path}: cannot be read ({error.strerror or error})") from error
+        raise LogFormatError(not_read(path, error)) from error
 
 
 def find_format(path: Path) -> LineFormat | None:

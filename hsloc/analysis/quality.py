@@ -79,7 +79,8 @@ def quality_warnings(result: Result) -> list[RunWarning]:
         RunWarning(
             WarningCode.SCANS_WITHOUT_PLACE,
             f"{without} of {scans} scans found no place on the map, so {meaning}",
-            "check map, mounting (--laser-pose) and odometry (hsloc check), or give the start (--initial-pose)",
+            "is it the map of this building? If so, check the mounting (--laser-pose) and the odometry (hsloc check), "
+            "or give the start (--initial-pose)",
         ),
     ]
 
@@ -261,9 +262,12 @@ def verdict_reasons(result: Result, warnings: Sequence[RunWarning]) -> tuple[Ver
         reasons += _of_the_map(result.mapping, result)
     if result.states is not None:
         of_poses = localisation_reasons(result.states, result.trajectory, result.ambiguities)
-        # Where every pose is a guess the scans without a place say so already, but not that several places fit.
-        whole = _share(result) > 0.0 or not reasons
-        reasons += [reason for reason in of_poses if whole or reason.code == "poses_ambiguous"]
+        codes = {reason.code for reason in reasons}
+        if _share(result) == 0.0 and codes:  # That every pose is a guess is said already, but not why.
+            of_poses = tuple(reason for reason in of_poses if reason.code == "poses_ambiguous")
+        if WarningCode.SCANS_WITHOUT_PLACE in codes:  # Where most fit nowhere, several places fit badly and none well.
+            of_poses = tuple(reason for reason in of_poses if reason.code != "poses_ambiguous")
+        reasons += of_poses
     return tuple(reasons)
 
 

@@ -113,8 +113,12 @@ def _headline(metrics: RunMetrics) -> str:
         return f"{made} from {mapping.keyscans} scans, {loops}."
     share = metrics.localised.share_of_poses
     if share == 0.0:
-        several = any(reason.code == "poses_ambiguous" for reason in metrics.verdict_reasons)
-        why = "several places of it fit, and every pose is a guess" if several else "every pose is a guess"
+        codes = {reason.code for reason in metrics.verdict_reasons}
+        why = "every pose is a guess"
+        if "scans_without_place" in codes:
+            why = f"most scans fit nowhere on it, and {why}"
+        elif "poses_ambiguous" in codes:
+            why = f"several places of it fit, and {why}"
         return f"Not localised on {_map_name(metrics)}: {why}."
     known = "every pose is known" if share == 1.0 else f"{format_share(share)} of the poses are known"
     return f"Localised on {_map_name(metrics)}: {known}{_lost_and_found(metrics)}."

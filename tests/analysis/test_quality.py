@@ -13,6 +13,7 @@ from hsloc.analysis.analyse import analyse
 from hsloc.analysis.quality import quality_warnings, verdict_reasons
 from hsloc.log import LogWriter, ReadOptions, open_log
 from hsloc.model import Odometry, Pose2, Scan, Truth
+from hsloc.model.estimate import Ambiguity, State
 from hsloc.replay.run import run
 from hsloc.report.summary import ResultSummary
 from hsloc.request import RunRequest
@@ -78,6 +79,30 @@ def test_a_log_too_short_to_be_sure_is_all_guesses() -> None:
     reasons = verdict_reasons(found, [warning])
     assert reasons
     assert {reason.verdict for reason in reasons} == {"failed"}
+
+
+def test_of_scans_that_fit_nowhere_is_not_said_that_several_places_fit() -> None:
+    """On the map of another building there may be some places that fit alike, and badly."""
+    found = run(RunRequest(logs=(OFFICE,), read=ReadOptions(end_s=3.0), unknown_start=True))
+    assert found.states is not None
+    n, stamps = len(found.trajectory), found.diagnostics.stamps_ns
+    fitness = np.full(len(stamps), 0.4)
+    nowhere = replace(
+        found,
+        localised=np.zeros(n, dtype=np.bool_),
+        states=replace(found.states, state=(State.AMBIGUOUS,) * n),
+        diagnostics=replace(found.diagnostics, status=("searching",) * len(stamps), fitness=fitness),
+        ambiguities=(Ambiguity(int(stamps[0]), int(stamps[-1]), int(stamps[-1]), ()),),
+    )
+    summary = ResultSummary.of(analyse(nowhere).metrics)
+    assert summary.headline.endswith("most scans fit nowhere on it, and every pose is a guess.")
+    assert "found no place on the map" in summary.reasons[0]
+    assert "is it the map of this building?" in summary.reasons[0]
+    assert not any("several places" in reason for reason in summary.reasons)
+    fitting = replace(nowhere, diagnostics=replace(nowhere.diagnostics, fitness=fitness + 0.5))
+    summary = ResultSummary.of(analyse(fitting).metrics)
+    assert summary.headline.endswith("several places of it fit, and every pose is a guess.")
+    assert not any("found no place" in reason for reason in summary.reasons)
 
 
 def test_odometry_in_millimetres_is_not_mended(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from hsloc.dataclass_json import from_json, json_schema, to_json
 from hsloc.errors import HslocError
 from hsloc.evaluation import RelationsResult
 from hsloc.evaluation.error_metrics import ErrorMetrics
-from hsloc.evaluation.maps import Crispness, MapComparison
+from hsloc.evaluation.maps import ChangeCounts, Crispness, MapComparison
 from hsloc.model.verdict import Verdict, VerdictReason
 from hsloc.slam.result import MappingQuality, OdometryErrors
 from hsloc.warnings import RunWarning
@@ -251,6 +251,8 @@ class MapMetrics:
     """Its size by the lidar; only of a given map that was localised on, where the scans determine it."""
     comparison_error: str | None = None
     """Why the map was not compared with the one in the log."""
+    changes: ChangeCounts | None = None
+    """What changed since it was made; only of a given map that was localised on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

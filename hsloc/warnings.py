@@ -135,6 +135,9 @@ class WarningCode(StrEnum):
     """Most scans were rejected, or did not determine the pose on the map."""
     STRAY_SCAN = "stray_scan"
     """Single scans of a built map that were rejected do not fit the scans around them: they are beside their place."""
+    MAP_CHANGED = "map_changed"
+    """Much of what the scans show is not on the map, or much of the map is gone: it is out of date. Poses that are
+    called localised are right all the same."""
     MAP_SCALE = "map_scale"
     """The map is larger or smaller than what the lidar measures: the resolution in its YAML may be wrong.
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.analysis.map_changes import MapChangeFinder
 from hsloc.analysis.metrics import (
     certificate_metrics,
     evaluation_counts,
@@ -18,7 +19,7 @@ from hsloc.analysis.metrics import (
     run_identity,
     scan_counts,
 )
-from hsloc.analysis.quality import offset_warnings, quality_warnings, verdict_reasons
+from hsloc.analysis.quality import change_warnings, offset_warnings, quality_warnings, verdict_reasons
 from hsloc.analysis.scan_statistics import (
     ConvergenceSample,
     CoverageCounter,
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.analysis.map_changes import SeenChanges
     from hsloc.analysis.scan_statistics import Coverage, ScanOverlay
     from hsloc.analysis.second_pass import PosedEvent
     from hsloc.evaluation import Comparison, RelationsResult
@@ -68,6 +70,7 @@ class Analysis:
     to the trajectory's first localised pose. `convergence` holds, by heading, the median best fitness over the
     evaluations of the search. `overlay` are the scans to be looked at on the map, and
     `coverage` counts how many of those with a known pose saw each place of it.
+    `map_changes` is what changed since a given map was made; None of a built map, and where too few scans show it.
     Whatever shows errors over time uses these pairs: association happens here alone.
     """
 
@@ -78,6 +81,7 @@ class Analysis:
     convergence: Convergence
     overlay: ScanOverlay
     coverage: Coverage
+    map_changes: SeenChanges | None = None
 
     def __repr__(self) -> str:
         compared = "no reference" if self.comparison is None else repr(self.comparison)
@@ -103,6 +107,7 @@ def analyse(
     sample = ConvergenceSample(likelihood, matcher, scans)
     overlay = ScanOverlayBuilder(scans, _not_matched(result))
     coverage = CoverageCounter(result.grid)
+    finder = MapChangeFinder(result.grid) if result.mode == "localise" else None
     for posed in posed_events(result, progress):
         if observer is not None:
             observer(posed)
@@ -115,10 +120,14 @@ def analyse(
                 coverage.add(scan, points, T_map_base)
                 check.add(scan, T_map_base)
                 sample.add(scan, T_map_base)
+            if posed.known and finder is not None:
+                finder.add(scan, points, T_map_base)
             overlay.add(scan, T_map_base, distance)
     errors = _Errors(result, request.alignment or ("se2" if result.mode == "slam" else "none"))
+    changes = None if finder is None else finder.changes()
     found = (
         *quality_warnings(result),
+        *change_warnings(changes, result.trajectory),
         *offset_warnings(result),
         *residuals.warnings(),
         *check.warnings(),
@@ -135,7 +144,7 @@ def analyse(
         evaluations=evaluation_counts(result),
         fitness=fitness_metrics(result),
         certificates=certificate_metrics(result),
-        map=map_metrics(result, residuals.metrics(), errors.whole),
+        map=map_metrics(result, residuals.metrics(), errors.whole, changes),
         localised=localised_metrics(result),
         losses=loss_metrics(result),
         warnings=warnings,
@@ -154,6 +163,7 @@ def analyse(
         convergence=sample.curves(request.matcher_name.upper()),
         overlay=overlay.overlay(),
         coverage=coverage.coverage(),
+        map_changes=changes,
     )
 
 

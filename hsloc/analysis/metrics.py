@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import EvaluationError
-from hsloc.evaluation.maps import compare_maps, crispness
+from hsloc.evaluation.maps import ChangeCounts, compare_maps, crispness
 from hsloc.evaluation.metrics import compare_run
 from hsloc.log import LaserSummary
 from hsloc.matching import summarise
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.analysis.map_changes import SeenChanges
     from hsloc.evaluation import Comparison
     from hsloc.replay.run import Result
 
@@ -144,10 +145,12 @@ def certificate_metrics(result: Result) -> CertificateMetrics | None:
     return None if summary is None else CertificateMetrics(**asdict(summary))
 
 
-def map_metrics(result: Result, residuals: ResidualMetrics, comparison: Comparison | None) -> MapMetrics:
+def map_metrics(
+    result: Result, residuals: ResidualMetrics, comparison: Comparison | None, changes: SeenChanges | None = None
+) -> MapMetrics:
     """How well scans and map agree; for a built map also how crisp and how consistent it is, and against a true one."""
     if result.mode != "slam":
-        return MapMetrics(residuals=residuals, scale=_scale_metrics(result))
+        return MapMetrics(residuals=residuals, scale=_scale_metrics(result), changes=_change_metrics(changes))
     compared = error_text = None
     if result.true_grid is not None and result.reference is not None:
         try:
@@ -178,6 +181,19 @@ def _scale_metrics(result: Result) -> ScaleMetrics | None:
         sigma=scale.sigma,
         resolution=result.grid.resolution,
         corrected=result.given_resolution is not None,
+    )
+
+
+def _change_metrics(changes: SeenChanges | None) -> ChangeCounts | None:
+    if changes is None:
+        return None
+    kinds = Counter(each.kind for each in changes.changes)
+    return ChangeCounts(
+        appeared=kinds["appeared"],
+        vanished=kinds["vanished"],
+        gone=changes.gone,
+        hidden=float(changes.hidden.mean()),
+        hidden_max=float(changes.hidden.max()),
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.analysis.map_changes import GONE, HIDDEN
 from hsloc.evaluation.association import interpolate_poses
 from hsloc.localisation.mounting_error import mounting_error_of_steps
 from hsloc.localisation.states import localisation_reasons
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.analysis.map_changes import SeenChanges
+    from hsloc.model.trajectory import Trajectory
     from hsloc.replay.run import Result
     from hsloc.request import RunRequest
     from hsloc.run_metrics import RunMetrics
@@ -226,6 +229,29 @@ def _place_warnings(mapping: MappingResult, result: Result) -> list[RunWarning]:
         f"{_ONE_SIDED if found.slip else ''}"
     )
     return [RunWarning(WarningCode.EXTRINSICS_WRONG, text, f"measure it, or hsloc calibrate; {option}")]
+
+
+def change_warnings(changes: SeenChanges | None, trajectory: Trajectory) -> list[RunWarning]:
+    """That the given map has changed so much that it is to be made again, by scans whose pose is known."""
+    if changes is None:
+        return []
+    start, text = int(trajectory.stamps_ns.min()), []
+    spans = [((begin - start) / NS_PER_S, (end - start) / NS_PER_S) for begin, end in changes.hidden_spans_ns()]
+    if spans:
+        times = ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in spans[:_MOST_NAMED])
+        more = f" and {len(spans) - _MOST_NAMED} more" if len(spans) > _MOST_NAMED else ""
+        text.append(f"{100 * HIDDEN:.0f} % of the beams and more end at things that it lacks, from {times}{more}")
+    if changes.gone >= GONE:
+        text.append(f"{100 * changes.gone:.0f} % of its walls that were seen are gone")
+    if not text:
+        return []
+    return [
+        RunWarning(
+            WarningCode.MAP_CHANGED,
+            f"the map has changed: {'; '.join(text)}",
+            "see changes.csv; make the map again, or extend it with this log (hsloc map --resume)",
+        )
+    ]
 
 
 def offset_warnings(result: Result) -> list[RunWarning]:

@@ -29,12 +29,16 @@ _BLOCK = 4096
 
 
 class PosedEvent(NamedTuple):
-    """A scan or an odometry message with the result's poses at its stamp, and whether these follow a track."""
+    """A scan or an odometry message with the result's poses at its stamp, whether these follow a track, and are known.
+
+    A pose on a track that fits badly, or at one of several places that fit, is followed but not known.
+    """
 
     event: Odometry | PairedScan
     T_map_odom: Pose2
     T_map_base: Pose2
     localised: bool
+    known: bool
 
 
 def posed_events(result: Result, progress: Callable[[float], None] | None = None) -> Iterator[PosedEvent]:
@@ -46,7 +50,8 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
     """
     log = result.log or open_log(result.request.logs, result.reading or result.request.reading())
     poses = result.trajectory.poses
-    localised = result.localised if result.tracked is None else result.tracked
+    known = result.localised
+    localised = known if result.tracked is None else result.tracked
     first = None if result.follows_scans else Pose2.from_array(result.odometry.poses[0])
     row = -1
     corrections = _corrections(result, localised)
@@ -62,15 +67,16 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
             if isinstance(event, PairedScan):
                 if result.follows_scans:
                     row += 1
-                    yield PosedEvent(event, IDENTITY, Pose2(*poses[row].tolist()), True)
+                    yield PosedEvent(event, IDENTITY, Pose2(*poses[row].tolist()), True, bool(known[row]))
                 else:
                     if T_map_odom is None:
                         T_map_odom = next(_corrections(result, localised))[0]
-                    yield PosedEvent(event, T_map_odom, T_map_odom @ event.T_odom_base, bool(localised[max(row, 0)]))
+                    T_map_base, at = T_map_odom @ event.T_odom_base, max(row, 0)
+                    yield PosedEvent(event, T_map_odom, T_map_base, bool(localised[at]), bool(known[at]))
             elif isinstance(event, Odometry) and not result.follows_scans:
                 row += 1
-                T_map_odom, T_map_base, known = next(corrections)
-                yield PosedEvent(event, T_map_odom, T_map_base, known)
+                T_map_odom, T_map_base, follows = next(corrections)
+                yield PosedEvent(event, T_map_odom, T_map_base, follows, bool(known[row]))
             if progress is not None and row % 500 == 0:
                 progress(row / len(result.trajectory))
 

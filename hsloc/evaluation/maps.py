@@ -198,6 +198,22 @@ class MapChange:
     """Number of its occupied cells."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChangeCounts:
+    """What changed since a given map was made, as the scans with a known pose show it (changes.csv)."""
+
+    appeared: int
+    """Number of things, from 0.3 m on, that stand where the map is free."""
+    vanished: int
+    """Number of things or pieces of wall of the map that are gone."""
+    gone: float
+    """Fraction of the occupied cells of the map that were seen which are gone, from 0 to 1."""
+    hidden: float
+    """Mean fraction of a scan's beams that end at things which appeared, from 0 to 1."""
+    hidden_max: float
+    """Largest fraction of a scan's beams that end at them, from 0 to 1."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MapChanges:
     """Changes from a map to another: `changes`, the largest first, and their cells in the first map's grid."""
@@ -232,9 +248,9 @@ def map_changes(
     changes: list[MapChange] = []
     kept = []
     for kind, mask in (("appeared", appeared), ("vanished", vanished)):
-        found, cells = _things(first, mask, kind, min_size)  # type: ignore[arg-type]
+        found, numbers = changed_things(first, mask, kind, min_size)  # type: ignore[arg-type]
         changes += found
-        kept.append(cells)
+        kept.append(numbers > 0)
     known = first.cells != UNKNOWN
     shared = float((known & (seen != UNKNOWN)).sum() / max(int(known.sum()), 1))
     gone = float(kept[1].sum() / max(int((before & (seen != UNKNOWN)).sum()), 1))
@@ -268,30 +284,33 @@ def _rows(grid: OccupancyGrid, points: NDArray[np.float64]) -> tuple[NDArray[np.
     return cells[:, 1], cells[:, 0], inside
 
 
-def _things(
+def changed_things(
     grid: OccupancyGrid, mask: Bools, kind: Literal["appeared", "vanished"], min_size: float
-) -> tuple[list[MapChange], Bools]:
-    """Changed cells that are near each other as one thing each, and the cells of those that are large enough."""
+) -> tuple[list[MapChange], NDArray[np.int32]]:
+    """Changed cells that are near each other as one thing each, of `min_size` (m) and more.
+
+    With the number of its thing, from 1 on, for each cell (h, w): 0 where there is none.
+    """
+    numbers = np.zeros(mask.shape, dtype=np.int32)
+    if not mask.any():
+        return [], numbers
     from scipy.ndimage import binary_dilation, label
 
-    kept = np.zeros_like(mask)
-    if not mask.any():
-        return [], kept
     around = binary_dilation(
         mask, np.ones((3, 3), dtype=np.bool_), iterations=max(round(0.5 * _JOINED_M / grid.resolution), 1)
     )
     labels, count = label(around, np.ones((3, 3), dtype=np.bool_))
-    centres, numbers = grid.centres(mask), labels[mask]
-    large = []
+    centres, of = grid.centres(mask), labels[mask]
+    numbered = np.zeros(count + 1, dtype=np.int32)
     things = []
     for k in range(1, count + 1):
-        points = centres[numbers == k]
+        points = centres[of == k]
         low, high = points.min(axis=0), points.max(axis=0)
         size = float((high - low).max()) + grid.resolution
         if size < min_size:
             continue
-        large.append(k)
         x, y = (float(value) for value in 0.5 * (low + high))
         things.append(MapChange(kind=kind, x=x, y=y, size=size, cells=len(points)))
-    kept[mask] = np.isin(numbers, large)
-    return things, kept
+        numbered[k] = len(things)
+    numbers[mask] = numbered[of]
+    return things, numbers

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.analysis.map_changes import SeenChanges
     from hsloc.localisation.states import StateRows
     from hsloc.model.estimate import Ambiguity
     from hsloc.replay.map_merge import MapMerge
@@ -52,6 +53,8 @@ _OF_RESULTS = (("metrics.json", "config.yaml"), ("results.json", "report.md"))
 
 HYPOTHESES_HEADER = "begin,end,t,x,y,theta,probability"
 """A stretch in which several places of the map fit, and one of these, T_map_base at the stamp t."""
+CHANGES_HEADER = "kind,x,y,size,cells,first,last"
+"""What appeared or vanished since the map was made, and the stamps of the first and the last scan that showed it."""
 COVARIANCES_HEADER = "t,xx,xy,xtheta,yy,ytheta,thetatheta"
 
 
@@ -117,6 +120,9 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
         write_states(folder / "states.csv", result.trajectory.stamps_ns, result.states)
     if result.ambiguities:
         write_hypotheses(folder / "hypotheses.csv", result.ambiguities)
+    if analysis.map_changes is not None and analysis.map_changes.changes:
+        write_changes(folder / "changes.csv", analysis.map_changes)
+        save_map(analysis.map_changes.layer, folder / "changes")
     if len(result.odometry):
         write_tum(folder / "odometry.tum", result.odometry)
     if result.reference is not None:
@@ -158,6 +164,7 @@ def report_parts(result: Result, analysis: Analysis) -> ReportParts:
         covariances=result.pose_covariances(),
         overlay=analysis.overlay,
         coverage=analysis.coverage,
+        map_changes=analysis.map_changes,
         mapping=result.mapping,
         provenance=provenance(result),
         ambiguities=result.ambiguities,
@@ -189,6 +196,15 @@ def write_hypotheses(path: Path, ambiguities: Sequence[Ambiguity]) -> None:
         stamps = ",".join(map(format_stamp, (each.begin_ns, each.end_ns, each.stamp_ns)))
         for pose, probability in each.places:
             lines.append(f"{stamps},{pose.x:.3f},{pose.y:.3f},{pose.theta:.4f},{probability:.4f}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_changes(path: Path, changes: SeenChanges) -> None:
+    """Write one line for each change of the map, the largest first: metres and seconds."""
+    lines = [CHANGES_HEADER]
+    for each, span in zip(changes.changes, changes.spans_ns.tolist(), strict=True):
+        stamps = ",".join(map(format_stamp, span))
+        lines.append(f"{each.kind},{each.x:.3f},{each.y:.3f},{each.size:.2f},{each.cells},{stamps}")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

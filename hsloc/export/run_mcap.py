@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.analysis.analyse import Analysis
+    from hsloc.analysis.map_changes import SeenChanges
     from hsloc.analysis.second_pass import PosedEvent
     from hsloc.model.verdict import VerdictReason
     from hsloc.replay.run import Result
@@ -139,6 +140,8 @@ class RunRecording:
                     self._writer.number(stamp_ns, value, topic)
         self._write_states()
         self._write_markers(metrics.verdict_reasons)
+        if analysis.map_changes is not None:
+            self._write_changes(analysis.map_changes)
         self.seconds += time.perf_counter() - begin
 
     def _write_pose(self, stamp_ns: int, T_map_odom: Pose2, T_odom_base: Pose2, T_map_base: Pose2) -> None:
@@ -173,6 +176,14 @@ class RunRecording:
         if places:
             self._writer.markers(self._start, places, "/places_to_check")
 
+    def _write_changes(self, changes: SeenChanges) -> None:
+        """The cells in which something appeared, and vanished, since the map was made."""
+        layer = changes.layer
+        kinds = (("appeared", layer.occupied(), _GREEN), ("vanished", layer.free(), _VERMILLION))
+        found = [Marker(name, layer.centres(cells), ink, layer.resolution) for name, cells, ink in kinds if cells.any()]
+        if found:
+            self._writer.markers(self._start, found, "/map_changes")
+
     def _covariance(self, row: int) -> NDArray[np.float64] | None:
         """Covariance (3, 3) of the pose at a scan, in the order of the log; None where it is not known."""
         result = self._result
@@ -196,6 +207,7 @@ def layout() -> dict[str, Any]:
                     "/pose_with_covariance": {"visible": True, "type": "arrow", "showCovariance": True},
                     "/loops": {"visible": True, "namespaces": {"refused": {"visible": False}}},
                     "/places_to_check": {"visible": True},
+                    "/map_changes": {"visible": True},
                     **{name: {"visible": True, "type": "line", "gradient": [ink, ink]} for name, ink in _PATHS.items()},
                 },
             },

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.analysis.map_changes import SeenChanges
     from hsloc.analysis.scan_statistics import Coverage, ScanOverlay
     from hsloc.evaluation import Comparison
     from hsloc.model import OccupancyGrid, ScanDiagnostics, Trajectory
@@ -76,6 +77,8 @@ class ReportParts:
     """The scans, to be drawn on the map."""
     coverage: Coverage | None = None
     """By how many scans each place of the map was seen."""
+    map_changes: SeenChanges | None = None
+    """What changed since the given map was made."""
     mapping: MappingResult | None = None
     """Loops and keyscans of a map that the run built."""
     points: Floats | None = None

@@ -20,6 +20,7 @@ from PIL import Image
 from hsloc.atomic_write import write_atomically
 from hsloc.errors import OutputError, not_written
 from hsloc.report import style
+from hsloc.report.changes import draw_changes
 from hsloc.report.charts import Chart, run_charts
 from hsloc.report.data import prepare, since
 from hsloc.report.map_image import Extent, shown_extent
@@ -107,6 +108,7 @@ def report_figure(parts: ReportParts, data: ReportData | None = None) -> Figure:
     axes = figure.add_axes((left, bottom, width, height))
     shown = extent.widened(width * WIDTH / (height * HEIGHT))
     draw_map(axes, data, parts.grid, parts.points, shown, max(width * WIDTH, height * HEIGHT) * DPI)
+    draw_changes(axes, parts.map_changes)
     reasons = () if parts.metrics is None else parts.metrics.verdict_reasons
     draw_places_to_check(axes, [place for reason in reasons for place in reason.places])
     _draw_head(figure, axes, parts.title, summary, reasons)

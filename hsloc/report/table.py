@@ -278,6 +278,10 @@ def _map_rows(found: MapMetrics) -> list[Row]:
         near = "less than a cell" if residuals.p95 == 0.0 else format_length(residuals.p95)
         distance = Row("scan to map, 95 % of points", (near,), _SCAN_TO_MAP, ("map/residuals/p95",))
         rows.append(replace(distance, usual="up to 10 cm"))
+    if found.changes is not None and (found.changes.appeared or found.changes.vanished):
+        values = f"{found.changes.appeared} things appeared, {found.changes.vanished} vanished"
+        sources = ("map/changes/appeared", "map/changes/vanished")
+        rows.append(Row("changes since the map was made", (values,), _CHANGES, sources))
     mapping = found.mapping
     if mapping is not None:
         loops = f"{mapping.loops} of {mapping.loops + mapping.loops_refused} candidates"
@@ -353,6 +357,10 @@ _NEAR_WALL = (
 _SCAN_TO_MAP = (
     "Distance to the nearest occupied cell of the map that 95 of 100 scan points stay below. One or two cells are "
     "usual, up to 10 cm on most maps."
+)
+_CHANGES = (
+    "Things of 0.3 m and more that stand where the map is free, and things or pieces of wall of the map that are gone, "
+    "by scans whose pose is known. changes.csv lists them with places and times."
 )
 _LOOPS = (
     "Places that were recognised when the robot came back, of all that were compared. A map without a loop keeps the "

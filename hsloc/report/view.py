@@ -10,13 +10,14 @@ import hashlib
 from base64 import b64encode
 from dataclasses import replace
 from io import BytesIO
-from math import isfinite
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from PIL import Image
 
 from hsloc.model import Status
+from hsloc.report import rounding
+from hsloc.report.changes import change_marks
 from hsloc.report.charts import convergence_charts, run_charts
 from hsloc.report.data import peak_rows, prepare, since, status_counts
 from hsloc.report.map_image import grey_levels, picture_of, shown_extent
@@ -79,16 +80,20 @@ def view_of(parts: ReportParts, data: ReportData | None = None) -> ReportView:
         "summary": None if summary is None else summary.to_json(),
         "run": None if parts.metrics is None else _run(parts.metrics, parts.provenance),
         "map": frame,
-        "extent": [_round(value) for value in (extent.x0, extent.y0, extent.x1, extent.y1)],
-        "end": _round(_end(data)),
+        "extent": [rounding.rounded(value) for value in (extent.x0, extent.y0, extent.x1, extent.y1)],
+        "end": rounding.rounded(_end(data)),
         "trajectory": _trajectory(parts, data),
         "odometry": _path(data.odometry, None),
         "reference": _path(data.reference, data.reference_jumps),
-        "points": None if parts.points is None else _columns(x=parts.points[:, 0], y=parts.points[:, 1]),
-        "lost": [[_round(begin), _round(end)] for begin, end in data.lost],
+        "points": None if parts.points is None else rounding.columns(x=parts.points[:, 0], y=parts.points[:, 1]),
+        "lost": [[rounding.rounded(begin), rounding.rounded(end)] for begin, end in data.lost],
         "scans": _scans(parts, data),
         "coverage": None if parts.coverage is None else _coverage(parts.coverage),
-        "marks": [*([] if scans is None else _marks(scans)), *_places_to_check(parts.metrics)],
+        "marks": [
+            *([] if scans is None else _marks(scans)),
+            *change_marks(parts.map_changes, data.start_ns, MOST_MARKS),
+            *_places_to_check(parts.metrics),
+        ],
         "loops": loops,
         "graph": None if parts.mapping is None else graph_view(parts.mapping.graph),
         "ellipses": _ellipses(parts, data.start_ns),
@@ -154,15 +159,15 @@ def _trajectory(parts: ReportParts, data: ReportData) -> dict[str, Any]:
     states = parts.states or tuple("localised" if known else "lost" for known in data.localised)
     names = list(dict.fromkeys(states))
     codes = {name: code for code, name in enumerate(names)}
-    result: dict[str, Any] = _columns(
+    result: dict[str, Any] = rounding.columns(
         t=data.seconds[rows], x=poses[rows, 0], y=poses[rows, 1], theta=poses[rows, 2], decimals=3
     )
     result |= {"states": [str(name) for name in names], "state": [codes[states[row]] for row in rows]}
     result["breaks"] = np.flatnonzero(data.jumps[rows]).tolist()
     if parts.covariances is not None and np.isfinite(parts.covariances).any():
-        result["sigma"] = _numbers(np.sqrt(parts.covariances[rows, 0, 0] + parts.covariances[rows, 1, 1]), 4)
+        result["sigma"] = rounding.numbers(np.sqrt(parts.covariances[rows, 0, 0] + parts.covariances[rows, 1, 1]), 4)
     if data.errors is not None:
-        result["error"] = _numbers(_at(data.errors, data.seconds[rows]), 4)
+        result["error"] = rounding.numbers(_at(data.errors, data.seconds[rows]), 4)
     return result
 
 
@@ -182,7 +187,7 @@ def _path(xy: Floats | None, jumps: NDArray[np.bool_] | None) -> dict[str, Any] 
         return None
     rows = _thinned(jumps, len(xy), MOST_POSES // 2)
     breaks = [] if jumps is None else np.flatnonzero(jumps[rows]).tolist()
-    return {**_columns(x=xy[rows, 0], y=xy[rows, 1], decimals=3), "breaks": breaks}
+    return {**rounding.columns(x=xy[rows, 0], y=xy[rows, 1], decimals=3), "breaks": breaks}
 
 
 def _scans(parts: ReportParts, data: ReportData) -> dict[str, Any] | None:
@@ -210,8 +215,8 @@ def _scans(parts: ReportParts, data: ReportData) -> dict[str, Any] | None:
     words = [status.get(stamp, ("", "")) for stamp in overlay.stamps_ns[rows].tolist()]
     poses = overlay.poses[rows]
     return {
-        **_columns(t=since(overlay.stamps_ns[rows], data.start_ns), x=poses[:, 0], y=poses[:, 1], decimals=3),
-        **_columns(theta=poses[:, 2], far=overlay.far[rows], decimals=4),
+        **rounding.columns(t=since(overlay.stamps_ns[rows], data.start_ns), x=poses[:, 0], y=poses[:, 1], decimals=3),
+        **rounding.columns(theta=poses[:, 2], far=overlay.far[rows], decimals=4),
         "count": [len(cloud) for cloud in clouds],
         "status": [f"{name}: {reason}" if reason and reason not in name else name for name, reason in words],
         "points": b64encode(points.tobytes()).decode("ascii"),
@@ -233,13 +238,15 @@ def _coverage(coverage: Coverage) -> dict[str, Any] | None:
     return {**frame, "levels": text, "most": int(coverage.counts.max())}
 
 
-def _marks(scans: Scans) -> list[dict[str, Any]]:
+def _marks(scans: Scans | None) -> list[dict[str, Any]]:
     """Scans that were refused or without returns, and those at which the pose was found, on the map."""
-    found = []
+    found: list[dict[str, Any]] = []
+    if scans is None:
+        return found
     for status in (Status.NO_RETURNS, Status.REJECTED, Status.RELOCALISED):
         rows = np.flatnonzero(scans.where(status) & np.isfinite(scans.xy).all(axis=1))
         rows = rows[_every(len(rows), MOST_MARKS)]
-        marks = _columns(t=scans.seconds[rows], x=scans.xy[rows, 0], y=scans.xy[rows, 1], decimals=3)
+        marks = rounding.columns(t=scans.seconds[rows], x=scans.xy[rows, 0], y=scans.xy[rows, 1], decimals=3)
         if len(rows):
             reasons = [scans.reason[row] for row in rows]
             found.append({"status": str(status), "label": MARK_WORDS[status], **marks, "reason": reasons})
@@ -254,7 +261,7 @@ def _places_to_check(metrics: RunMetrics | None) -> list[dict[str, Any]]:
     if not found:
         return []
     x, y, texts = zip(*found, strict=True)
-    columns = _columns(x=np.array(x), y=np.array(y))
+    columns = rounding.columns(x=np.array(x), y=np.array(y))
     return [{"status": "to_check", "label": "places to check", "t": [None] * len(x), **columns, "reason": list(texts)}]
 
 
@@ -264,7 +271,7 @@ def _loops(mapping: MappingResult, start_ns: int) -> dict[str, Any]:
     first, second = (mapping.keyscan_poses[ends[:, k]] for k in (0, 1))
     seconds = since(mapping.keyscan_stamps_ns[ends[:, 1]], start_ns)
     return {
-        **_columns(t=seconds, x0=first[:, 0], y0=first[:, 1], x1=second[:, 0], y1=second[:, 1], decimals=3),
+        **rounding.columns(t=seconds, x0=first[:, 0], y0=first[:, 1], x1=second[:, 0], y1=second[:, 1], decimals=3),
         "accepted": [bool(loop.accepted) for loop in loops],
         "reason": [loop.reason for loop in loops],
     }
@@ -278,7 +285,7 @@ def graph_view(graph: PoseGraph) -> dict[str, Any] | None:
     length = np.hypot(*(poses[pairs[:, 0], :2] - poses[pairs[:, 1], :2]).T)
     rows = np.sort(np.argsort(-length, kind="stable")[:MOST_EDGES])
     nodes, ends = np.unique(pairs[rows], return_inverse=True)
-    columns = _columns(x=poses[nodes, 0], y=poses[nodes, 1], decimals=3)
+    columns = rounding.columns(x=poses[nodes, 0], y=poses[nodes, 1], decimals=3)
     return {**columns, "edges": ends.reshape(-1, 2).tolist(), "total": len(pairs)}
 
 
@@ -292,8 +299,8 @@ def _ellipses(parts: ReportParts, start_ns: int) -> dict[str, Any] | None:
     if not len(rows):
         return None
     seconds, poses, c = since(trajectory.stamps_ns[rows], start_ns), trajectory.poses[rows], covariances[rows]
-    columns = _columns(t=seconds, x=poses[:, 0], y=poses[:, 1], decimals=3)
-    return columns | _columns(xx=c[:, 0, 0], xy=c[:, 0, 1], yy=c[:, 1, 1], decimals=7)
+    columns = rounding.columns(t=seconds, x=poses[:, 0], y=poses[:, 1], decimals=3)
+    return columns | rounding.columns(xx=c[:, 0, 0], xy=c[:, 0, 1], yy=c[:, 1, 1], decimals=7)
 
 
 def _ambiguities(data: ReportData) -> list[dict[str, Any]]:
@@ -302,9 +309,11 @@ def _ambiguities(data: ReportData) -> list[dict[str, Any]]:
     for each, labels in zip(data.ambiguities, data.place_labels, strict=True):
         begin, end, t = since(np.array([each.begin_ns, each.end_ns, each.stamp_ns]), data.start_ns).tolist()
         poses = np.array([place.pose.to_array() for place in each.places])
-        columns = _columns(x=poses[:, 0], y=poses[:, 1], theta=poses[:, 2])
-        columns |= {"p": [_round(place.probability) for place in each.places], "labels": labels}
-        found.append({"begin": _round(begin), "end": _round(end), "at": _round(t), **columns})
+        columns = rounding.columns(x=poses[:, 0], y=poses[:, 1], theta=poses[:, 2])
+        columns |= {"p": [rounding.rounded(place.probability) for place in each.places], "labels": labels}
+        found.append(
+            {"begin": rounding.rounded(begin), "end": rounding.rounded(end), "at": rounding.rounded(t), **columns}
+        )
     return found
 
 
@@ -331,7 +340,7 @@ def _events(
         rows = np.flatnonzero(data.scans.where(Status.REJECTED))
         rows = rows[_every(len(rows), MOST_MARKS)]
         found += [(float(data.scans.seconds[row]), "rejected", data.scans.reason[row]) for row in rows]
-    return [{"t": _round(t), "kind": kind, "text": text} for t, kind, text in sorted(found)]
+    return [{"t": rounding.rounded(t), "kind": kind, "text": text} for t, kind, text in sorted(found)]
 
 
 def _status_rows(scans: Scans) -> list[dict[str, Any]]:
@@ -341,7 +350,7 @@ def _status_rows(scans: Scans) -> list[dict[str, Any]]:
     for name, count in status_counts(scans).items():
         spans = runs(scans.seconds[scans.where(name)], 2.0 * spacing)
         spans = spans[_every(len(spans), MOST_MARKS)]
-        times = [[_round(begin), _round(end + spacing)] for begin, end in spans]
+        times = [[rounding.rounded(begin), rounding.rounded(end + spacing)] for begin, end in spans]
         rows.append({"status": name, "label": STATUS_WORDS.get(name, name), "count": count, "runs": times})
     return rows
 
@@ -361,31 +370,12 @@ def _chart(chart: Chart) -> dict[str, Any]:
     values: dict[str, Any] = {
         "name": chart.name, "title": chart.title, "unit": chart.unit, "explanation": chart.explanation,
         "log": chart.is_logarithmic, "top": chart.top, "time": chart.over_time,
-        "t": _numbers(chart.curve.seconds[rows], 3), "v": _significant(chart.curve.values[rows]),
+        "t": rounding.numbers(chart.curve.seconds[rows], 3), "v": rounding.significant(chart.curve.values[rows]),
     }  # fmt: skip
     if chart.marks is not None and len(chart.marks.seconds):
         kept = _every(len(chart.marks.seconds), MOST_MARKS)
-        values["marks"] = {"t": _numbers(chart.marks.seconds[kept], 3), "v": _significant(chart.marks.values[kept])}
+        values["marks"] = {
+            "t": rounding.numbers(chart.marks.seconds[kept], 3),
+            "v": rounding.significant(chart.marks.values[kept]),
+        }
     return values
-
-
-def _columns(*, decimals: int = 3, **columns: Floats) -> dict[str, Any]:
-    return {name: _numbers(column, decimals) for name, column in columns.items()}
-
-
-def _numbers(values: Floats, decimals: int) -> list[float | None]:
-    """Rounded; what is not a number is null."""
-    rounded = np.round(np.asarray(values, dtype=np.float64), decimals)
-    rounded += 0.0  # no -0.0
-    return [
-        value if known else None for value, known in zip(rounded.tolist(), np.isfinite(rounded).tolist(), strict=True)
-    ]
-
-
-def _significant(values: Floats) -> list[float | None]:
-    """Five figures, which are enough to read."""
-    return [float(f"{value:.5g}") if isfinite(value) else None for value in values.tolist()]
-
-
-def _round(value: float) -> float:
-    return round(float(value), 3)

@@ -71,7 +71,7 @@ def test_rosbags_decodes_every_message(results: Path) -> None:
     scans = json.loads((results / "metrics.json").read_text())["scans"]["total"]
     of_each = {"/scan": scans, "/pose": len(trajectory), "/tf": len(trajectory)}
     layout = json.loads((results / "lichtblick.json").read_text())
-    of_maps = {"/loops", "/places_to_check"}
+    of_maps = {"/loops", "/places_to_check", "/map_changes"}
     assert set(layout["configById"]["3D!map"]["topics"]) - of_maps <= set(found)
     plotted = {
         line["value"].split(".")[0]

@@ -62,7 +62,7 @@
       "text-anchor": anchor, "dominant-baseline": "central", "paint-order": "stroke", stroke: view.ink("halo"), "stroke-width": 2 * ratio }, words));
     for (const mark of data.marks) {
       if (!on(mark.status)) continue;
-      for (const k of mark.t.keys()) text(globalThis.ResultLayers.MARKS[mark.status], ...view.pixels(...view.local(mark.x[k], mark.y[k])), view.ink(view.markInk(mark)), mark.status === "to_check" ? 24 : 12);
+      for (const k of mark.t.keys()) text(globalThis.ResultLayers.MARKS[mark.status], ...view.pixels(...view.local(mark.x[k], mark.y[k])), view.ink(view.markInk(mark)), globalThis.ResultLayers.MARK_PX[mark.status] ?? 12);
     }
     for (const { outline, text: words, at } of view.placeMarks()) {
       page.append(node("polygon", { points: outline.map((xy) => xy.map(fixed).join(",")).join(" "), fill: view.ink("orange"), stroke: view.ink("ink"), "stroke-width": 1.4 * ratio }));

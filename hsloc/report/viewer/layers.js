@@ -4,8 +4,8 @@
   const STATES = { localised: "blue", predicted: "sky", ambiguous: "orange", off_map: "vermillion", lost: "purple" };
   // Viridis at eight places (S. van der Walt and N. Smith, 2015): even in lightness, readable for the colour-blind.
   const SCALE = ["#440154", "#46327e", "#365c8d", "#277f8e", "#1fa187", "#4ac16d", "#a0da39", "#fde725"];
-  const MARKS = { rejected: "✕", no_returns: "▼", relocalised: "★", to_check: "⚠\uFE0E" };
-  const MARK_PX = { relocalised: 20, to_check: 24 };
+  const MARKS = { rejected: "✕", no_returns: "▼", relocalised: "★", appeared: "✚", vanished: "◌", to_check: "⚠\uFE0E" };
+  const MARK_PX = { relocalised: 20, appeared: 16, vanished: 20, to_check: 24 };
   const PLACE = [[13, 0], [-9, 8], [-5, 0], [-9, -8]]; // an arrow, in pixels
   const PIECE = 256, THIN_PX = 0.5; // points or ellipses that are stroked at once; points that are closer (pixels) are joined
   const HEAT_M = 0.3, HEAT_CELLS = 240; // where the scale ends; cells along the longer side of the extent
@@ -261,7 +261,7 @@
       const mark = (name, colour, at, isLeft) => ({ name, colour, at, align: isLeft ? "right" : "left", text: [at[0] + (isLeft ? -r : r), at[1] - r] });
       return [mark("end", "vermillion", last, near && !left), mark("start", "green", first, left)];
     },
-    markInk: (mark) => ["rejected", "to_check"].includes(mark.status) ? "vermillion" : "orange",
+    markInk: (mark) => ({ rejected: "vermillion", to_check: "vermillion", vanished: "vermillion", appeared: "green" })[mark.status] ?? "orange",
     // Why there is a mark at a pixel, or why a loop through it was refused; null where nothing is.
     reasonAt(px, py) {
       const { marks, loops } = this.data, at = (x, y) => this.pixels(...this.local(x, y));
@@ -332,5 +332,5 @@
       c.restore();
     },
   };
-  globalThis.ResultLayers = { MARKS, Path, before, make, within, methods };
+  globalThis.ResultLayers = { MARKS, MARK_PX, Path, before, make, within, methods };
 })();

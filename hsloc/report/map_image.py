@@ -62,6 +62,21 @@ class Extent:
         """Width by height."""
         return self.width / self.height
 
+    def holds(self, xy: Floats) -> bool:
+        """Whether all points (n, 2) that are known lie within."""
+        inside = (self.x0 <= xy[:, 0]) & (xy[:, 0] <= self.x1) & (self.y0 <= xy[:, 1]) & (xy[:, 1] <= self.y1)
+        return bool((inside | ~np.isfinite(xy).all(axis=1)).all())
+
+    def around(self, xy: Floats) -> Extent:
+        """The smallest rectangle that holds this one and points (n, 2), with a margin around these."""
+        known = _finite(xy)
+        if not len(known):
+            return self
+        room = 0.5 * MARGIN * max(self.width, self.height)
+        low, high = known.min(axis=0) - room, known.max(axis=0) + room
+        corners = (min(self.x0, low[0]), min(self.y0, low[1]), max(self.x1, high[0]), max(self.y1, high[1]))
+        return Extent(*(float(value) for value in corners))
+
     def widened(self, aspect: float) -> Extent:
         """The smallest rectangle around this one, with the same middle, that has another aspect."""
         wider, higher = max(self.width, self.height * aspect), max(self.height, self.width / aspect)
@@ -115,7 +130,7 @@ def picture_of(grid: OccupancyGrid, most_pixels: float) -> Picture | None:
 def shown_extent(data: ReportData, grid: OccupancyGrid | None, points: Floats | None) -> Extent:
     """All of the trajectory, the reference and the places that may be right, and the known map around them.
 
-    Odometry may leave the picture. Of a map that is far larger than the path only what lies within `SURROUNDINGS` of
+    Odometry may lie outside of it. Of a map that is far larger than the path only what lies within `SURROUNDINGS` of
     the path is shown.
     """
     reference = np.zeros((0, 2)) if data.reference is None else data.reference

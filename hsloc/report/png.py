@@ -24,8 +24,9 @@ from hsloc.report.changes import draw_changes
 from hsloc.report.charts import Chart, run_charts
 from hsloc.report.data import prepare, since
 from hsloc.report.map_image import Extent, shown_extent
-from hsloc.report.png_panels import draw_map, draw_panel, draw_places_to_check, draw_table
-from hsloc.report.summary import VERDICT_WORDS, ResultSummary, count
+from hsloc.report.png_labels import label_ends
+from hsloc.report.png_panels import draw_map, draw_panel, draw_places_to_check, draw_table, line_count
+from hsloc.report.summary import VERDICT_WORDS, ResultSummary, count, short_warnings
 from hsloc.report.table import reason_text
 
 if TYPE_CHECKING:
@@ -46,14 +47,21 @@ WIDTH, HEIGHT, DPI = 16.0, 10.0, 100
 LEFT, LEFT_OF_AXES, RIGHT, BOTTOM, TOP = 0.015, 0.05, 0.985, 0.06, 0.88
 """Edges as parts of the picture: of text, of axes (their numbers are left of them), and of all below the head."""
 
-LINE = 0.031
-"""Height of a line of the table, as a part of the picture's."""
+HEAD, TEXT_LINE = 0.909, 0.023
+"""Where the third line of the head is, and the height of one of its small lines, as parts of the picture's."""
 
-LEAST_LINE = 0.024
-"""As low as a line of the table may be, so that the next one does not touch it."""
+MOST_WARNINGS = 3
+"""Warnings that are shown; the last line says how many others there are."""
 
-MOST_PANELS = 3
-"""Curves that are shown, the most important first."""
+LINE, USUAL_LINE, LEAST_LINE = 0.031, 0.024, 0.0165
+"""Height of a line of the table, as a part of the picture's: where there is room, where the type has its usual size,
+and as low as it may be, with smaller type."""
+
+LEAST_SCALE = 0.8
+"""The map may be drawn this much smaller, so that odometry which leaves it is in the picture; if not, it is cut."""
+
+MOST_PANELS, LEAST_PANEL = 3, 0.075
+"""Curves that are shown at most, the most important first, and the height that each needs with its heading."""
 
 WIDE = 2.1
 """From this ratio of width to height on, the map takes the whole width, and the rest is below it."""
@@ -103,16 +111,45 @@ def report_figure(parts: ReportParts, data: ReportData | None = None) -> Figure:
     data = prepare(parts) if data is None else data
     summary = None if parts.metrics is None else ResultSummary.of(parts.metrics)
     rows = [] if summary is None else list(summary.figures)
-    extent, panels = shown_extent(data, parts.grid, parts.points), run_charts(data)[:MOST_PANELS]
-    left, bottom, width, height = _place(figure, extent, panels, rows, data)
+    warned = [] if parts.metrics is None else _warning_lines(short_warnings(parts.metrics))
+    reasons = () if parts.metrics is None else parts.metrics.verdict_reasons
+    head = HEAD - (0.027 if reasons else 0.0)
+    top = min(head - TEXT_LINE * len(warned) - 0.012, TOP)
+    extent, panels = _with_odometry(shown_extent(data, parts.grid, parts.points), data), run_charts(data)[:MOST_PANELS]
+    left, bottom, width, height = _place(figure, (extent, top), panels, rows, data)
     axes = figure.add_axes((left, bottom, width, height))
     shown = extent.widened(width * WIDTH / (height * HEIGHT))
     draw_map(axes, data, parts.grid, parts.points, shown, max(width * WIDTH, height * HEIGHT) * DPI)
     draw_changes(axes, parts.map_changes)
-    reasons = () if parts.metrics is None else parts.metrics.verdict_reasons
     draw_places_to_check(axes, [place for reason in reasons for place in reason.places])
+    label_ends(axes, data)
     _draw_head(figure, axes, parts.title, summary, reasons)
+    for k, text in enumerate(warned):
+        line = figure.text(
+            LEFT, head - k * TEXT_LINE, "", fontsize=style.SMALL, color=style.MUTED, va="top", parse_math=False
+        )
+        _fit(line, [text, *(f"{text[:most]}…" for most in range(len(text) - 1, 0, -1))], RIGHT - LEFT)
     return figure
+
+
+def _warning_lines(texts: Sequence[str]) -> list[str]:
+    """What stands below the reasons; a job and report.html have all of it, with remedies."""
+    shown = texts if len(texts) <= MOST_WARNINGS else texts[: MOST_WARNINGS - 1]
+    lines = [text if text.startswith("log: ") else f"warning {text}" for text in shown]
+    others = len(texts) - len(shown)
+    return [*lines, f"and {count(others, 'other warning')}: see report.html"] if others else lines
+
+
+def _with_odometry(extent: Extent, data: ReportData) -> Extent:
+    """With all of the odometry, if what else is shown does not become too small."""
+
+    def scale(shown: Extent) -> float:
+        """Parts of the picture's width a metre, at most."""
+        below = min((RIGHT - LEFT_OF_AXES) / shown.width, 0.48 * HEIGHT / WIDTH / shown.height)
+        return max(below, min(0.64 / shown.width, (TOP - BOTTOM) * HEIGHT / WIDTH / shown.height))
+
+    whole = extent if data.odometry is None else extent.around(data.odometry)
+    return whole if scale(whole) >= LEAST_SCALE * scale(extent) else extent
 
 
 def _draw_head(
@@ -143,7 +180,7 @@ def _draw_head(
     if summary.reasons:
         others = len(summary.reasons) - 1
         more = f" (and {count(others, 'other reason')})" if others else ""
-        line = figure.text(LEFT, 0.909, "", fontsize=11, color=style.INK, va="top", parse_math=False)
+        line = figure.text(LEFT, HEAD, "", fontsize=11, color=style.INK, va="top", parse_math=False)
         # What there is no room for is in report.html: the remedy first, then places, then times.
         first, text = replace(reasons[0], remedy=""), reasons[0].text
         whole = [summary.reasons[0], reason_text(first), reason_text(replace(first, places=())), text]
@@ -170,30 +207,39 @@ def _fit(line: Text, texts: list[str], width: float) -> None:
         line.set_text(texts[low])
 
 
-def _place(figure: Figure, extent: Extent, panels: list[Chart], rows: list[Row], data: ReportData) -> Box:
-    """Draw panels and table beside the map or below it; returns the box that is left for the map."""
+def _place(figure: Figure, shown: tuple[Extent, float], panels: list[Chart], rows: list[Row], data: ReportData) -> Box:
+    """Draw panels and table beside the map or below it; returns the box that is left for the map.
+
+    `shown` is what the map shows, and the upper edge of all.
+    """
+    extent, top = shown
     if not panels and not rows:
-        return LEFT_OF_AXES, BOTTOM, RIGHT - LEFT_OF_AXES, TOP - BOTTOM
+        return LEFT_OF_AXES, BOTTOM, RIGHT - LEFT_OF_AXES, top - BOTTOM
     if extent.aspect > WIDE:
-        height = min(max((RIGHT - LEFT_OF_AXES) * WIDTH / extent.aspect / HEIGHT, 0.3), 0.48)
-        below = TOP - height - 0.09
         split = LEFT_OF_AXES + 0.6 * (RIGHT - LEFT_OF_AXES) if panels else LEFT_OF_AXES - 0.055
+        lines = line_count(rows, (RIGHT - split - 0.055) * WIDTH * DPI)
+        # The table begins above the panels and ends below them, which have headings and times.
+        room = top - 0.065 - 0.02 - min(USUAL_LINE * lines, 0.45)
+        height = min(max((RIGHT - LEFT_OF_AXES) * WIDTH / extent.aspect / HEIGHT, 0.3), 0.48, max(room, 0.3))
+        below = top - height - 0.065
         _draw_panels(figure, panels, data, (LEFT_OF_AXES, BOTTOM, split - LEFT_OF_AXES, below - BOTTOM))
-        _draw_rows(figure, rows, (split + 0.055, BOTTOM, RIGHT - split - 0.055, below - BOTTOM))
-        return LEFT_OF_AXES, TOP - height, RIGHT - LEFT_OF_AXES, height
-    width = min(max((TOP - BOTTOM) * HEIGHT * extent.aspect / WIDTH, 0.36), 0.64)
+        _draw_rows(figure, rows, (split + 0.055, 0.02, RIGHT - split - 0.055, below - 0.02))
+        return LEFT_OF_AXES, top - height, RIGHT - LEFT_OF_AXES, height
+    width = min(max((top - BOTTOM) * HEIGHT * extent.aspect / WIDTH, 0.36), 0.64)
     column = LEFT_OF_AXES + width + 0.055
-    table = min(LINE * (len(rows) + 2), 0.5) if rows else 0.0
-    above = TOP - BOTTOM - table - (0.065 if rows else 0.0)
-    _draw_panels(figure, panels, data, (column, TOP - above, RIGHT - column, above))
-    _draw_rows(figure, rows, (column, BOTTOM - 0.02 if panels else TOP - table, RIGHT - column, table))
-    return LEFT_OF_AXES, BOTTOM, width, TOP - BOTTOM
+    lines = line_count(rows, (RIGHT - column) * WIDTH * DPI)
+    table = min(LINE * lines + 0.01, 0.55) if rows else 0.0
+    above = top - 0.02 - table - 0.085 if rows else top - BOTTOM
+    _draw_panels(figure, panels, data, (column, top - above, RIGHT - column, above))
+    _draw_rows(figure, rows, (column, 0.02 if panels else top - table, RIGHT - column, table))
+    return LEFT_OF_AXES, BOTTOM, width, top - BOTTOM
 
 
 def _draw_panels(figure: Figure, panels: list[Chart], data: ReportData, box: Box) -> None:
     """The panels one below the other; their headings are within the box, the time of the last below it."""
     left, bottom, width, height = box
     heading = 0.036
+    panels = panels[: max(int(height / LEAST_PANEL), 1)]
     each = height / max(len(panels), 1)
     for index, panel in enumerate(panels):
         y = bottom + height - (index + 1) * each
@@ -203,9 +249,9 @@ def _draw_panels(figure: Figure, panels: list[Chart], data: ReportData, box: Box
 
 def _draw_rows(figure: Figure, rows: list[Row], box: Box) -> None:
     if rows:
-        # One for the heading, and one for a long value, which has a line of its own.
-        line = min(LINE, max(box[3] / (len(rows) + 2), LEAST_LINE))
-        draw_table(figure.add_axes(box), rows, line_height=line / box[3])
+        line = min(LINE, max(box[3] / line_count(rows, box[2] * WIDTH * DPI), LEAST_LINE))
+        size = style.TEXT * min(line / USUAL_LINE, 1.0)
+        draw_table(figure.add_axes(box), rows, line_height=line / box[3], size=size)
 
 
 def draw_comparisons(comparisons: Mapping[str, Comparison], figure: Figure | None = None) -> Figure:

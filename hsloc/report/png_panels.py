@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import floor, log10
+from textwrap import wrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,7 @@ from hsloc.model import Status
 from hsloc.report import style
 from hsloc.report.data import Curve, with_gaps
 from hsloc.report.map_image import known_runs, line_width, picture_of
+from hsloc.report.png_labels import HALO
 from hsloc.report.table import MARK_WORDS
 
 if TYPE_CHECKING:
@@ -40,7 +42,6 @@ MOST_TO_CHECK = 40
 """Places to check that are drawn: more would hide the map."""
 _SIGN_OFFSET = np.array((0.36, 0.45))
 """By which the "!" is left of and below the middle of its triangle (points): its parts then lie on whole pixels."""
-HALO = [withStroke(linewidth=3.0, foreground="white")]
 
 
 def draw_map(
@@ -52,10 +53,10 @@ def draw_map(
         _draw_grid(axes, grid, pixels)
     if points is not None and len(points):
         axes.plot(points[:, 0], points[:, 1], ".", color=style.WALL, markersize=2.2, label="map points", zorder=2)
-    _draw_paths(axes, data, line_width(data, extent), max(extent.width, extent.height) / pixels)
+    _draw_paths(axes, data, extent, max(extent.width, extent.height) / pixels)
     _draw_marks(axes, data)
     _draw_places(axes, data)
-    _draw_ends(axes, data, extent)
+    _draw_ends(axes, data)
     _draw_scale_bar(axes, extent)
     axes.set_xlim(extent.x0, extent.x1)
     axes.set_ylim(extent.y0, extent.y1)
@@ -90,7 +91,7 @@ def _draw_grid(axes: Axes, grid: OccupancyGrid, pixels: float) -> None:
     image.set_transform(Affine2D().rotate(pose.theta).translate(pose.x, pose.y) + axes.transData)
 
 
-def _draw_paths(axes: Axes, data: ReportData, width: float, pixel: float) -> None:
+def _draw_paths(axes: Axes, data: ReportData, extent: Extent, pixel: float) -> None:
     """In the order of the legend; zorder gives what covers what. Nothing finer than half a pixel is drawn."""
 
     def seen(xy: Floats) -> Floats:
@@ -101,7 +102,14 @@ def _draw_paths(axes: Axes, data: ReportData, width: float, pixel: float) -> Non
         axes.plot(*lines.T, color=style.GREEN, linewidth=1.2, label="loop closed", zorder=4)
     if len(data.path):
         known = seen(with_gaps(np.where(data.localised[:, None], data.path, np.nan), data.jumps))
-        axes.plot(*known.T, color=style.BLUE, linewidth=width, label="trajectory", zorder=5, solid_capstyle="round")
+        axes.plot(
+            *known.T,
+            color=style.BLUE,
+            linewidth=line_width(data, extent),
+            label="trajectory",
+            zorder=5,
+            solid_capstyle="round",
+        )
     if data.reference is not None and len(data.reference):
         axes.plot(
             *seen(with_gaps(data.reference, data.reference_jumps)).T,
@@ -114,7 +122,7 @@ def _draw_paths(axes: Axes, data: ReportData, width: float, pixel: float) -> Non
     if data.odometry is not None and len(data.odometry):
         axes.plot(
             *seen(data.odometry).T, color=style.VERMILLION, alpha=0.7, linewidth=1.3, linestyle=(0, (1, 1.2)),
-            label="odometry alone", zorder=3,
+            label="odometry alone" if extent.holds(data.odometry) else "odometry alone, goes on outside", zorder=3,
         )  # fmt: skip
     if not data.localised.all():
         guessed = seen(with_gaps(np.where(data.localised[:, None], np.nan, data.path), data.jumps))
@@ -178,26 +186,17 @@ def draw_places_to_check(axes: Axes, places: Sequence[tuple[float, float]]) -> N
     )  # fmt: skip
 
 
-def _draw_ends(axes: Axes, data: ReportData, extent: Extent) -> None:
+def _draw_ends(axes: Axes, data: ReportData) -> None:
     if not len(data.path):
         axes.text(
             0.5, 0.5, "no pose", transform=axes.transAxes, ha="center", va="center", color=style.MUTED, fontsize=14
         )
         return
     order = np.argsort(data.seconds, kind="stable")
-    start, end = data.path[order[0]], data.path[order[-1]]
-    together = np.hypot(*(end - start)) < 0.04 * max(extent.width, extent.height)
-    for xy, marker, colour, label in (
-        (end, "s", style.VERMILLION, "" if together else "end"),
-        (start, "o", style.GREEN, "start, end" if together else "start"),
-    ):
+    for row, marker, colour in ((order[-1], "s", style.VERMILLION), (order[0], "o", style.GREEN)):
         axes.plot(
-            *xy, marker=marker, color=colour, markersize=9, markeredgecolor="white", markeredgewidth=1.5, zorder=10
-        )
-        near_the_edge = xy[0] > extent.x1 - 0.1 * extent.width
-        axes.annotate(
-            label, xy, xytext=(-8 if near_the_edge else 8, 8), textcoords="offset points", fontsize=style.TEXT,
-            fontweight="bold", color=style.INK, path_effects=HALO, zorder=11, ha="right" if near_the_edge else "left",
+            *data.path[row], marker=marker, color=colour, markersize=9, markeredgecolor="white", markeredgewidth=1.5,
+            zorder=10,
         )  # fmt: skip
 
 
@@ -281,32 +280,65 @@ def _draw_line(axes: Axes, curve: Curve, chart: Chart) -> None:
     axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
 
 
-def draw_table(axes: Axes, rows: list[Row], *, line_height: float) -> None:
-    """The table, from the top down; `line_height` is a line's part of the panel. What does not fit is left out."""
+_LETTER = 9.3
+"""Mean width of a letter of the table (pixels), or a little more."""
+
+
+def line_count(rows: Sequence[Row], width: float) -> int:
+    """Lines of a table of this width (pixels), or some more: a heading if there are pairs, more for a long value."""
+    most = max(int(width / _LETTER), 1)
+    paired = any(len(row.values) == 2 for row in rows)
+    long = [row.values[0] for row in rows if len(row.values) == 1 and len(row.label + row.values[0]) > most]
+    return len(rows) + paired + sum(1 + len(value) // most for value in long)
+
+
+def draw_table(axes: Axes, rows: list[Row], *, line_height: float, size: float) -> None:
+    """The table, from the top down, in type of `size`; `line_height` is a line's part of the panel."""
     axes.set_axis_off()
     axes.set_xlim(0.0, 1.0)
     axes.set_ylim(0.0, 1.0)
     y = 1.0
     if any(len(row.values) == 2 for row in rows):
         for x, heading in ((0.74, "translation"), (1.0, "rotation")):
-            axes.text(x, y, heading, ha="right", va="top", fontsize=style.SMALL, color=style.MUTED)
+            axes.text(x, y, heading, ha="right", va="top", fontsize=min(style.SMALL, size), color=style.MUTED)
         y -= line_height
     rules = []
     for row in rows:
-        if y < 0.6 * line_height:
-            break
         rules.append(y + 0.18 * line_height)
-        label = axes.text(0.0, y, row.label, ha="left", va="top", fontsize=style.TEXT, color=style.INK)
+        label = axes.text(0.0, y, row.label, ha="left", va="top", fontsize=size, color=style.INK)
+        begin, end = 0.0, 0.0
         for x, value in zip((0.74, 1.0) if len(row.values) == 2 else (1.0,), row.values, strict=True):
-            text = axes.text(x, y, value, ha="right", va="top", fontsize=style.TEXT, color=style.INK, fontweight="bold")
-            if len(row.values) == 1 and text.get_window_extent().x0 < label.get_window_extent().x1 + _GAP_PIXELS:
-                y -= line_height  # a long value has a line of its own
-                text.set_y(y)
-                text.set_fontsize(style.TEXT * min(0.95 * axes.bbox.width / text.get_window_extent().width, 1.0))
+            text = axes.text(x, y, value, ha="right", va="top", fontsize=size, color=style.INK, fontweight="bold")
+            if len(row.values) == 1:
+                begin, end = label.get_window_extent().x1 + _GAP_PIXELS, text.get_window_extent().x0
+            if end < begin:  # a long value has lines of its own
+                room = 0.95 * axes.bbox.width / text.get_window_extent().width
+                text.remove()
+                for piece in _pieces(value, int(room * len(value))):
+                    y -= line_height
+                    axes.text(x, y, piece, ha="right", va="top", fontsize=size, color=style.INK, fontweight="bold")
+        if row.usual and begin < end:
+            _draw_usual(axes, row.usual, y, (begin, end - _GAP_PIXELS), size)
         y -= line_height
     ends = np.array([(x, rule) for rule in rules for x in (0.0, 1.0)]).reshape(-1, 2)
     ends = with_gaps(ends, np.arange(len(ends)) % 2 == 0)
     axes.plot(*ends.T, color=style.RULE, linewidth=0.7, clip_on=False)
+
+
+def _pieces(text: str, most: int) -> list[str]:
+    """A text in lines of at most `most` letters, if its parts between commas are not longer."""
+    bound = text.replace(" ", "\N{NO-BREAK SPACE}").replace(",\N{NO-BREAK SPACE}", ", ")
+    return [line.replace("\N{NO-BREAK SPACE}", " ") for line in wrap(bound, max(most, 1), break_long_words=False)]
+
+
+def _draw_usual(axes: Axes, usual: str, y: float, between: tuple[float, float], size: float) -> None:
+    """What is usual, between the label and the value (pixels), if there is room."""
+    x = (between[0] - axes.bbox.x0) / axes.bbox.width
+    text = axes.text(
+        x, y, f"usual: {usual}", ha="left", va="top", fontsize=min(style.SMALL, 0.9 * size), color=style.MUTED
+    )
+    if text.get_window_extent().x1 > between[1]:
+        text.remove()
 
 
 _BLOCK = 4096

@@ -11,7 +11,10 @@ from hsloc.model.verdict import Verdict
 from hsloc.report.table import Row, format_duration, format_length, format_share, reason_texts, table_rows
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from hsloc.run_metrics import RunMetrics
+    from hsloc.warnings import RunWarning
 
 VERDICT_WORDS: dict[str, str] = {
     Verdict.GOOD: "nothing contradicts the result",
@@ -144,10 +147,15 @@ def _map_name(metrics: RunMetrics) -> str:
     return "the map of the log" if metrics.run.map == "log" else metrics.run.map
 
 
-def _warnings(metrics: RunMetrics) -> list[str]:
+def short_warnings(metrics: RunMetrics) -> list[str]:
+    """The same texts as `ResultSummary.warnings`, each warning with its code before it and without its remedy."""
+    return _warnings(metrics, lambda warning: f"{warning.code}: {warning.text}")
+
+
+def _warnings(metrics: RunMetrics, written: Callable[[RunWarning], str] = str) -> list[str]:
     """Without those that are reasons of the verdict already."""
     reasons = {(reason.code, reason.text) for reason in metrics.verdict_reasons}
-    found = [str(each) for each in metrics.warnings if (each.code, each.text) not in reasons]
+    found = [written(each) for each in metrics.warnings if (each.code, each.text) not in reasons]
     found += [f"log: {line}" for line in metrics.losses.notes]
     if metrics.evaluation_error is not None:
         found.append(f"no comparison with the reference: {metrics.evaluation_error}")

@@ -26,7 +26,7 @@ STATUS_WORDS: dict[str, str] = {
     Status.PREDICTED: "skipped (robot had hardly moved)",
     Status.REJECTED: "rejected",
     Status.NO_RETURNS: "without returns",
-    Status.SEARCHING: "during the search for the pose",
+    Status.SEARCHING: "during the pose search",
 }
 """What a scan's status is called."""
 MARK_WORDS: dict[str, str] = {
@@ -253,7 +253,7 @@ def scan_rows(scans: ScanCounts) -> list[Row]:
         words = ", ".join(f"{scans.by_status[name]} {STATUS_WORDS.get(name, name)}" for name in unused)
         explanation = (
             "What became of the other scans. Skipped: the robot had hardly moved since the last match, so the scan "
-            "was not needed (the motion gate); this is no fault. During the search for the pose: it was not known "
+            "was not needed (the motion gate); this is no fault. During the pose search: the pose was not known "
             "yet; once it is found, the poses before are computed backwards from there."
         )
         rows.append(

@@ -246,7 +246,7 @@ def test_a_pose_that_is_known_during_a_search_was_found_later(run: dict[str, Any
         ReportParts(title="", trajectory=path, diagnostics=diagnostics, overlay=overlay, localised=localised)
     )
     (status,) = view["scans"]["status"]
-    assert status.startswith("during the search for the pose")
+    assert status.startswith("during the pose search")
     assert ("placed once it had ended" in status) is known
 
 

@@ -157,6 +157,7 @@ KINDS: dict[str, Kind] = {
     "way x 1.05": Kind(drives.steps(1.0, 1.05)),
     "way x 0.8": Kind(drives.steps(1.0, 0.8)),
     "skid steer": Kind(drives.steps(1.35, 1.08)),
+    "misses 3 deg a metre": Kind(drives.turning(np.radians(3.0))),
     "odometry 5 Hz": Kind(drives.at_rate(10)),
     "odometry 2 Hz": Kind(drives.at_rate(25)),
     "jitter": Kind(drives.jittered),

@@ -221,6 +221,11 @@ def steps(turn: float, way: float) -> Callable[[Drive], Drive]:
     return lambda drive: drive.with_steps(lambda _, m: Pose2(way * m.x, way * m.y, turn * m.theta))
 
 
+def turning(per_metre: float) -> Callable[[Drive], Drive]:
+    """A turn (rad) with each metre that the odometry misses: one wheel is larger than the other."""
+    return lambda drive: drive.with_steps(lambda _, m: Pose2(m.x, m.y, m.theta - per_metre * np.hypot(m.x, m.y)))
+
+
 def at_rate(every: int) -> Callable[[Drive], Drive]:
     """Only some of the odometry messages."""
 

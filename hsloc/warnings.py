@@ -128,7 +128,8 @@ class WarningCode(StrEnum):
     ODOMETRY_JUMPS = "odometry_jumps"
     """The odometry jumps too often to be corrected."""
     ODOMETRY_SCALE = "odometry_scale"
-    """The odometry counts distances or turns wrongly by the same part everywhere; on a given map it is corrected."""
+    """The odometry counts distances or turns wrongly by the same part everywhere, or misses a turn with each metre;
+    on a given map it is corrected."""
     ODOMETRY_UNUSABLE = "odometry_unusable"
     """The odometry does not move while the scans do, or never states a heading; the run goes on without it."""
     SCANS_WITHOUT_PLACE = "scans_without_place"

@@ -11,6 +11,7 @@ from hsloc.garbage_collection import rarely_collected
 from hsloc.log import open_log
 from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle
+from hsloc.preprocessing.body_returns import without_beams
 from hsloc.preprocessing.odometry import ContinuousOdometry
 from hsloc.preprocessing.scans import ScanWatch, pair
 
@@ -58,10 +59,11 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
     T_map_odom: Pose2 | None = None
 
     with rarely_collected():
-        events = _with_recorded_odometry(log.events(), result) if result.lidar_only else log.events()
+        recorded = without_beams(log.events(), result.body_beams) if result.body_beams else log.events()
+        events = _with_recorded_odometry(recorded, result) if result.lidar_only else recorded
         joined = ContinuousOdometry(events)
         watched = joined if result.lidar_only else ScanWatch(joined)
-        # The odometry as the run had it: poses of scans are composed with it.
+        # All as the run had it: poses of scans are composed with the odometry that it corrected.
         counted = watched if result.odometry_correction is None else result.odometry_correction.applied(watched)
         for event in pair(counted, deskew=result.deskewed, first=first):
             if isinstance(event, PairedScan):

@@ -112,6 +112,8 @@ class Result:
     """How much more a metre and a radian of `odometry` are, by a localiser on a given map."""
     odometry_correction: OdometryScale | None = None
     """The scale by which `odometry` differs from that of the log; None where it is as recorded."""
+    body_beams: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+    """Beams (n,) that see the robot itself and were left out, by the frame of a laser."""
     mounting_error: MountingError | None = None
     ambiguities: tuple[Ambiguity, ...] = ()
     lidar_only: bool = False
@@ -373,6 +375,7 @@ def _run_with(
         map_scale=scale,
         odometry_scale=None if localiser is None else localiser.odometry_scale,
         odometry_correction=of_odometry,
+        body_beams=own,
         given_resolution=given_resolution,
         mounting_error=mounting,
         ambiguities=history.ambiguities(states),

@@ -11,27 +11,31 @@ from hsloc.localisation.kalman_filter import difference, predict_covariance, upd
 from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.localisation.odometry_scale import OdometryScale, OdometryScaleEstimator
 from hsloc.model import Odometry, Pose2
-from hsloc.model.pose2 import rotated
+from hsloc.model.pose2 import IDENTITY, rotated
 
 SURE = OdometryScale(0.25, -0.1, 0.001, 0.001)
 
 
-def driven(true: OdometryScale, *, along: float = 1e6, slips: tuple[int, ...] = ()) -> OdometryScale | None:
+def driven(
+    true: OdometryScale, *, along: float = 1e6, slips: tuple[int, ...] = (), mounting: Pose2 = IDENTITY
+) -> OdometryScale | None:
     """What is found in a drive of 300 steps of the odometry, 0.2 m and up to 0.3 rad each.
 
     `along` is the information (1/m^2) that matches have along the heading; before the steps `slips` the wheels slip.
+    The laser is at `mounting` from where it is stated, and so are the poses of the matches.
     """
     rng, noise, subject = np.random.default_rng(0), OdometryNoise(), OdometryScaleEstimator()
-    place = pose = Pose2()
+    place, pose = Pose2(), mounting
     covariance = 1e-6 * np.eye(3)
     for k in range(300):
         turn = 0.3 if k % 40 < 15 else 0.0
         motion = Pose2(0.2, 0.0, turn * (1.0 if k % 80 < 40 else -1.0))
-        half = 0.5 * true.turn * motion.theta
+        turned = true.turn * motion.theta + true.drift * motion.x
+        half = 0.5 * turned
         length = (1.0 + true.way) * motion.x + (0.5 if k in slips else 0.0)
-        place = place @ Pose2(length * np.cos(half), length * np.sin(half), (1.0 + true.turn) * motion.theta)
+        place = place @ Pose2(length * np.cos(half), length * np.sin(half), motion.theta + turned)
         information = rotated(np.diag((along, 1e4, 1e5)), place.theta)
-        seen = Pose2.from_array(place.to_array() + rng.normal(0.0, (0.003, 0.003, 0.001)))
+        seen = Pose2.from_array((place @ mounting).to_array() + rng.normal(0.0, (0.003, 0.003, 0.001)))
         moved = noise.covariance(motion)
         subject.predict(pose, motion)
         covariance, pose = predict_covariance(covariance, pose, motion, moved), pose @ motion
@@ -49,6 +53,27 @@ def test_both_scales_are_found_also_where_walls_hold_the_poses_weakly(way: float
     assert found.way == pytest.approx(way, abs=0.01)
     assert found.turn == pytest.approx(turn, abs=0.015)
     assert (found.of_way, found.of_turn) == (way != 0.0, turn != 0.0)
+
+
+@pytest.mark.parametrize(("turn", "drift"), [(0.0, 0.05), (0.0, -0.03), (-0.1, 0.04)])
+def test_turns_that_come_with_the_distance_are_no_scale_of_the_turns(turn: float, drift: float) -> None:
+    found = driven(OdometryScale(0.0, turn, drift=drift))
+    assert found is not None
+    assert found.drift == pytest.approx(drift, abs=0.005)
+    assert found.turn == pytest.approx(turn, abs=0.015)
+    assert (found.of_way, found.of_turn, found.of_drift) == (False, turn != 0.0, True)
+
+
+@pytest.mark.parametrize("mounting", [Pose2(0.05, 0.0, 0.0), Pose2(-0.1, 0.04, 0.0), Pose2(0.0, 0.0, 0.05)])
+def test_a_laser_that_is_mounted_elsewhere_than_stated_is_no_error_of_the_odometry(mounting: Pose2) -> None:
+    found = driven(OdometryScale(0.0, 0.0), mounting=mounting)
+    assert found is not None
+    assert not found.is_significant
+    assert abs(found.turn) < 0.01
+    both = driven(OdometryScale(0.1, 0.0), mounting=mounting)
+    assert both is not None
+    assert (both.of_way, both.of_turn, both.of_drift) == (True, False, False)
+    assert both.way == pytest.approx(0.1, abs=0.01)
 
 
 def test_odometry_that_counts_rightly_is_left_as_it_is() -> None:
@@ -90,3 +115,7 @@ def test_a_correction_is_kept_where_little_of_the_error_is_left() -> None:
     assert not SURE.is_mended(None)
     assert "distances 0.800 times and turns 1.111 times" in SURE.warning().text
     assert "turns" not in replace(SURE, turn_sigma=1.0).warning().text
+    drifting = replace(SURE, drift=0.1)
+    assert "and misses turns of 5.73 deg with each metre" in drifting.warning().text
+    assert not drifting.is_mended(OdometryScale(0.01, 0.01, drift=0.09))
+    assert drifting.is_mended(OdometryScale(0.01, 0.01, drift=0.01))

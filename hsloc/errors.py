@@ -55,6 +55,12 @@ class OutputError(HslocError):
     """Results cannot be written."""
 
 
+def install_hint(*extras: str) -> str:
+    """How packages come that hsloc works without, in a clone and elsewhere; hsloc itself is there already."""
+    names = ",".join(extras)
+    return f"pip install '.[{names}]' in a clone of hsloc, pip install 'hsloc[{names}]' elsewhere"
+
+
 def not_written(path: object, error: OSError) -> str:
     """The message for a file or folder that cannot be written."""
     reason = f"{path}: cannot be written ({error.strerror or error})"

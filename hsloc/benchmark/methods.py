@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
+from hsloc.errors import install_hint
 from hsloc.kernels.fitness import fitness_many, score_sum
 from hsloc.matching import HarmonySearch, Hide, LikelihoodField
 from hsloc.model import Pose2
@@ -66,7 +67,7 @@ def peers(grid: OccupancyGrid) -> tuple[list[Method], list[str]]:
         try:
             module = importlib.import_module(name)
         except ImportError:
-            missing.append(f"{name} is not installed and was left out; pip install 'hsloc[bench]' brings it")
+            missing.append(f"{name} is not installed and was left out; {install_hint('bench')} brings it")
         else:
             methods += make(module)
     return methods, missing

@@ -12,11 +12,10 @@ BEGIN = time.perf_counter()
 
 def service_module(name: str) -> Any:
     """A module of `hsloc_service`, found by name: the library does not import the service."""
-    from hsloc.errors import ConfigError
+    from hsloc.errors import ConfigError, install_hint
 
     try:
         return importlib.import_module(f"hsloc_service.{name}")
     except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"{error.name} is not installed; install the service with: pip install 'hsloc[serve]'"
-        ) from error
+        what = f"{error.name}, which the service needs, is not installed"
+        raise ConfigError(f"{what}: {install_hint('serve')}") from error

@@ -307,6 +307,16 @@ def test_wrong_use_ends_with_2(here: Path, capsys: pytest.CaptureFixture[str], a
     assert empty(here)
 
 
+def test_a_service_that_is_not_installed_names_how_it_is_in_a_clone_and_elsewhere(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "hsloc_service.main", raising=False)
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    line = fails(capsys, "serve")
+    assert "uvicorn, which the service needs, is not installed: pip install '.[serve]' in a clone of hsloc" in line
+    assert "pip install 'hsloc[serve]' elsewhere" in line
+
+
 def test_interrupted_runs_leave_nothing_behind(here: Path) -> None:
     command = [sys.executable, "-m", "hsloc.cli.main", "replay", OFFICE, "--out", "out"]
     process = subprocess.Popen(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hsloc.errors import LogFormatError
+from hsloc.errors import LogFormatError, install_hint
 from hsloc.log.messages import definitions
 from hsloc.log.messages.decode import GridMessage, LinkMessage, PoseMessage, ScanMessage
 from hsloc.log.transforms import Transform3
@@ -99,7 +99,7 @@ def _protobuf_parser(channel: Channel) -> Callable[[bytes], Any]:
         from google.protobuf import descriptor_pb2, descriptor_pool, duration_pb2, message_factory, timestamp_pb2
     except ImportError as error:
         raise LogFormatError(
-            f"{channel.topic}: {channel.typename} in protobuf needs a package more: pip install 'hsloc[foxglove]'"
+            f"{channel.topic}: {channel.typename} in protobuf needs a package more: {install_hint('foxglove')}"
         ) from error
     try:
         files = {item.name: item for item in descriptor_pb2.FileDescriptorSet.FromString(channel.schema).file}

@@ -19,6 +19,7 @@ from sqlalchemy import Engine, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError, DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.orm import Session
 
+from hsloc.errors import install_hint
 from hsloc_service.db.migrations import migrate
 from hsloc_service.logs import log
 from hsloc_service.settings import SettingsError
@@ -231,7 +232,7 @@ def _engine(where: Path | str) -> tuple[Engine, str]:
             connect_args=_POSTGRESQL,
         )
     except ModuleNotFoundError as error:
-        raise SettingsError(f"HSLOC_DATABASE_URL is {name}: pip install 'hsloc[postgresql]'") from error
+        raise SettingsError(f"HSLOC_DATABASE_URL is {name}: {install_hint('postgresql')}") from error
     return engine, name
 
 

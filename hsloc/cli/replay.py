@@ -55,6 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.cli.main import EXIT_BELOW_LIMIT, EXIT_DATA_LOST, EXIT_OK
     from hsloc.cli.output import import_matplotlib, print_summary
     from hsloc.evaluation.metrics import format_json
+    from hsloc.replay.progress import COMPILING
     from hsloc.replay.run import run as run_replay
 
     import_matplotlib()
@@ -67,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         def show(progress: Progress) -> None:
             if progress.phase == "compile":
-                line.show_clock("compile", 20.0, "compiling kernels (once, about 20 s)")
+                line.show_clock("compile", 20.0, COMPILING)
                 return
             speed = progress.done_s / max(line.elapsed, 1e-9)
             line.show(

@@ -167,6 +167,8 @@ def _show(line: ProgressLine, job: dict[str, Any]) -> None:
     progress = job["progress"]
     if progress is None:
         line.show(job["state"], 1.0 if job["ended"] else 0.0, "")
+    elif progress["phase"] == "compile":  # How many kernels there will be is not known.
+        line.show_clock("compile", 20.0, progress.get("text") or "")
     else:
         line.show(progress["phase"], progress["fraction"], f"{progress['age_s']:.0f} s ago")
 

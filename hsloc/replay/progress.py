@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hsloc.model.events import Scan
-
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
@@ -15,6 +13,10 @@ if TYPE_CHECKING:
     from hsloc.replay.run_history import RunHistory
 
     Report = Callable[["Progress"], None] | None
+
+
+COMPILING = "compiling the search kernels, once on this machine, about 20 s"
+"""The phase "compile" in words; other phases say how far they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +41,8 @@ def share_of(progress: Report, total: float, scans: int) -> Callable[[float], No
 
 def with_progress(log: Log, events: Iterable[Event], history: RunHistory, progress: Report) -> Iterator[Event]:
     """The events, telling now and then how far they are."""
+    from hsloc.model.events import Scan  # Here: the service needs the words above alone, and no NumPy.
+
     if progress is None:
         yield from events
         return

@@ -46,6 +46,8 @@ def main() -> int:
         spawn_sleeper(new_session=True)  # leaves the process group
     if word == "held" or (word == "held-first" and folder.name.endswith(".1")):
         hold(folder, emit)
+    if word == "compiling":
+        hold(folder, emit, "compile", 0)
     if word in ("slow", "ignore-term"):
         seconds = float(rest[0])
         begin = time.monotonic()
@@ -138,12 +140,12 @@ def main() -> int:
     return 0
 
 
-def hold(folder: Path, emit: Callable[[dict[str, object]], None]) -> None:
+def hold(folder: Path, emit: Callable[[dict[str, object]], None], phase: str = "replay", total: int = 10_000) -> None:
     """Go on when a test says so (`live_service.go_on`), with progress meanwhile."""
     scans = 0
     while not (folder / "go on").exists():
         scans += 1
-        emit({"phase": "replay", "part": scans, "total": 10_000, "scans": scans})
+        emit({"phase": phase, "part": scans, "total": total, "scans": scans})
         time.sleep(0.05)
 
 

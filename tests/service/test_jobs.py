@@ -37,7 +37,7 @@ def test_a_running_job_reports_its_progress(client: TestClient, tmp_path: Path) 
         return {**client.get(f"/v1/jobs/{job}").json(), "asked": asked}
 
     first = until(shown, "there is progress", lambda found: found["progress"] is not None)
-    assert first["progress"]["phase"] == "replay"
+    assert (first["progress"]["phase"], first["progress"]["text"]) == ("replay", "replay")
     fraction = first["progress"]["fraction"]
     assert 0.0 < fraction < 0.9
     later = until(shown, "there is more", lambda found: found["progress"]["fraction"] > fraction)
@@ -45,6 +45,17 @@ def test_a_running_job_reports_its_progress(client: TestClient, tmp_path: Path) 
         assert 0.0 <= age_s <= time.time() - first["asked"]  # both were written again since then
     go_on(tmp_path / "data", job)
     assert wait(client, job)["progress"] is None
+
+
+def test_a_job_that_compiles_says_so_in_words(client: TestClient, tmp_path: Path) -> None:
+    job = submit(client, b"compiling")
+    found = until(lambda: client.get(f"/v1/jobs/{job}").json(), "there is progress", lambda found: found["progress"])
+    progress = found["progress"]
+    assert progress["text"] == "compiling the search kernels, once on this machine, about 20 s"
+    assert (progress["phase"], progress["total"], progress["fraction"]) == ("compile", 0.0, 0.0)
+    assert progress["done"] >= 1.0
+    go_on(tmp_path / "data", job)
+    assert wait(client, job)["state"] == "succeeded"
 
 
 def test_events_have_a_cursor(client: TestClient) -> None:

@@ -277,13 +277,17 @@ def _throttled(
     tell: Callable[[dict[str, Any]], None], say: Callable[[str], None]
 ) -> Callable[[str, float, float, int], None]:
     """Progress for the pipe at most every `EVERY_S`, and for the log each phase and each tenth of the replay."""
-    last, phase, tenth = 0.0, "", 0
+    from hsloc.replay.progress import COMPILING
+
+    last, phase, tenth, told = 0.0, "", 0, False
 
     def report(now_in: str, done: float, total: float, scans: int) -> None:
-        nonlocal last, phase, tenth
+        nonlocal last, phase, tenth, told
         now = time.monotonic()
         if now_in != phase:
-            say(now_in)
+            explained = now_in == "compile" and not told  # kernels that are met later interrupt the replay again
+            say(f"compile: {COMPILING}" if explained else now_in)
+            told |= explained
             tenth = 0
         if now_in == "replay" and total > 0.0 and int(10.0 * done / total) > tenth:
             tenth = int(10.0 * done / total)

@@ -267,8 +267,14 @@ class ProgressView(BaseModel):
     """How far a running job is."""
 
     phase: str = Field(description="fetch, open, prepare, compile, replay, refine, write, store", examples=["replay"])
-    done: float = Field(description="seconds of the log (replay), or the part of the work from 0 to 1 (others)")
-    total: float
+    text: str = Field(
+        description="the phase in words: compile is the compilation of the search kernels, once on each machine",
+        examples=["replay"],
+    )
+    done: float = Field(
+        description="seconds of the log (replay), kernels compiled (compile), or the part of the work from 0 to 1"
+    )
+    total: float = Field(description="of `done`; 0 where it is not known (compile)")
     fraction: float = Field(ge=0.0, le=1.0)
     speed: float | None = Field(description="done per second of wall time since the attempt began")
     scans: int | None

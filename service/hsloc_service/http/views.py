@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any, cast
 
+from hsloc.replay.progress import COMPILING
 from hsloc_service.http.schemas import (
     DeliveryView,
     FileView,
@@ -42,6 +43,7 @@ def job_view(row: JobRow) -> JobView:
         total, done = row.total or 0.0, row.done or 0.0
         progress = ProgressView(
             phase=row.phase,
+            text=COMPILING if row.phase == "compile" else row.phase,
             done=done,
             total=total,
             fraction=min(max(done / total, 0.0), 1.0) if total > 0.0 else 0.0,

@@ -64,8 +64,9 @@ function row(job) {
   const result = cell(badge(job)), summary = job.summary ?? {};
   if (job.progress) {
     const bar = element("progress");
-    bar.value = job.progress.fraction;
-    bar.setAttribute("aria-label", `${job.progress.phase} of ${job.log}`);
+    if (job.progress.total > 0) bar.value = job.progress.fraction;
+    bar.title = job.progress.text;
+    bar.setAttribute("aria-label", `${job.progress.text}: ${job.log}`);
     result.append(bar);
   }
   const name = element("div"), named = element("div", "", "named");

@@ -108,10 +108,9 @@ function render(job, isMine = true) {
   const progress = job.progress;
   $("job-bar").hidden = !ACTIVE.includes(job.state);
   if (progress) {
-    $("job-bar").value = progress.fraction;
-    const speed = progress.phase === "replay" && progress.speed ? `, ${progress.speed.toFixed(0)} times real time` : "";
-    const amount = progress.phase === "replay" ? `${progress.done.toFixed(0)} of ${progress.total.toFixed(0)} s` : `${Math.round(100 * progress.fraction)} %`;
-    state.append(`: ${progress.phase}, ${amount}${speed}, ${progress.age_s.toFixed(0)} s ago`);
+    if (progress.total > 0) $("job-bar").value = progress.fraction;
+    else $("job-bar").removeAttribute("value");  // how much there is to do is not known
+    state.append(`: ${progress.text}, ${amount(progress)}, ${progress.age_s.toFixed(0)} s ago`);
   } else {
     $("job-bar").removeAttribute("value");
   }
@@ -119,6 +118,12 @@ function render(job, isMine = true) {
   $("job-request").lastElementChild.textContent = JSON.stringify(settings, null, 2);
   offer(job, isMine);
   $("job-describe").hidden = !isMine;
+}
+
+function amount({ phase, done, total, fraction, speed }) {
+  if (phase === "compile") return `${done} done`;
+  if (phase !== "replay") return `${Math.round(100 * fraction)} %`;
+  return `${done.toFixed(0)} of ${total.toFixed(0)} s${speed ? `, ${speed.toFixed(0)} times real time` : ""}`;
 }
 
 function place(queue) {

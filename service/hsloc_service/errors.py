@@ -37,6 +37,11 @@ def no_space(message: str) -> ServiceError:
     return ServiceError(507, "no_space", message, {"Retry-After": "60"})
 
 
+def empty_file() -> ServiceError:
+    """No bytes came, or are to come."""
+    return ServiceError(400, "empty", "the file is empty (0 bytes); copy it again, and send its bytes as the body")
+
+
 def is_disk_full(error: OperationalError) -> bool:
     """Whether SQLite or PostgreSQL failed because its disk is full, by its error code and not by its words."""
     full = getattr(error.orig, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL

@@ -25,7 +25,7 @@ from schemathesis.specs.openapi.checks import negative_data_rejection
 from hsloc_service.http import tus
 from hsloc_service.http.app import create_app
 from hsloc_service.http.openapi import describe
-from hsloc_service.http.schemas import UUID_PATTERN
+from hsloc_service.http.validation import UUID_PATTERN
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,8 +11,10 @@ import pytest
 from live_service import go_on, submit, upload, wait
 from waiting import until
 
+from hsloc_service.http.validation import IN_WORDS, TAG_PATTERN, URL_PATTERN, UUID_PATTERN
+
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from fastapi.testclient import TestClient
@@ -158,6 +160,52 @@ def test_a_request_that_does_not_fit_is_refused_with_its_place(
     answer = client.post("/v1/jobs", json={"log": upload(client), **change})
     assert answer.status_code == 422
     assert where in answer.json()["message"]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (b'{"log": bad}', "body: is no valid JSON: expecting value at character 9"),
+        (b'{"log": "a",}', "body: is no valid JSON: "),
+        (b"log=1", "body: is no valid JSON: expecting value at character 1"),
+        (b"[]", "body: must be an object of JSON, sent with Content-Type: application/json"),
+    ],
+)
+def test_a_body_that_is_no_json_is_called_that(client: TestClient, text: bytes, expected: str) -> None:
+    answer = client.post("/v1/jobs", content=text, headers={"Content-Type": "application/json"})
+    assert answer.status_code == 422
+    assert answer.json()["message"].startswith(expected)
+    assert answer.json()["details"][0]["where"] == ["body"]
+    log = [("log", ("run.mcap", b"ok"))]
+    answer = client.post("/v1/run", files=log, data={"request": '{"seed": x}'})
+    assert answer.json()["message"] == "request: is no valid JSON: expecting value at character 10"
+
+
+def test_what_an_id_or_a_name_must_be_is_said_without_a_regular_expression(client: TestClient) -> None:
+    an_id = "must be an id (a UUID in lower case), such as 3f0c1a52-"
+    for answer, where in (
+        (client.get("/v1/jobs/run.mcap"), "path.job_id"),
+        (client.get("/v1/files/7"), "path.file_id"),
+        (client.post("/v1/jobs", json={"log": "run.mcap"}), "body.log"),
+        (client.post("/v1/run", files=[("log", b"ok")], data={"request": '{"resume": "x"}'}), "request.resume"),
+    ):
+        assert (answer.status_code, answer.json()["code"]) == (422, "invalid")
+        assert answer.json()["message"].startswith(f"{where}: {an_id}")
+
+
+def test_every_pattern_of_the_api_has_words(client: TestClient) -> None:
+    def patterns(node: Any) -> Iterator[str]:
+        if isinstance(node, dict):
+            found = node.get("pattern")
+            yield from [found] if isinstance(found, str) else []
+        for each in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
+            yield from patterns(each)
+
+    found = set(patterns(client.get("/openapi.json").json()))
+    assert UUID_PATTERN in found
+    assert found <= set(IN_WORDS)
+    answer = client.post("/v1/jobs", json={"log": str(uuid.uuid4()), "tag": "A b", "webhook": "ftp://here"})
+    assert [each["what"] for each in answer.json()["details"]] == [IN_WORDS[URL_PATTERN], IN_WORDS[TAG_PATTERN]]
 
 
 def test_not_a_number_is_no_number(client: TestClient) -> None:

@@ -215,11 +215,28 @@ def test_a_body_with_a_wrong_checksum_is_not_taken(client: TestClient) -> None:
     assert append(client, begin(client, 1), 0, b"x", **{"Upload-Checksum": "crc32 AAAA"}).status_code == 400
 
 
-def test_creation_with_upload_and_empty_files(client: TestClient) -> None:
+def test_creation_with_upload(client: TestClient) -> None:
     answer = client.post("/v1/tus", content=b"abc", headers={**PATCH, "Upload-Length": "3"})
     assert (answer.status_code, answer.headers["upload-offset"]) == (201, "3")
-    empty = begin(client, 0)
-    assert client.get(empty.replace("tus", "files")).json()["state"] == "complete"
+
+
+@pytest.mark.parametrize("body", [b"", iter(())])
+def test_an_empty_file_is_refused_with_a_remedy(client: TestClient, body: Any) -> None:
+    """Stated to be empty, or found to be so at the end of a stream; a part of an upload may be."""
+    for answer in (
+        client.post("/v1/files", content=body),
+        client.put(f"/v1/files/{uuid.uuid4()}", content=body),
+        client.post("/v1/tus", headers={**TUS, "Upload-Length": "0"}),
+        client.post("/v1/tus", headers={**PATCH, "Upload-Length": "0"}, content=body),
+        client.post("/v1/run", files=[("log", ("run.mcap", b""))]),
+    ):
+        assert (answer.status_code, answer.json()["code"]) == (400, "empty")
+        assert "is empty (0 bytes); copy it again" in answer.json()["message"]
+    assert client.get("/v1/files").json()["files"] == []
+    path = begin(client, 3)
+    assert append(client, path, 0, b"").status_code == 204
+    assert append(client, path, 0, b"abc").status_code == 204
+    assert client.get(path.replace("tus", "files")).json()["state"] == "complete"
 
 
 def test_termination(client: TestClient) -> None:

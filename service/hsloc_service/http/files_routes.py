@@ -15,7 +15,8 @@ from hsloc_service.db.tables import FileRow
 from hsloc_service.errors import ServiceError
 from hsloc_service.http import metrics
 from hsloc_service.http.context import Context, Ctx, Reader, Writer, problems
-from hsloc_service.http.schemas import UUID_PATTERN, FileList, FileView
+from hsloc_service.http.schemas import FileList, FileView
+from hsloc_service.http.validation import UUID_PATTERN
 from hsloc_service.http.views import file_view
 from hsloc_service.uploads.repository import sample_log
 
@@ -33,9 +34,9 @@ Digest = Annotated[
 ]
 _BODY = {
     "requestBody": {
-        "required": False,  # on the wire, no body and a body of no bytes are one thing: an empty file
-        "description": "the bytes of the file; any size, streamed to the disk",
-        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+        "required": True,  # on the wire, no body and a body of no bytes are one thing: an empty file, which is refused
+        "description": "the bytes of the file, at least one; any size, streamed to the disk",
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary", "minLength": 1}}},
     }
 }
 

@@ -17,7 +17,6 @@ from hsloc_service.db.tables import ENDED
 from hsloc_service.errors import busy
 from hsloc_service.http.context import Context, Ctx, Reader, Writer, problems
 from hsloc_service.http.schemas import (
-    UUID_PATTERN,
     DeliveryList,
     JobDescription,
     JobList,
@@ -29,6 +28,7 @@ from hsloc_service.http.schemas import (
     Verdict,
     checked,
 )
+from hsloc_service.http.validation import KEY_PATTERN, NUMBER_PATTERN, UUID_PATTERN
 from hsloc_service.http.views import brief_view, delivery_view, job_view
 from hsloc_service.jobs.leases import place_in_queue
 from hsloc_service.jobs.repository import JobFilter, JobOrder
@@ -48,7 +48,7 @@ Key = Annotated[
     Header(
         min_length=1,
         max_length=200,
-        pattern=r"^[\x21-\x7e]+$",
+        pattern=KEY_PATTERN,
         description="a text that you choose: the same request sent again with it makes no second job",
     ),
 ]
@@ -182,7 +182,7 @@ async def events(
     who: Reader,
     job_id: JobId,
     after: Annotated[int, Query(ge=0, le=2**62, description="id of the last event that you saw")] = 0,
-    last_event_id: Annotated[str | None, Header(pattern=r"^[0-9]{1,18}$")] = None,
+    last_event_id: Annotated[str | None, Header(pattern=NUMBER_PATTERN)] = None,
     follow: Annotated[bool, Query(description="wait for more until the job has ended")] = True,
 ) -> StreamingResponse:
     """Events after the cursor (`after`, or Last-Event-ID), then those that come, until the job has ended."""

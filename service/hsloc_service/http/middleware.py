@@ -28,6 +28,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from hsloc_service.errors import ServiceError, StoreError, is_disk_full
 from hsloc_service.http import metrics
 from hsloc_service.http.guard import problem
+from hsloc_service.http.validation import in_words
 from hsloc_service.logs import log
 
 if TYPE_CHECKING:
@@ -179,7 +180,8 @@ def add_error_handlers(app: FastAPI, storage: Storage, routes: Sequence[BaseRout
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> Response:
-        details = [{"where": [str(p) for p in each["loc"]], "what": each["msg"]} for each in error.errors()][:50]
+        found = [in_words(each) for each in error.errors()[:50]]
+        details = [{"where": where, "what": what} for where, what in found]
         first = details[0] if details else {"where": [], "what": "invalid"}
         message = f"{'.'.join(first['where'])[:200]}: {first['what'][:500]}"
         return _answer(422, "invalid", message, _closing(request, {}), details)

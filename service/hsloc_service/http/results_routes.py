@@ -15,6 +15,7 @@ from hsloc_service.errors import BrokenAnswer, ServiceError, StoreError, not_fou
 from hsloc_service.http.context import Context, Ctx, Reader, problems
 from hsloc_service.http.jobs_routes import JobId
 from hsloc_service.http.schemas import AssetView, Manifest
+from hsloc_service.http.validation import ASSET_PATTERN
 from hsloc_service.results.store import BLOCK, MEDIA_TYPES
 from hsloc_service.storage import safe_name
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from hsloc_service.results.store import AssetReader
 
 router = APIRouter(prefix="/v1/jobs", tags=["results"])
-AssetName = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$", examples=["trajectory.tum"])]
+AssetName = Annotated[str, Path(pattern=ASSET_PATTERN, examples=["trajectory.tum"])]
 SANDBOX = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 )

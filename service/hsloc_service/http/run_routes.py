@@ -15,6 +15,7 @@ from hsloc_service import config_schema as options
 from hsloc_service.errors import ServiceError
 from hsloc_service.http.context import Context, Ctx, Writer, problems
 from hsloc_service.http.schemas import ALIGNED, MAX_LOGS, JobRequest, JobView, RunRequest, checked
+from hsloc_service.http.validation import no_json
 from hsloc_service.http.views import job_view
 from hsloc_service.stored_request import MAPS, UPLOADS, plain
 
@@ -30,7 +31,7 @@ IMAGES = {name: f"{name}_image" for name in MAPS}
 FILES = ("log", *IMAGES, *IMAGES.values(), *UPLOADS)
 FIELD_BYTES = 64 << 10
 HEADER_BYTES = 8 << 10
-_FILE = {"type": "string", "contentMediaType": "application/octet-stream"}
+_FILE = {"type": "string", "contentMediaType": "application/octet-stream", "minLength": 1}
 _BODY = {
     "requestBody": {
         "required": True,
@@ -105,8 +106,10 @@ def _request(text: bytes, files: dict[str, list[str]]) -> JobRequest:
             raise ServiceError(422, "invalid", f"a map is two files: `{name}` (YAML) and `{image}`")
     try:
         found = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ServiceError(422, "invalid", f"request: {no_json(error.msg, error.pos)}") from error
     except (ValueError, RecursionError) as error:
-        raise ServiceError(422, "invalid", "`request` is not JSON") from error
+        raise ServiceError(422, "invalid", "request: is no valid JSON in UTF-8") from error
     values, logs = checked(RunRequest, found).model_dump(exclude_unset=True), files["log"]
     values |= {"log": logs[0]} if len(logs) == 1 else {"logs": logs}
     values |= {

@@ -21,15 +21,14 @@ from pydantic_core import PydanticCustomError
 from hsloc.options import offered
 from hsloc_service.config_schema import whole
 from hsloc_service.errors import ServiceError
+from hsloc_service.http.validation import EXAMPLE_ID, TAG_PATTERN, URL_PATTERN, UUID_PATTERN, WORD_PATTERN, in_words
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from hsloc.options import Option
 
-TAG_PATTERN = r"^[a-z0-9][a-z0-9-]{0,39}$"
-UUID_PATTERN = r"^[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}$"
-Ident = Annotated[str, Field(pattern=UUID_PATTERN, examples=["3f0c1a52-8f5d-4c3b-9a51-0d6f0c1d2e3f"])]
+Ident = Annotated[str, Field(pattern=UUID_PATTERN, examples=[EXAMPLE_ID])]
 PoseList = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3, examples=[[1.0, 2.0, 0.0]])]
 MAX_LOGS = 64
 UNIQUE: dict[str, Any] = {"uniqueItems": True}
@@ -130,7 +129,7 @@ class _Common(Strict):
     """What is no option of `hsloc replay`, of a job and of one that is run again."""
 
     read: ReadRequest | None = None  # type: ignore[valid-type]
-    webhook: Annotated[str, Field(max_length=2000, pattern=r"^https?://[^\s]+$")] | None = Field(
+    webhook: Annotated[str, Field(max_length=2000, pattern=URL_PATTERN)] | None = Field(
         default=None, description="URL that is called when the job has ended"
     )
     tag: Annotated[str, Field(pattern=TAG_PATTERN)] | None = Field(
@@ -244,7 +243,7 @@ Verdict = Literal["good", "check", "failed"]
 State = Literal["queued", "running", "cancelling", "succeeded", "failed", "crashed", "cancelled"]
 
 
-Word = Annotated[str, Field(pattern=r"^[^\s,]([^,\x00-\x1f]{0,38}[^\s,])?$")]
+Word = Annotated[str, Field(pattern=WORD_PATTERN)]
 
 
 class JobDescription(Strict):
@@ -380,9 +379,8 @@ def checked(kind: type[Request], values: Any) -> Request:
         found: Request = kind.model_validate(values)
         return found
     except ValidationError as error:
-        first = error.errors()[0]
-        where = "".join(f".{part}" for part in first["loc"])
-        raise ServiceError(422, "invalid", f"request{where}: {first['msg']}") from error
+        where, what = in_words(error.errors()[0])
+        raise ServiceError(422, "invalid", f"{'.'.join(('request', *where))}: {what}") from error
 
 
 def moment(seconds: float | None) -> datetime | None:

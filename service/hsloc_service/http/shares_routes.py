@@ -13,7 +13,8 @@ from hsloc_service.http.context import Ctx, Reader, Visitor, Writer, problems
 from hsloc_service.http.guard import SHARED_PREFIX
 from hsloc_service.http.jobs_routes import JobId
 from hsloc_service.http.results_routes import AssetName, assets_of, file_answer, manifest_of
-from hsloc_service.http.schemas import UUID_PATTERN, Ident, JobView, Manifest, Strict, known_moment
+from hsloc_service.http.schemas import Ident, JobView, Manifest, Strict, known_moment
+from hsloc_service.http.validation import SECRET_PATTERN, UUID_PATTERN
 from hsloc_service.http.views import shared_view
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 router = APIRouter(tags=["shares"])
 ShareId = Annotated[str, Path(pattern=UUID_PATTERN, description="id of a link")]
-Secret = Annotated[str, Path(pattern=r"^hss_[A-Za-z0-9_-]{43}$")]
+Secret = Annotated[str, Path(pattern=SECRET_PATTERN)]
 DAY_S = 86400.0
 CORS = {
     "Access-Control-Allow-Origin": "*",

@@ -15,7 +15,6 @@ from hsloc_service.http.context import Ctx, Reader, Writer, problems
 from hsloc_service.http.jobs_routes import Key
 from hsloc_service.http.schemas import (
     UNIQUE,
-    UUID_PATTERN,
     Config,
     Ident,
     JobRequest,
@@ -25,6 +24,7 @@ from hsloc_service.http.schemas import (
     checked,
     known_moment,
 )
+from hsloc_service.http.validation import RUN_PATTERN, UUID_PATTERN
 from hsloc_service.jobs.sweeps import SweepJob, SweepState
 from hsloc_service.stored_request import plain
 
@@ -32,7 +32,7 @@ router = APIRouter(prefix="/v1/sweeps", tags=["sweeps"])
 SweepId = Annotated[str, Path(pattern=UUID_PATTERN, description="id of a sweep")]
 MAX_EACH = 1000
 CLOSED: dict[str, Any] = {"additionalProperties": False}
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9=._,+-]{0,99}$")]
+Name = Annotated[str, Field(pattern=RUN_PATTERN)]
 Seed = Annotated[int, Field(ge=0, le=2**53 - 1), BeforeValidator(whole)]
 
 

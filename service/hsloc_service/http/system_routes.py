@@ -21,13 +21,13 @@ from hsloc_service.errors import ServiceError, not_found
 from hsloc_service.http import metrics
 from hsloc_service.http.context import Admin, Context, Ctx, Reader, problems
 from hsloc_service.http.schemas import (
-    UUID_PATTERN,
     Ident,
     LabelList,
     Problem,
     SecretView,
     known_moment,
 )
+from hsloc_service.http.validation import UUID_PATTERN
 from hsloc_service.jobs.workers import alive_workers, workers
 from hsloc_service.uploads.repository import used_bytes
 from hsloc_service.webhooks import secret_of

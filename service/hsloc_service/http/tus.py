@@ -18,6 +18,7 @@ from hsloc_service.errors import ServiceError
 from hsloc_service.http import metrics
 from hsloc_service.http.context import Ctx, Reader, Writer, problems
 from hsloc_service.http.files_routes import FileId
+from hsloc_service.http.validation import NUMBER_PATTERN
 
 VERSION = "1.0.0"
 EXTENSIONS = "creation,creation-with-upload,checksum,expiration,termination"
@@ -32,12 +33,13 @@ CHECKSUMS = ("^sha1 [A-Za-z0-9+/]{27}=$", "^sha256 [A-Za-z0-9+/]{43}=$", "^md5 [
 
 # The protocol has answers of its own for these (412, 400), so they are described here and checked by hand.
 Resumable = Annotated[str | None, Header(alias="Tus-Resumable", include_in_schema=False)]
-Number = Annotated[str | None, Header(pattern=r"^[0-9]{1,18}$", include_in_schema=False)]
+Number = Annotated[str | None, Header(pattern=NUMBER_PATTERN, include_in_schema=False)]
 Text = Annotated[str | None, Header(max_length=4096, include_in_schema=False)]
-_NUMBER = {"type": "string", "pattern": "^[0-9]{1,18}$"}
+_NUMBER = {"type": "string", "pattern": NUMBER_PATTERN}
+_SIZE = {"type": "string", "pattern": "^[1-9][0-9]{0,17}$"}
 _HEADERS: dict[str, dict[str, Any]] = {
     "Tus-Resumable": {"required": True, "example": VERSION, "schema": {"type": "string", "enum": [VERSION]}},
-    "Upload-Length": {"required": True, "example": "1929453", "schema": _NUMBER},
+    "Upload-Length": {"required": True, "example": "1929453", "schema": _SIZE},
     "Upload-Offset": {"required": True, "example": "0", "schema": _NUMBER},
     "Upload-Metadata": {
         "required": False,
@@ -113,7 +115,7 @@ async def create(
     size = int(upload_length)
     row = await to_thread.run_sync(ctx.files.create, who, name, size)
     content = request.headers.get("content-type") == OFFSET_TYPE
-    if content or size == 0:
+    if content:
         with ctx.receiver.writer(row.id):
             row = await ctx.receiver.append(who, row.id, 0, request.stream(), checksum)
     headers = _headers(row)

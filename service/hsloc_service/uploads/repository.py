@@ -16,7 +16,7 @@ from hsloc.version import __version__
 from hsloc_service.audit import note
 from hsloc_service.db.database import clock
 from hsloc_service.db.tables import ACTIVE, FileRow, JobRow, UploadPartRow
-from hsloc_service.errors import ServiceError, busy, conflict, no_space, not_found
+from hsloc_service.errors import ServiceError, busy, conflict, empty_file, no_space, not_found
 from hsloc_service.results.deletion_queue import delete_upload
 from hsloc_service.stored_request import files_of
 
@@ -52,7 +52,8 @@ class Files:
     def create(self, who: Principal, name: str, size: int | None, file_id: str | None = None) -> FileRow:
         """A row for an upload of `size` bytes (None: not known yet), which are reserved.
 
-        Raises ServiceError 413 for too much, 507 where disk or quota do not suffice, 409 for an id that is taken.
+        Raises ServiceError 400 for an empty file, 413 for too much, 507 where disk or quota do not suffice, 409 for an
+        id that is taken.
         """
         if size is not None:
             self.need_size(size)
@@ -77,7 +78,9 @@ class Files:
         return row
 
     def need_size(self, size: int) -> None:
-        """Raises ServiceError 413 for a file larger than any that is taken."""
+        """Raises ServiceError 400 for an empty file, 413 for one larger than any that is taken."""
+        if size == 0:
+            raise empty_file()
         if size > self.settings.max_upload_bytes:
             raise ServiceError(
                 413, "too_large", f"it has {size} bytes; at most {self.settings.max_upload_bytes} are taken"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from anyio import to_thread
 from starlette.requests import ClientDisconnect
 
-from hsloc_service.errors import ServiceError, conflict, no_space
+from hsloc_service.errors import ServiceError, conflict, empty_file, no_space
 from hsloc_service.logs import log
 from hsloc_service.results.upload_parts import Staging
 from hsloc_service.storage import hash_file, sync_folder
@@ -85,7 +85,10 @@ class UploadReceiver:
         return row
 
     async def finish(self, file_id: str) -> FileRow:
-        """All bytes are there: note size and sha256, computed on the way or (after a restart) from the file."""
+        """All bytes are there: note size and sha256, computed on the way or (after a restart) from the file.
+
+        Raises ServiceError 400 where there are none, of an upload that did not state its size.
+        """
         path, parts = self._files.storage.upload_path(file_id), self._files.parts
         digest, counted = self._hashes.pop(file_id, (None, -1))
 
@@ -93,6 +96,8 @@ class UploadReceiver:
             return path.stat().st_size if parts is None else sum(part.size for part in parts.of(file_id))
 
         size = await to_thread.run_sync(size_of)
+        if size == 0:
+            raise empty_file()
         if digest is not None and counted == size:
             sha256 = digest.hexdigest()
         elif parts is None:

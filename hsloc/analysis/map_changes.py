@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from hsloc.localisation.states import StateRows
     from hsloc.model.events import Scan
 
     F64 = NDArray[np.float64]
@@ -79,6 +80,17 @@ class SeenChanges:
             for first, last in spans
             if last - first + 1 >= _FEWEST_SCANS
         ]
+
+
+def with_changes(rows: StateRows, stamps_ns: NDArray[np.int64], changes: SeenChanges) -> StateRows:
+    """The rows at n stamps (n,), of which those that are localised say where the map has changed, and how much."""
+    reasons = list(rows.reason)
+    for begin, end in changes.hidden_spans_ns():
+        for row in np.flatnonzero((stamps_ns >= begin) & (stamps_ns <= end) & rows.is_localised()).tolist():
+            share = float(np.interp(stamps_ns[row], changes.stamps_ns, changes.hidden))
+            text = f"the map has changed here: {100.0 * share:.0f} % of the beams end at things that it lacks"
+            reasons[row] = f"{reasons[row]}; {text}" if reasons[row] else text
+    return replace(rows, reason=tuple(reasons))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hsloc.analysis.analyse import Analysis, analyse
+from hsloc.analysis.map_changes import with_changes
 from hsloc.analysis.metrics import run_timings
 from hsloc.atomic_write import whole_folder
 from hsloc.dataclass_json import to_json
@@ -117,7 +118,10 @@ def _write(result: Result, folder: Path, progress: Callable[[float], None] | Non
     begin = time.perf_counter()
     write_tum(folder / "trajectory.tum", result.trajectory)
     if result.states is not None:
-        write_states(folder / "states.csv", result.trajectory.stamps_ns, result.states)
+        stamps, states, changes = result.trajectory.stamps_ns, result.states, analysis.map_changes
+        write_states(
+            folder / "states.csv", stamps, states if changes is None else with_changes(states, stamps, changes)
+        )
     if result.ambiguities:
         write_hypotheses(folder / "hypotheses.csv", result.ambiguities)
     if analysis.map_changes is not None and analysis.map_changes.changes:

@@ -13,12 +13,14 @@ import pytest
 from paths import RECORDINGS
 
 from hsloc.analysis import map_changes
-from hsloc.analysis.map_changes import GONE, HIDDEN, MapChangeFinder, SeenChanges
+from hsloc.analysis.map_changes import GONE, HIDDEN, MapChangeFinder, SeenChanges, with_changes
 from hsloc.analysis.quality import change_warnings
 from hsloc.evaluation.maps import MapChange
 from hsloc.export.results_folder import write_results
+from hsloc.localisation.states import StateRows
 from hsloc.maps import load_map, save_map
 from hsloc.model import OccupancyGrid, Pose2, Scan, Trajectory
+from hsloc.model.estimate import State
 from hsloc.replay.run import run
 from hsloc.simulation.built_in import built_in
 from hsloc.warnings import WarningCode
@@ -173,6 +175,16 @@ def test_a_map_that_is_out_of_date_is_warned_of(hidden: list[float], gone: float
     assert [each.text for each in found] == ([f"the map has changed: {text}"] if text else [])
     assert all(each.code == WarningCode.MAP_CHANGED for each in found)
     assert change_warnings(None, trajectory) == []
+
+
+def test_poses_say_where_the_map_has_changed() -> None:
+    stamps = np.arange(6, dtype=np.int64) * 1_000_000_000
+    states = (*[State.LOCALISED] * 3, State.LOST, State.LOCALISED, State.LOCALISED)
+    rows = StateRows(states, np.ones(6), np.zeros((6, 3)), np.ones(6), ("", "", "by the odometry alone", "", "", ""))
+    found = with_changes(rows, stamps, changes_with([0.0, 0.2, 0.3, 0.4, 0.3, 0.1], 0.0))
+    text = "the map has changed here: {} % of the beams end at things that it lacks"
+    both = f"by the odometry alone; {text.format(30)}"
+    assert found.reason == ("", text.format(20), both, "", text.format(30), "")
 
 
 @pytest.fixture(scope="module")

@@ -48,6 +48,8 @@ _THIN = 3.0
 """What is this many times as long as wide is thin."""
 _MIN_SIZE_M = 0.3
 """Smallest change, as of `hsloc diff`."""
+_OUTLINE_M = 0.5
+"""Length of the outline that a change shows, at least: that of a box of 0.3 m from two sides is 0.6 m."""
 HIDDEN = 0.2
 """Part of a scan's beams that end at things the map does not have, from which on it is told: the usual fitness of 0.93
 is then below 0.75, where a match begins to be doubtful."""
@@ -212,10 +214,12 @@ def _things(grid: OccupancyGrid, appeared: Bools, vanished: Bools) -> tuple[NDAr
     labels = np.zeros(grid.cells.shape, dtype=np.int32)
     things: list[MapChange] = []
     for kind, mask in (("appeared", appeared), ("vanished", vanished)):
+        if int(mask.sum()) * grid.resolution < _OUTLINE_M:
+            continue
         found, numbers = changed_things(grid, mask, kind, _MIN_SIZE_M)  # type: ignore[arg-type]
         # A thing shows a line of cells across it, at least: what is scattered is the rim of something, or noise.
-        dense = [0, *(k if one.cells * grid.resolution >= one.size else 0 for k, one in enumerate(found, start=1))]
-        number_of = np.cumsum(np.array(dense) > 0) * (np.array(dense) > 0)
+        dense = np.array([False, *(one.cells * grid.resolution >= max(one.size, _OUTLINE_M) for one in found)])
+        number_of = np.cumsum(dense) * dense
         numbers = np.where(number_of > 0, number_of + len(things), 0)[numbers]
         labels[numbers > 0] = numbers[numbers > 0]
         things += [one for one, number in zip(found, number_of[1:], strict=True) if number]

@@ -48,8 +48,8 @@ class Parts:
         return Leases(self.database, lease_s, RetryPolicy(max_attempts))
 
     def submit(self, who: Principal = ANYBODY, **options: Any) -> str:
-        file = self.files.create(who, "run.mcap", 0)
-        self.files.complete(file.id, 0, "00")
+        file = self.files.create(who, "run.mcap", 1)
+        self.files.complete(file.id, 1, "00")
         return self.jobs.submit(who, {"log": file.id, "map": None, **options}).job.id
 
 
@@ -233,8 +233,8 @@ def test_of_many_claims_at_once_each_gets_a_job_of_its_own(parts: Parts) -> None
 
 
 def test_of_many_submissions_with_one_key_at_once_one_makes_a_job(parts: Parts) -> None:
-    file = parts.files.create(ANYBODY, "run.mcap", 0)
-    parts.files.complete(file.id, 0, "00")
+    file = parts.files.create(ANYBODY, "run.mcap", 1)
+    parts.files.complete(file.id, 1, "00")
     with ThreadPoolExecutor(6) as pool:
         made = list(pool.map(lambda _: parts.jobs.submit(ANYBODY, {"log": file.id, "map": None}, "key"), range(12)))
     assert len({submitted.job.id for submitted in made}) == 1
@@ -243,8 +243,8 @@ def test_of_many_submissions_with_one_key_at_once_one_makes_a_job(parts: Parts) 
 
 def test_of_many_submissions_at_once_no_more_wait_than_allowed(parts: Parts) -> None:
     jobs = replace(parts.jobs, settings=replace(parts.jobs.settings, max_queued=3))
-    file = parts.files.create(ANYBODY, "run.mcap", 0)
-    parts.files.complete(file.id, 0, "00")
+    file = parts.files.create(ANYBODY, "run.mcap", 1)
+    parts.files.complete(file.id, 1, "00")
 
     def submit_one(_: int) -> int | None:
         try:
@@ -288,8 +288,8 @@ def test_a_worker_that_stops_while_the_database_is_away_gives_its_job_back(tmp_p
 
 
 def test_a_job_with_a_tag_waits_for_a_worker_that_has_it(parts: Parts) -> None:
-    file = parts.files.create(ANYBODY, "run.mcap", 0)
-    parts.files.complete(file.id, 0, "00")
+    file = parts.files.create(ANYBODY, "run.mcap", 1)
+    parts.files.complete(file.id, 1, "00")
     large = parts.jobs.submit(ANYBODY, {"log": file.id, "map": None, "tag": "big-memory"}).job.id
     small = parts.submit()
     leases = parts.leases()
@@ -299,7 +299,7 @@ def test_a_job_with_a_tag_waits_for_a_worker_that_has_it(parts: Parts) -> None:
 
 
 def test_a_text_that_postgresql_does_not_take(parts: Parts) -> None:
-    file = parts.files.create(ANYBODY, "a\0b.mcap", 0)
+    file = parts.files.create(ANYBODY, "a\0b.mcap", 1)
     assert parts.files.get(ANYBODY, file.id).name == "ab.mcap"
     assert parse_line(b'{"failed": "a\\u0000b"}') == {"failed": "a\ufffdb"}
 

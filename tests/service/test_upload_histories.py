@@ -75,7 +75,7 @@ class Histories(RuleBasedStateMachine):
         expected = 404 if model.gone else 409 if model.whole else status
         assert answer.status_code == expected, answer.text
 
-    @rule(target=uploads, size=st.integers(0, 100))
+    @rule(target=uploads, size=st.integers(1, 100))
     def create(self, size: int) -> str:
         path = begin(self.client, size)
         self.models[path] = Model(size)

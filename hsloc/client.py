@@ -80,7 +80,7 @@ class Client:
             with path.open("rb") as file:
                 size = file.seek(0, 2)
                 if size == 0:
-                    raise ClientError(f"{path}: is empty (0 bytes); copy it again, or record anew")
+                    raise ClientError(f"{path}: is empty (0 bytes); copy it again, or record again")
                 name = base64.b64encode(path.name.encode()).decode()
                 headers = {**TUS, "Upload-Length": str(size), "Upload-Metadata": f"filename {name}"}
                 place = self.request("POST", "/v1/tus", headers=headers).headers["Location"]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.evaluation.maps import TOLERANCE_M, MapChange, changed_things
+from hsloc.evaluation.maps import MIN_SIZE_M, TOLERANCE_M, MapChange, changed_things, largest_first
 from hsloc.kernels.changed_cells import count_beams, count_scan
 from hsloc.kernels.score_field import wall_distances
 from hsloc.model.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -46,15 +46,11 @@ _STANDS, _GONE = 0.5, 0.2
 """What stands is met by this part of the scans that see its place, or more; what is gone by the second, or less."""
 _THIN = 3.0
 """What is this many times as long as wide is thin."""
-_MIN_SIZE_M = 0.3
-"""Smallest change, as of `hsloc diff`."""
 _OUTLINE_M = 0.5
 """Length of the outline that a change shows, at least: that of a box of 0.3 m from two sides is 0.6 m."""
 HIDDEN = 0.2
-"""Part of a scan's beams that end at things the map does not have, from which on it is told: the usual fitness of 0.93
-is then below 0.75, where a match begins to be doubtful."""
-GONE = 0.2
-"""Part of the seen walls that is gone, from which on it is told: the limit of `hsloc diff`."""
+"""Part of a scan's beams that end at things the map does not have, from which on there is a warning: the usual
+fitness of 0.93 is then below 0.75, where a match begins to be doubtful."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,8 +84,9 @@ def with_changes(rows: StateRows, stamps_ns: NDArray[np.int64], changes: SeenCha
     """The rows at n stamps (n,), of which those that are localised say where the map has changed, and how much."""
     reasons = list(rows.reason)
     for begin, end in changes.hidden_spans_ns():
-        for row in np.flatnonzero((stamps_ns >= begin) & (stamps_ns <= end) & rows.is_localised()).tolist():
-            share = float(np.interp(stamps_ns[row], changes.stamps_ns, changes.hidden))
+        within = np.flatnonzero((stamps_ns >= begin) & (stamps_ns <= end) & rows.is_localised())
+        shares = np.interp(stamps_ns[within], changes.stamps_ns, changes.hidden)
+        for row, share in zip(within.tolist(), shares.tolist(), strict=True):
             text = f"the map has changed here: {100.0 * share:.0f} % of the beams end at things that it lacks"
             reasons[row] = f"{reasons[row]}; {text}" if reasons[row] else text
     return replace(rows, reason=tuple(reasons))
@@ -147,14 +144,16 @@ class MapChangeFinder:
         kept = [replace(one, origin=one.origin - low, ends=one.ends - low.astype(np.float32)) for one in self._kept]
         appeared, vanished, walls_seen = _changed_cells(grid, kept)
         labels, things = _things(grid, appeared, vanished)
-        along = np.array([(0.0, 0.0), *(_along(labels == k) for k in range(1, len(things) + 1))])
+        cells = np.argwhere(labels)
+        of = labels[labels > 0]
+        along = np.array([(0.0, 0.0), *(_along(cells[of == k]) for k in range(1, len(things) + 1))])
         is_new = np.array([False, *(each.kind == "appeared" for each in things)])
         shown, hidden = _when(labels, along, is_new, kept, _MARGIN_M / grid.resolution)
         often = shown[:, 0] >= _FEWEST_SCANS
         kinds = np.where(often, np.where(is_new, OCCUPIED, FREE), UNKNOWN).astype(np.int8)
         layer = np.full(self._grid.cells.shape, UNKNOWN, dtype=np.int8)
         layer[low[1] : high[1], low[0] : high[0]] = kinds[labels]
-        order = sorted(np.flatnonzero(often).tolist(), key=lambda k: _rank(things[k - 1]))
+        order = sorted(np.flatnonzero(often).tolist(), key=lambda k: largest_first(things[k - 1]))
         return SeenChanges(
             changes=tuple(things[k - 1] for k in order),
             spans_ns=shown[order, 1:],
@@ -216,7 +215,7 @@ def _things(grid: OccupancyGrid, appeared: Bools, vanished: Bools) -> tuple[NDAr
     for kind, mask in (("appeared", appeared), ("vanished", vanished)):
         if int(mask.sum()) * grid.resolution < _OUTLINE_M:
             continue
-        found, numbers = changed_things(grid, mask, kind, _MIN_SIZE_M)  # type: ignore[arg-type]
+        found, numbers = changed_things(grid, mask, kind, MIN_SIZE_M)  # type: ignore[arg-type]
         # A thing shows a line of cells across it, at least: what is scattered is the rim of something, or noise.
         dense = np.array([False, *(one.cells * grid.resolution >= max(one.size, _OUTLINE_M) for one in found)])
         number_of = np.cumsum(dense) * dense
@@ -226,15 +225,10 @@ def _things(grid: OccupancyGrid, appeared: Bools, vanished: Bools) -> tuple[NDAr
     return labels, things
 
 
-def _along(cells: Bools) -> tuple[float, float]:
-    """Unit vector (column, row) along cells (h, w) that are far longer than wide; zeros for others."""
-    rows, columns = np.nonzero(cells)
-    values, vectors = np.linalg.eigh(np.cov(np.stack((columns, rows)), bias=True) + np.eye(2) / 12.0)
+def _along(cells: NDArray[np.int64]) -> tuple[float, float]:
+    """Unit vector (column, row) along cells (n, 2), row and column, that are far longer than wide; else zeros."""
+    values, vectors = np.linalg.eigh(np.cov(cells.T[::-1], bias=True) + np.eye(2) / 12.0)
     return (float(vectors[0, 1]), float(vectors[1, 1])) if values[1] > _THIN**2 * values[0] else (0.0, 0.0)
-
-
-def _rank(change: MapChange) -> tuple[float, float, float]:
-    return -change.size, change.x, change.y
 
 
 def _when(

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.analysis.map_changes import GONE, HIDDEN
+from hsloc.analysis.map_changes import HIDDEN
 from hsloc.evaluation.association import interpolate_poses
+from hsloc.evaluation.maps import MOST_GONE
 from hsloc.localisation.mounting_error import mounting_error_of_steps
 from hsloc.localisation.states import localisation_reasons
 from hsloc.model.pose2 import Pose2
@@ -241,7 +242,7 @@ def change_warnings(changes: SeenChanges | None, trajectory: Trajectory) -> list
         times = ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in spans[:_MOST_NAMED])
         more = f" and {len(spans) - _MOST_NAMED} more" if len(spans) > _MOST_NAMED else ""
         text.append(f"{100 * HIDDEN:.0f} % of the beams and more end at things that it lacks, from {times}{more}")
-    if changes.gone >= GONE:
+    if changes.gone >= MOST_GONE:
         text.append(f"{100 * changes.gone:.0f} % of its walls that were seen are gone")
     if not text:
         return []

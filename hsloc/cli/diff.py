@@ -18,9 +18,6 @@ EXAMPLES = """
   hsloc diff map.yaml results/run --json                a floor plan and a map in its frame
 """
 _MOST_LINES = 20
-_MOST_GONE = 0.2
-"""Part of the walls that vanishes when a building is rebuilt, or when two frames are taken for one: of maps of one log
-at most 0.05, of one that is 2 % too large 0.37 and more, of five other buildings 0.63 and more."""
 _GREEN, _RED = (0, 150, 60), (210, 30, 30)
 
 
@@ -43,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from hsloc.dataclass_json import to_json
     from hsloc.errors import MapError
-    from hsloc.evaluation.maps import map_changes
+    from hsloc.evaluation.maps import MOST_GONE, map_changes
     from hsloc.replay.map_and_start import load_grid
     from hsloc.replay.map_merge import merge_maps
 
@@ -59,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     if arguments.png:
         _draw(Path(arguments.png), first, found)
-    if not arguments.align and found.gone > _MOST_GONE:
+    if not arguments.align and found.gone > MOST_GONE:
         text = (
             f"{100.0 * found.gone:.0f} % of the walls of {arguments.first} that lie in {arguments.second} are free "
             "ground there: is it the same building, and are both in one frame? see --align"

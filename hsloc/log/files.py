@@ -172,7 +172,7 @@ def why_no_text_log(path: Path) -> str:
     if is_packed(head):
         head = unpacked_head(path, head)
         if not head:
-            return "nothing of it can be unpacked; copy it again, or record anew"
+            return "nothing of it can be unpacked; copy it again, or record again"
     return why_no_log(path, head)
 
 

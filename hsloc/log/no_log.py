@@ -15,7 +15,7 @@ NO_LOG = (
     "is not an MCAP, a ROS bag or a CARMEN log; name the recording: a .mcap, .db3 or .bag file, a CARMEN or Wean Hall "
     "text, or the folder with its parts"
 )
-EMPTY = "is empty (0 bytes); copy it again, or record anew"
+EMPTY = "is empty (0 bytes); copy it again, or record again"
 COPY_AGAIN = "copy the file again, if the copy was cut off"
 _SQLITE_PAGE_AT, _SQLITE_PAGES_AT = 16, 28
 _MAX_FOLDERS = 1000

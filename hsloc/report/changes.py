@@ -25,10 +25,12 @@ _MOST_CELLS = 4000
 
 def change_marks(changes: SeenChanges | None, start_ns: int, most: int) -> list[dict[str, Any]]:
     """For each kind that there is the largest of its things, at most `most`, and when a scan showed each first."""
+    if changes is None:
+        return []
     found = []
     for kind, words in CHANGE_WORDS.items():
-        rows = [] if changes is None else [k for k, each in enumerate(changes.changes) if each.kind == kind][:most]
-        if changes is None or not rows:
+        rows = [k for k, each in enumerate(changes.changes) if each.kind == kind][:most]
+        if not rows:
             continue
         things, spans = [changes.changes[k] for k in rows], since(changes.spans_ns[rows], start_ns)
         x, y = np.array([each.x for each in things]), np.array([each.y for each in things])

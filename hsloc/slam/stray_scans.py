@@ -18,7 +18,7 @@ from hsloc.model.pose2 import IDENTITY, Pose2, rotated
 from hsloc.model.verdict import spans_of
 from hsloc.slam.pair_sums import summed_at
 from hsloc.slam.refinement import near_the_end, refine_map, silent
-from hsloc.slam.scan_registration import MovingScan, StoredScans, register_onto
+from hsloc.slam.scan_registration import MovingScan, ScanRegistration, StoredScans, register_onto
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from hsloc.slam.map_session import MapSession
     from hsloc.slam.parameters import GraphMapperParameters
     from hsloc.slam.pose_graph import Edges
-    from hsloc.slam.scan_registration import ScanRegistration
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
@@ -124,24 +123,22 @@ def _placed_in_turn(session: MapSession, poses: F64, first: int, last: int) -> F
     around = range(max(first - _AROUND, 0), min(last + 1 + _AROUND, len(poses)))
     scans = {k: MovingScan.of(session.scans.prepared(k)) for k in around}
     placed, stored = poses.copy(), StoredScans()
-    before, after = first - 1, last + 1
-    while after - before > 1:
-        found = [
-            (k, each)
-            for end, side in ((before, 1), (after, -1))
-            for k, each in _beside(session, placed, scans, (end, side), stored)
-        ]
-        k, best = max(found, key=lambda each: each[1].agreement)
-        placed[k] = best.pose.to_array()
-        before, after = (k, after) if k == before + 1 else (before, k)
+    ends, found = {1: first - 1, -1: last + 1}, dict[int, ScanRegistration]()
+    while ends[-1] - ends[1] > 1:
+        for side, end in ends.items():
+            if side not in found:  # what was found on the other side still holds
+                found[side] = _beside(session, placed, scans, (end, side), stored)
+        side = max(ends, key=lambda each: found[each].agreement)
+        ends[side] += side
+        placed[ends[side]] = found.pop(side).pose.to_array()
     near = np.hypot(*(placed - poses)[first : last + 1, :2].T) <= _FOUND_M
     return np.where(near[:, None], poses[first : last + 1], placed[first : last + 1])
 
 
 def _beside(
     session: MapSession, poses: F64, scans: dict[int, MovingScan], at: tuple[int, int], stored: StoredScans
-) -> list[tuple[int, ScanRegistration]]:
-    """The keyscan on one `side` (1 or -1) of the keyscan `end`, which has its place, registered from several starts.
+) -> ScanRegistration:
+    """The keyscan on one `side` (1 or -1) of the keyscan `end`, which has its place: the best of several starts.
 
     These are a step as the odometry has it, none, the last one again, and that of the odometry the other way round.
     """
@@ -155,7 +152,8 @@ def _beside(
     starts = [step, IDENTITY, turn, Pose2(-step.x, -step.y, step.theta)]
     if len(near) > 1:
         starts.append(Pose2.from_array(poses[near[1]]).between(here))
-    return [(k, register_onto(still, (scans[k],), here @ start, here @ turn, _ANYWHERE, stored)) for start in starts]
+    found = [register_onto(still, (scans[k],), here @ start, here @ turn, _ANYWHERE, stored) for start in starts]
+    return max(found, key=lambda each: each.agreement)
 
 
 def _agreement(refined: Registration) -> F64:

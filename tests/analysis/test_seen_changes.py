@@ -13,9 +13,9 @@ import pytest
 from paths import RECORDINGS
 
 from hsloc.analysis import map_changes
-from hsloc.analysis.map_changes import GONE, HIDDEN, MapChangeFinder, SeenChanges, with_changes
+from hsloc.analysis.map_changes import HIDDEN, MapChangeFinder, SeenChanges, with_changes
 from hsloc.analysis.quality import change_warnings
-from hsloc.evaluation.maps import MapChange
+from hsloc.evaluation.maps import MOST_GONE, MapChange
 from hsloc.export.results_folder import write_results
 from hsloc.localisation.states import StateRows
 from hsloc.maps import load_map, save_map
@@ -165,8 +165,8 @@ def changes_with(hidden: list[float], gone: float) -> SeenChanges:
             0.0,
             "20 % of the beams and more end at things that it lacks, from 1.0 to 3.0 s",
         ),
-        ([0.0] * 5, GONE, "20 % of its walls that were seen are gone"),
-        ([0.0, HIDDEN, HIDDEN, 0.0, HIDDEN], 0.9 * GONE, ""),
+        ([0.0] * 5, MOST_GONE, "20 % of its walls that were seen are gone"),
+        ([0.0, HIDDEN, HIDDEN, 0.0, HIDDEN], 0.9 * MOST_GONE, ""),
     ],
 )
 def test_a_map_that_is_out_of_date_is_warned_of(hidden: list[float], gone: float, text: str) -> None:

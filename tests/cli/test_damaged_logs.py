@@ -247,7 +247,7 @@ def test_the_check_of_a_log_without_a_whole_chunk_names_the_loss_and_nothing_tha
     code, out, _ = run(capsys, "check", path)
     assert code == 1
     assert f"bytes were lost; 1 file ends too early (cut off, or never closed) ({path}: ends at byte {kept}" in out
-    assert "remedy: copy the file again, if the copy was cut off; else record anew: no scan" in out
+    assert "remedy: copy the file again, if the copy was cut off; else record again: no scan" in out
     assert "no scans (sensor_msgs/msg/LaserScan) in what is left of the log" in out
     assert not re.search("convert|--odom-topic|--no-odom", out)
 

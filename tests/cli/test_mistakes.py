@@ -131,7 +131,7 @@ _MAP = "image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n"
         ("photo.jpg", b"\xff\xd8\xff\xe0" + bytes(99), "is an image, not a log"),
         ("map.yaml", _MAP.encode(), "is the YAML of a map, not a log; name the recording, and give the map with --map"),
         ("notes.txt", b"dear diary\n", "name the recording: a .mcap, .db3 or .bag file"),
-        ("empty.mcap", b"", "is empty (0 bytes); copy it again, or record anew"),
+        ("empty.mcap", b"", "is empty (0 bytes); copy it again, or record again"),
     ],
 )
 def test_what_is_no_log_is_called_what_it_is_with_a_remedy(

@@ -88,7 +88,7 @@ def test_refusals_are_reported_at_once(make_live: Callable[..., Live], log: Path
         Client("localhost:8000")
     empty = log.with_name("empty.mcap")
     empty.touch()
-    with pytest.raises(ClientError, match=r"empty\.mcap: is empty \(0 bytes\); copy it again, or record anew"):
+    with pytest.raises(ClientError, match=r"empty\.mcap: is empty \(0 bytes\); copy it again, or record again"):
         Client(live.url, "a-token-of-the-operator-0123456789").upload(empty)
     with pytest.raises(ClientError, match=r"no such file"):
         Client(live.url).upload(log.parent / "not there")

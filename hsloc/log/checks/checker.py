@@ -160,7 +160,7 @@ def _check_summary(summary: LogSummary, has_scans: bool, losses: Losses, finding
             Severity.ERROR, "no_scan", "", f"no scans (sensor_msgs/msg/LaserScan){left}",
             f"read the point clouds on {clouds[0]} with --slice LOW,HIGH, the heights of walls above the base [m]"
             if clouds
-            else f"{first}record anew, with the laser's topic; `hsloc info` lists what there is",
+            else f"{first}record again, with the laser's topic; `hsloc info` lists what there is",
         )  # fmt: skip
     elif summary.scan_topic is None:
         findings.add(
@@ -200,7 +200,7 @@ def _check_damage(log: Log, losses: Losses, is_empty: bool, findings: Findings) 
         first = f" ({losses.reasons[0]})" if losses.reasons else ""
         used = "what is whole is used, and `hsloc convert` writes it into a sound file"
         if is_empty:
-            used = f"{COPY_AGAIN}; else record anew: no scan and no odometry of it is whole"
+            used = f"{COPY_AGAIN}; else record again: no scan and no odometry of it is whole"
         elif losses.truncated_files or losses.bytes_lost or losses.damaged_chunks:
             used = f"{COPY_AGAIN}; else {used}"
         findings.add(Severity.DAMAGE, "damage", "", "; ".join(losses.lines()) + first, used)

@@ -11,9 +11,8 @@ from hsloc.garbage_collection import rarely_collected
 from hsloc.log import open_log
 from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle
-from hsloc.preprocessing.body_returns import without_beams
-from hsloc.preprocessing.odometry import ContinuousOdometry
-from hsloc.preprocessing.scans import ScanWatch, pair
+from hsloc.preprocessing.scans import pair
+from hsloc.replay.prepared_events import PreparedEvents
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -53,19 +52,16 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
     poses = result.trajectory.poses
     known = result.localised
     localised = known if result.tracked is None else result.tracked
-    first = None if result.follows_scans else Pose2.from_array(result.odometry.poses[0])
+    preparation = result.preparation
     row = -1
     corrections = _corrections(result, localised)
     T_map_odom: Pose2 | None = None
 
     with rarely_collected():
-        recorded = without_beams(log.events(), result.body_beams) if result.body_beams else log.events()
-        events = _with_recorded_odometry(recorded, result) if result.lidar_only else recorded
-        joined = ContinuousOdometry(events)
-        watched = joined if result.lidar_only else ScanWatch(joined)
-        # All as the run had it: poses of scans are composed with the odometry that it corrected.
-        counted = watched if result.odometry_correction is None else result.odometry_correction.applied(watched)
-        for event in pair(counted, deskew=result.deskewed, first=first):
+        recorded = preparation.without_body(log.events())
+        events = _with_recorded_odometry(recorded, result) if preparation.lidar_only else recorded
+        prepared = PreparedEvents(events, preparation)
+        for event in pair(prepared, deskew=preparation.deskewed, first=preparation.first):
             if isinstance(event, PairedScan):
                 if result.follows_scans:
                     row += 1

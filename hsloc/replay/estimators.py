@@ -13,7 +13,6 @@ from hsloc.interrupts import interrupts_held_back
 from hsloc.matching.window import Window
 from hsloc.model.events import Heading, Odometry
 from hsloc.model.pose2 import IDENTITY
-from hsloc.preprocessing.body_returns import without_beams
 from hsloc.preprocessing.left_out_hits import without_isolated
 from hsloc.preprocessing.odometry import OdometryWatch
 from hsloc.replay.map_and_start import load_grid, resumed
@@ -22,12 +21,9 @@ from hsloc.slam.point_mapper import PointMapper
 from hsloc.slam.stated_loops import StatedLoops
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from numpy.typing import NDArray
+    from collections.abc import Iterable
 
     from hsloc.localisation.localiser import Localiser
-    from hsloc.log import Log
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
     from hsloc.model.events import Event
@@ -38,14 +34,11 @@ if TYPE_CHECKING:
     from hsloc.slam.mapper import Mapper
 
 
-def events_of(
-    request: RunRequest, log: Log, lidar_only: bool, localise: bool, own: Mapping[str, NDArray[np.bool_]]
-) -> Iterable[Event]:
-    """The events of the log; its odometry watched, or left out, or replaced for a localiser by that of the scans.
+def events_of(request: RunRequest, recorded: Iterable[Event], lidar_only: bool, localise: bool) -> Iterable[Event]:
+    """Recorded events; their odometry watched, or left out, or replaced for a localiser by that of the scans.
 
-    Headings stay, unless the scans alone are asked for. `own` are the beams that are left out.
+    Headings stay, unless the scans alone are asked for.
     """
-    recorded = without_beams(log.events(), own) if own else log.events()
     if not lidar_only:
         # The point mapper cannot do without odometry, whatever that is like.
         events = recorded if request.config.mapper == "point" and not localise else OdometryWatch(recorded)

@@ -12,8 +12,7 @@ from hsloc.garbage_collection import rarely_collected
 from hsloc.kernels.cache import compilation_reported
 from hsloc.localisation.odometry_scale import OdometryScale
 from hsloc.preprocessing.body_returns import body_beams, body_warnings
-from hsloc.preprocessing.odometry import ContinuousOdometry, UnusableOdometry
-from hsloc.preprocessing.scans import ScanWatch
+from hsloc.preprocessing.odometry import UnusableOdometry
 from hsloc.replay.clock_offset import (
     ClockEvidence,
     LateScans,
@@ -38,6 +37,7 @@ from hsloc.replay.map_and_start import (
 )
 from hsloc.replay.matched_scans import mean_fitness
 from hsloc.replay.pose_covariances import pose_covariances
+from hsloc.replay.prepared_events import Preparation, PreparedEvents
 from hsloc.replay.progress import Progress, share_of, with_progress
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory
@@ -82,9 +82,8 @@ class Result:
     `tracked` the poses that were not searched for, whether their scans fit or not.
     `map_scale` is the size of a given map by what the lidar measures, `mounting_error` where the only laser is by the
     odometry, from where it is said to be, `ambiguities` where several places of it fit.
-    Odometry that counts wrongly is corrected in `odometry`, with a warning. With `lidar_only` no odometry of the log
-    was used: a localiser's `odometry` is then that of the scans. `deskewed` says whether the beams were moved to where
-    the robot was when each was measured.
+    `preparation` is what was done with the events of the log. Odometry that counts wrongly is corrected in `odometry`,
+    with a warning. With `lidar_only` no odometry of the log was used: a localiser's `odometry` is that of the scans.
     """
 
     request: RunRequest
@@ -110,14 +109,9 @@ class Result:
     """Side of a cell of the map as it was given (m), where that was wrong and `grid` has another."""
     odometry_scale: OdometryScale | None = None
     """How much more a metre and a radian of `odometry` are, by a localiser on a given map."""
-    odometry_correction: OdometryScale | None = None
-    """The scale by which `odometry` differs from that of the log; None where it is as recorded."""
-    body_beams: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
-    """Beams (n,) that see the robot itself and were left out, by the frame of a laser."""
     mounting_error: MountingError | None = None
     ambiguities: tuple[Ambiguity, ...] = ()
-    lidar_only: bool = False
-    deskewed: bool = False
+    preparation: Preparation = field(default_factory=Preparation)
     clock_offsets: Mapping[str, Offset] | None = None
     """Offsets of the scans' stamps that were found and not removed, by topic."""
     corrected_offsets: Mapping[str, Offset] | None = None
@@ -165,6 +159,16 @@ class Result:
         """The scan matcher that was used; None for the graph mapper, which has its own."""
         own = self.mode == "slam" and self.request.config.mapper == "graph"
         return None if own else self.request.matcher_name
+
+    @property
+    def lidar_only(self) -> bool:
+        """Whether no odometry of the log was used."""
+        return self.preparation.lidar_only
+
+    @property
+    def deskewed(self) -> bool:
+        """Whether the beams were moved to where the robot was when each was measured."""
+        return self.preparation.deskewed
 
     @property
     def follows_scans(self) -> bool:
@@ -316,20 +320,22 @@ def _run_with(
         localiser, likelihood = None, None
         estimator = mapper = make_mapper(request, state, lidar_only)
     first = None if lidar_only else first_odometry(log.events())
-    own = body_beams(log.events())
-    warnings = (*warnings, *body_warnings(own))
+    # Turns that were joined of segments are known beam by beam; a whole turn is deskewed if the user asks for it.
+    preparation = Preparation(
+        lidar_only=lidar_only,
+        deskewed=request.read.deskew or (log.summary.segments > 1 and not lidar_only),
+        body_beams=body_beams(log.events()),
+        odometry_correction=correction if isinstance(correction, OdometryScale) else None,
+        first=first,
+    )
+    warnings = (*warnings, *body_warnings(preparation.body_beams))
     prepared = time.perf_counter()
     history = RunHistory(request.config.localiser.smoothing_model() if localise else None)
-    events = ContinuousOdometry(events_of(request, log, lidar_only, localise, own), log.summary.odom_topic)
-    watch = ScanWatch(events, log.summary.scan_topic)
-    watched = events if lidar_only else watch
-    # Turns that were joined of segments are known beam by beam; a whole turn is deskewed if the user asks for it.
-    deskew = request.read.deskew or (log.summary.segments > 1 and not lidar_only)
-    of_odometry = correction if isinstance(correction, OdometryScale) else None
+    recorded = preparation.without_body(log.events())
+    events = PreparedEvents(events_of(request, recorded, lidar_only, localise), preparation, log.summary)
     with rarely_collected():
-        counted = watched if of_odometry is None else of_odometry.applied(watched)
-        reported = with_progress(log, counted, history, progress)
-        for event, estimate in replay(reported, estimator, deskew=deskew, first=first):
+        reported = with_progress(log, events, history, progress)
+        for event, estimate in replay(reported, estimator, deskew=preparation.deskewed, first=first):
             history.add(event, estimate)
     replayed = time.perf_counter()
     require_data(request, log, scans=history.scans > 0, odometry=first is not None or lidar_only)
@@ -342,7 +348,7 @@ def _run_with(
         if not lidar_only and not of_steps:
             is_first = time_offset is None
             is_right = is_first and require_direction(request, log, reading, history)
-            offsets = offsets_of_mapping(request, log, reading, history, deskew=deskew, correct=is_first)
+            offsets = offsets_of_mapping(request, log, reading, history, deskew=preparation.deskewed, correct=is_first)
         mapping = mapper.finish(share_of(progress, log.summary.duration_s, history.scans))
         grid = mapping.grid
         seconds["finish"] = time.perf_counter() - replayed
@@ -364,7 +370,7 @@ def _run_with(
         grid=require_map(grid),
         diagnostics=history.diagnostics(mapping),
         losses=log.losses,
-        warnings=(*log.summary.warnings, *warnings, *events.warnings(), *watch.warnings(), *of_steps),
+        warnings=(*log.summary.warnings, *warnings, *events.warnings(), *of_steps),
         seconds=seconds,
         mode="localise" if localise else "slam",
         mapping=mapping,
@@ -374,13 +380,10 @@ def _run_with(
         tracked=tracked,
         map_scale=scale,
         odometry_scale=None if localiser is None else localiser.odometry_scale,
-        odometry_correction=of_odometry,
-        body_beams=own,
         given_resolution=given_resolution,
         mounting_error=mounting,
         ambiguities=history.ambiguities(states),
-        lidar_only=lidar_only,
-        deskewed=deskew,
+        preparation=preparation,
         clock_offsets=offsets,
         reading=reading,
         direction_is_right=is_right,

@@ -27,12 +27,17 @@ test: $(VENV)/.dev build/numba/.compiled  ## all tests on all cores, and the cov
 	$(BIN)/coverage report --data-file=$(COVERAGE)/data
 
 # Each process that runs tests would compile all kernels, which takes it a minute: here two compile a half each. In half a
-# minute of the office a loop is closed.
-build/numba/.compiled: hsloc/kernels/*.py requirements.lock | $(VENV)/.dev
+# minute of the office a loop is closed. Each service would begin the warm-up anew, until one has lived to its end.
+# As modules, which run while pip puts hsloc's own entry in the environment anew.
+AS_MODULE := export NUMBA_CACHE_DIR=$(CURDIR)/build/numba MPLCONFIGDIR=$(CURDIR)/build/matplotlib PYTHONPATH=service; \
+	$(BIN)/python -m
+build/numba/.compiled: hsloc/kernels/*.py requirements.lock | $(VENV)/.demo
 	mkdir -p $(@D) && rm -rf build/compiled
-	export NUMBA_CACHE_DIR=$(CURDIR)/build/numba MPLCONFIGDIR=$(CURDIR)/build/matplotlib; \
-	$(BIN)/hsloc replay recordings/office.mcap --end 15 --unknown-start --certify -q --out build/compiled/replay & \
-	$(BIN)/hsloc map recordings/office.mcap --end 30 --time-offset auto -q --out build/compiled/map && wait $$!
+	$(AS_MODULE) hsloc.cli.main replay recordings/office.mcap --end 15 --unknown-start --certify -q \
+		--out build/compiled/replay & \
+	$(AS_MODULE) hsloc.cli.main map recordings/office.mcap --end 30 --time-offset auto -q --out build/compiled/map \
+		&& wait $$!
+	$(AS_MODULE) hsloc_service.execution.warm_up >/dev/null
 	touch $@
 
 lint: $(VENV)/.dev  ## style, types and the direction of imports

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from imports import need_no_import
 from paths import RECORDINGS
-from processes import has_open, heed_rights
+from processes import has_open, heeding_rights
 from waiting import LIMIT_S, until
 
 from hsloc.cli.main import main
@@ -153,19 +153,21 @@ def test_of_a_folder_whose_logs_lie_further_down_one_is_named(here: Path, capsys
 
 
 @pytest.mark.parametrize("command", ["replay", "check"])
-def test_what_may_not_be_read_is_said_with_a_remedy(here: Path, command: str) -> None:
+def test_what_may_not_be_read_is_said_with_a_remedy(
+    here: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
     for name in ("closed/run.mcap", "closed.mcap"):
         (here / name).parent.mkdir(exist_ok=True)
         (here / name).write_bytes(Path(OFFICE).read_bytes())
     (here / "closed.mcap").chmod(0)
     (here / "closed").chmod(0)
     for name in ("closed.mcap", "closed", "closed/run.mcap"):
-        line = fails_by_rights(command, name)
+        line = fails_by_rights(capsys, command, name)
         assert line == (
             f"hsloc: error: {name}: cannot be read (Permission denied); "
             "check its rights, and those of the folders above it"
         )
-    line = fails_by_rights("replay", OFFICE, "--map", "closed/map.yaml", "--out", "out")
+    line = fails_by_rights(capsys, "replay", OFFICE, "--map", "closed/map.yaml", "--out", "out")
     assert "closed/map.yaml" in line
     assert "check its rights" in line
     (here / "closed").chmod(0o700)
@@ -185,24 +187,24 @@ def test_what_may_not_be_read_is_said_with_a_remedy(here: Path, command: str) ->
         ["record", "--world", "hall"],
     ],
 )
-def test_an_output_that_may_not_be_written_is_no_input(here: Path, argv: list[str]) -> None:
+def test_an_output_that_may_not_be_written_is_no_input(
+    here: Path, capsys: pytest.CaptureFixture[str], argv: list[str]
+) -> None:
     (here / "closed").mkdir(mode=0)
     for target in ("closed/out", "closed/below/out"):
-        line = fails_by_rights(*argv, target)
+        line = fails_by_rights(capsys, *argv, target)
         assert line.startswith(f"hsloc: error: {target}: cannot be written (Permission denied); ")
         assert line.endswith(("choose another --out", "or name another one"))
     (here / "closed").chmod(0o500)
     if argv[0] in ("replay", "calibrate"):
-        assert "is not a folder that may be written to); choose another --out" in fails_by_rights(*argv, "closed/out")
+        assert "is not a folder that may be written to); choose another --out" in fails_by_rights(
+            capsys, *argv, "closed/out"
+        )
 
 
-def fails_by_rights(*argv: str) -> str:
-    """As `fails`, in a process that heeds the rights of files."""
-    command = [sys.executable, "-m", "hsloc.cli.main", *argv]
-    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=heed_rights)
-    assert (done.returncode, done.stdout) == (1, ""), done.stderr
-    (line,) = done.stderr.splitlines()
-    return line
+def fails_by_rights(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+    """As `fails`, where the rights of files are heeded."""
+    return heeding_rights(lambda: fails(capsys, *argv))
 
 
 def write_log(path: Path, scans: tuple[Any, ...] = ("/scan",), odometry: bool = True, grid: bool = False) -> None:

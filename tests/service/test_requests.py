@@ -325,8 +325,9 @@ def test_every_example_of_the_api_fits_it(client: TestClient) -> None:
 def test_what_has_not_changed_is_304_and_the_rest_is_compressed(make_live: Callable[..., Live]) -> None:
     live = make_live()
     with live.client() as client:
-        for seed in range(20):
-            wait(client, submit(client, seed=seed, config={"hide": {"budget": 300}}))
+        jobs = [submit(client, seed=seed, config={"hide": {"budget": 300}}) for seed in range(20)]
+        for job in jobs:
+            wait(client, job)
         full = client.get("/v1/jobs", headers={"Accept-Encoding": "identity"})
         packed = client.get("/v1/jobs", headers={"Accept-Encoding": "gzip"})
         assert packed.headers["content-encoding"] == "gzip"

@@ -172,7 +172,7 @@ def test_delete_removes_results_but_not_what_is_active(client: TestClient) -> No
 def test_an_empty_and_a_large_file_are_read_in_blocks(client: TestClient, tmp_path: Path) -> None:
     job = submit(client)
     wait(client, job)
-    content = bytes(i % 251 for i in range(BLOCK * 2 + 12345))
+    content = (bytes(range(251)) * (BLOCK // 100))[: BLOCK * 2 + 12345]  # 251 is prime: no two blocks are alike
     place, assets = output(tmp_path, large=content, empty=b"")
     context = client.app.state.context  # type: ignore[attr-defined]
     store, name = context.stores.current, f"{job}.2"

@@ -13,6 +13,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import forked_commands
 import httpx2 as httpx
 from mcap.reader import make_reader
 from waiting import LIMIT_S, until
@@ -94,15 +95,30 @@ def environment(**variables: str) -> dict[str, str]:
     }
 
 
+def start(
+    log: Path, arguments: list[str], variables: dict[str, str]
+) -> forked_commands.Forked | subprocess.Popen[bytes]:
+    """A command of `hsloc` as a process; it writes to `log`."""
+    chosen = environment(**variables)
+    if (
+        forked_commands.POSSIBLE
+        and _COVERAGE not in chosen
+        and not any(name.startswith("PYTHON") for name in variables)
+    ):
+        return forked_commands.Forked(arguments, chosen, log)
+    with log.open("ab") as file:
+        return subprocess.Popen(
+            [sys.executable, "-m", "hsloc.cli.main", *arguments], env=chosen, stdout=file, stderr=file
+        )
+
+
 class Worker:
     """`hsloc work` as a process."""
 
     def __init__(self, folder: Path, *arguments: str, **variables: str) -> None:
         folder.mkdir(exist_ok=True)
         self.log = folder / "worker.log"
-        command = [sys.executable, "-m", "hsloc.cli.main", "work", "--data", str(folder / "data"), *arguments]
-        with self.log.open("ab") as log:
-            self.process = subprocess.Popen(command, env=environment(**variables), stdout=log, stderr=log)
+        self.process = start(self.log, ["work", "--data", str(folder / "data"), *arguments], variables)
 
     def end(self, which: int = signal.SIGTERM) -> int:
         """Send a signal; the exit code."""
@@ -115,7 +131,7 @@ class Live:
 
     def __init__(self, folder: Path, **variables: str) -> None:
         self.data, self.port, self._variables = folder / "data", free_port(), variables
-        self.process: subprocess.Popen[bytes] | None = None
+        self.process: forked_commands.Forked | subprocess.Popen[bytes] | None = None
         self.log = folder / "server.log"
 
     @property
@@ -123,13 +139,8 @@ class Live:
         return f"http://127.0.0.1:{self.port}"
 
     def start(self) -> Live:
-        with self.log.open("ab") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "hsloc.cli.main", "serve", "--data", str(self.data), "--port", str(self.port)],
-                env=environment(**self._variables),
-                stdout=log,
-                stderr=log,
-            )
+        arguments = ["serve", "--data", str(self.data), "--port", str(self.port)]
+        self.process = start(self.log, arguments, self._variables)
         with self.client() as client:
 
             def is_ready() -> bool:

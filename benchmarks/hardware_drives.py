@@ -226,6 +226,17 @@ def turning(per_metre: float) -> Callable[[Drive], Drive]:
     return lambda drive: drive.with_steps(lambda _, m: Pose2(m.x, m.y, m.theta - per_metre * np.hypot(m.x, m.y)))
 
 
+def misled(begin: float, end: float, turn: float, way: float) -> Callable[[Drive], Drive]:
+    """Scales of what the odometry counts between two times (s); -1 is the other way round."""
+
+    def change(elapsed_s: float, motion: Pose2) -> Pose2:
+        if not begin <= elapsed_s < end:
+            return motion
+        return Pose2(way * motion.x, way * motion.y, turn * motion.theta)
+
+    return lambda drive: drive.with_steps(change)
+
+
 def at_rate(every: int) -> Callable[[Drive], Drive]:
     """Only some of the odometry messages."""
 

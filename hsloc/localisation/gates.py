@@ -146,6 +146,10 @@ class MatchGate:
         """Whether a match of fitness `wide` in a wide window takes the place of one that was not as fit as usual."""
         return self.usual is not None and wide >= max(worse + _REGAINED, _AS_USUAL * self.usual)
 
+    def gives_way(self, narrow: float, wide: float) -> bool:
+        """Whether a match of fitness `narrow` gives way to one of fitness `wide` in a wide window, refused or not."""
+        return self.is_recovered(narrow, wide) if self.refusal(narrow) else self.is_regained(narrow, wide)
+
     def is_elsewhere(self, here: float, elsewhere: float) -> bool:
         """Whether a match of fitness `elsewhere` is as fit as usual, and one at rest of fitness `here` is not."""
         return self.fits_as_usual(elsewhere) and here <= _AS_LAST * elsewhere

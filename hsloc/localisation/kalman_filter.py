@@ -1,25 +1,23 @@
 """An extended Kalman filter over poses: prediction, update, and smoothing backwards over a run.
 
-Offline, the scans to come are known, so the poses are smoothed in two steps. Those at matches by the recursion of
-Rauch, Tung and Striebel (AIAA Journal 3(8), 1965): `x_i += C (x_(i+1) - x_(i+1|i))` with `C = P_i F^T P_(i+1|i)^-1`;
-that brings what a corridor's end shows to the poses before it. Between two matches the errors of odometry are a random
-walk whose ends are known: its mean is the mean of what both ends predict, weighted by the share of the motion, as the
-variance grows with it.
+Offline, the scans to come are known, so the poses at matches are smoothed by the recursion of Rauch, Tung and Striebel
+(AIAA Journal 3(8), 1965): `x_i += C (x_(i+1) - x_(i+1|i))` with `C = P_i F^T P_(i+1|i)^-1`; that brings what a
+corridor's end shows to the poses before it. Those between two matches are in `between_matches`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import cos, exp, hypot, log, sin
+from math import cos, exp, log, sin
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hsloc.localisation.interpolated_odometry import AtStamp, Sides, motion_variances, sides
-from hsloc.model.pose2 import Pose2, compose_poses, pose_differences, rotated, wrap_angle, wrap_angles
+from hsloc.localisation.interpolated_odometry import AtStamp, motion_variances
+from hsloc.model.pose2 import Pose2, rotated, wrap_angle, wrap_angles
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -31,13 +29,6 @@ if TYPE_CHECKING:
 MAX_SQUARED = 16.3
 """Squared difference by its covariance, prediction to smoothed pose, up to which it was noise: the 99.9 % quantile
 of chi squared with 3 degrees of freedom. Beyond it a wheel slipped."""
-_METRES_PER_RADIAN = 0.5
-"""Metres that a radian counts for in the share of the motion: about the track width of an indoor robot."""
-_STEP_M, _FEW_STEPS = 0.2, 3.0
-"""Motions (m) whose noise is independent, as the filter takes it from match to match, and the number of them from which
-on the noise of a motion between two matches is theirs: taken as one, it is three times as large over 2 m."""
-_STILL_M = 1e-6
-"""Motion (m) that an odometry message counts for that states none, as where it is frozen and the robot is not."""
 _REMEMBERED = 0.98
 """Weight of an innovation after the next one: about 50 are remembered, the 10 m of a match each 0.2 m."""
 _HALF_MEMORY = 25
@@ -109,9 +100,17 @@ def fuse_match(prediction: Pose2, covariance: F64, match: Match, information: F6
     return update_with_information(prediction, covariance, match.pose, information)
 
 
-def is_slip(innovation: F64, covariance: F64, information: F64) -> bool:
-    """Whether an innovation (3,), by covariance of the prediction and information of the match (3, 3), is no noise."""
-    weight = information @ np.linalg.inv(_EYE + covariance @ information)
+def innovation_weight(covariance: F64, information: F64) -> F64:
+    """Inverse covariance of an innovation, by covariance of the prediction and information of the match (3, 3).
+
+    `L (I + P L)^-1`: directions that are not measured count for none.
+    """
+    weight: F64 = information @ np.linalg.inv(_EYE + covariance @ information)
+    return weight
+
+
+def is_slip(innovation: F64, weight: F64) -> bool:
+    """Whether an innovation (3,), by its inverse covariance (3, 3), is no noise."""
     return float(innovation @ weight @ innovation) > MAX_SQUARED
 
 
@@ -147,7 +146,7 @@ class Innovations:
         trace of the gain.
         """
         covariance = propagated + max(self.noise_scale, 1.0) * noise
-        weight: F64 = information @ np.linalg.inv(_EYE + covariance @ information)
+        weight = innovation_weight(covariance, information)
         found = weight
         squared = float(innovation @ weight @ innovation)
         freedom = float(np.trace(covariance @ weight))
@@ -156,7 +155,7 @@ class Innovations:
         self._excess += _EXCESS_GAIN * (min(squared / freedom, _MOST_EXCESS) - self._excess)
         if self.noise_scale < 1.0:
             scaled = propagated + self.noise_scale * noise
-            weight = information @ np.linalg.inv(_EYE + scaled @ information)
+            weight = innovation_weight(scaled, information)
             squared = float(innovation @ weight @ innovation)
         part = weight @ (self.noise_scale * noise)
         limited = min(1.0, MAX_SQUARED / squared) if squared > 0.0 else 1.0  # a slip is not noise
@@ -224,7 +223,7 @@ def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> Smoo
             continue
         motion = here.T_odom_base.between(following.T_odom_base)
         noise = motion_model.covariance(motion)
-        variances[k + 1] = _noise_around(anchors, k + 1) * np.diag(rotated(noise, here.T_map_base.theta))
+        variances[k + 1] = noise_around(anchors, k + 1) * np.diag(rotated(noise, here.T_map_base.theta))
         noise = max(following.noise_scale, 1.0) * noise + np.diag(motion_variances(here.at, following.at))
         predicted = here.T_map_base @ motion
         variance = predict_covariance(here.covariance, here.T_map_base, motion, noise) + _NO_NOISE
@@ -233,7 +232,7 @@ def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> Smoo
         if off @ weighted > MAX_SQUARED:
             slips[k + 1] = np.maximum(off**2 - np.diag(variance), 0.0)
             if not here.fits_as_usual:
-                jump = np.outer(off, off)
+                jump = jump + np.outer(off, off)
             covariances[k] += jump
             continue
         gain = np.linalg.solve(variance, transition(here.T_map_base, motion) @ here.covariance).T
@@ -244,142 +243,6 @@ def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> Smoo
     return SmoothedMatches(poses, covariances, variances, slips)
 
 
-def _noise_around(anchors: Sequence[Anchor], k: int) -> float:
+def noise_around(anchors: Sequence[Anchor], k: int) -> float:
     """Variance of the odometry by the assumed one around the k-th anchor; its own knows only the matches before."""
     return anchors[min(k + _HALF_MEMORY, len(anchors) - 1)].noise_scale
-
-
-class _Between(NamedTuple):
-    """Poses between two matches of a track: rows, anchors before and after, and the share (n, 1) of the motion.
-
-    `steps` (n,) are the motions of `_STEP_M` between the two. `sides` is what interpolation adds, if it adds anything.
-    """
-
-    rows: NDArray[np.int64]
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
-    share: F64
-    steps: F64
-    sides: Sides | None
-
-    def weights(self, motion: F64) -> F64:
-        """Weights (n, 3) of what the second match predicts; `motion` (m, 3) are variances up to each anchor."""
-        if self.sides is None:
-            return np.broadcast_to(self.share, (len(self.rows), 3))
-        before = self.share * motion[self.second] + self.sides.before
-        total = motion[self.second] + self.sides.before + self.sides.after
-        weights: F64 = np.divide(before, total, out=np.tile(self.share, 3), where=total > 0.0)
-        return weights
-
-
-def _between(odometry: F64, anchors: Sequence[Anchor], interpolated: Mapping[int, AtStamp]) -> _Between:
-    counts = np.array([anchor.count for anchor in anchors])
-    begins = np.array([anchor.begins for anchor in anchors])
-    before = np.searchsorted(counts, np.arange(len(odometry)), side="right") - 1
-    rows = np.flatnonzero((before >= 0) & (before + 1 < len(anchors)))
-    rows = rows[~begins[before[rows] + 1]]
-    first, second = before[rows], before[rows] + 1
-    moved = np.cumsum(_STILL_M + _way(np.diff(odometry, axis=0, prepend=odometry[:1])))
-    # Messages may be seconds apart: the motion from the last one before a scan to the scan counts, too.
-    last = np.maximum(counts - 1, 0)
-    at = np.array([anchor.T_odom_base.to_array() for anchor in anchors])
-    at_anchors = moved[last] + np.where(counts > 0, _way(at - odometry[last]), 0.0)
-    begin, end = at_anchors[first], at_anchors[second]
-    share = np.clip((moved[rows] - begin) / np.maximum(end - begin, 1e-9), 0.0, 1.0)[:, None]
-    around = None
-    if interpolated or any(anchor.at.interpolation for anchor in anchors):
-        around = sides(rows, (first, second), [anchor.at for anchor in anchors], interpolated)
-    return _Between(rows, first, second, share, (end - begin) / _STEP_M, around)
-
-
-def _way(steps: F64) -> F64:
-    """Metres of each step (n, 3), its rotation with them."""
-    way: F64 = np.hypot(steps[:, 0], steps[:, 1]) + _METRES_PER_RADIAN * np.abs(wrap_angles(steps[:, 2]))
-    return way
-
-
-def between_matches(
-    poses: F64,
-    odometry: F64,
-    anchors: Sequence[Anchor],
-    matched: SmoothedMatches,
-    *,
-    leads_to_first: bool = False,
-    interpolated: Mapping[int, AtStamp] | None = None,
-) -> F64:
-    """The poses (n, 3) of a run, those between two matches of a track replaced by the mean of what both predict.
-
-    With `leads_to_first` those before the first match lead to it: a start that is given is a guess.
-    `odometry` (n, 3) belongs to the poses, those of its rows that are no messages are `interpolated`.
-    """
-    if len(anchors) < 2:
-        return poses
-    at_odometry = np.array([anchor.T_odom_base.inverse().to_array() for anchor in anchors])
-    T_map_odom = compose_poses(matched.poses, at_odometry)
-    between = _between(odometry, anchors, interpolated or {})
-    rows, first, second = between.rows, between.first, between.second
-    ahead = compose_poses(T_map_odom[first], odometry[rows])
-    back = compose_poses(T_map_odom[second], odometry[rows])
-    smoothed = poses.copy()
-    begin = anchors[0].count if leads_to_first else 0
-    smoothed[:begin] = compose_poses(T_map_odom[0], odometry[:begin])
-    smoothed[rows] = ahead + between.weights(matched.motion) * pose_differences(back, ahead)
-    smoothed[rows, 2] = wrap_angles(smoothed[rows, 2])
-    return smoothed
-
-
-def bridge_variances(
-    odometry: F64,
-    anchors: Sequence[Anchor],
-    matched: SmoothedMatches,
-    motion_model: MotionModel,
-    interpolated: Mapping[int, AtStamp] | None = None,
-) -> tuple[F64, NDArray[np.bool_]]:
-    """What the odometry (n, 3) adds to the variances (n, 3) of poses between two matches: a walk whose ends are known.
-
-    Of the variances of the odometry up to a match a quarter is left half-way. Where wheels slipped between two matches
-    it is not known when: the slip may lie before or after a pose. Rows of the odometry that are no messages are
-    `interpolated`. Also returns to which poses (n,) interpolation or a slip adds.
-    """
-    unsure = np.zeros(len(odometry), dtype=np.bool_)
-    variances = np.zeros((len(odometry), 3))
-    for row, at in (interpolated or {}).items():
-        variances[row], unsure[row] = at.variances(), True
-    if len(anchors) >= 2:
-        between = _between(odometry, anchors, interpolated or {})
-        weights = between.weights(matched.motion)
-        rows, _, second, share, steps, around = between
-        motion = matched.motion.copy()
-        for k in np.unique(second[steps > _FEW_STEPS]).tolist():
-            way = odometry[max(anchors[k - 1].count - 1, 0) : anchors[k].count]
-            turned = anchors[k].T_map_base.theta - anchors[k].T_odom_base.theta
-            motion[k] = _noise_around(anchors, k) * _walk_variances(way, turned, motion_model)
-        left = (1.0 - weights) ** 2 * share + weights**2 * (1.0 - share)
-        variances[rows] = left * motion[second]
-        if around is not None:
-            variances[rows] += around.mean
-            unsure[rows] = (around.before + around.after).any(axis=1)
-            measured = ~np.isin(rows, list(interpolated or {}))[:, None]
-            variances[rows] += measured * ((1.0 - weights) ** 2 * around.before + weights**2 * around.after)
-        variances[rows] += (1.0 / 3.0 - weights * (1.0 - weights)) * matched.slips[second]
-        unsure[rows] |= matched.slips[second].any(axis=1)
-    return variances, unsure
-
-
-def _walk_variances(way: F64, turned: float, motion_model: MotionModel) -> F64:
-    """Variances (3,) of odometry (n, 3) as a walk of short motions, in a frame in which its own is `turned`."""
-    total, last = np.zeros((3, 3)), Pose2.from_array(way[0])
-    for k, row in enumerate(way[1:], start=2):
-        here = Pose2.from_array(row)
-        step = last.between(here)
-        size = hypot(step.x, step.y) + _METRES_PER_RADIAN * abs(step.theta)
-        if size >= _STEP_M or k == len(way):
-            covariance = min(_STEP_M / max(size, _STILL_M), 1.0) * motion_model.covariance(step)
-            total += rotated(covariance, last.theta + turned)
-            last = here
-    # A walk of the heading takes the way aside; where that is known at both ends, 1/192 of its square is left half-way.
-    x, y = (way[-1, :2] - way[0, :2]).tolist()
-    c, s = cos(turned), sin(turned)
-    aside = np.array((s * x + c * y, c * x - s * y, 0.0)) ** 2
-    variances: F64 = np.diag(total) + total[2, 2] * aside / 48.0
-    return variances

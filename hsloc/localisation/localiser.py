@@ -12,9 +12,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.kernels.fitness import fitness_many
+from hsloc.localisation.contradicted_odometry import ContradictedOdometry
 from hsloc.localisation.gates import MatchGate, MotionGate, RestGate
 from hsloc.localisation.interpolated_odometry import AtStamp, motion_variances
-from hsloc.localisation.kalman_filter import Innovations, difference, fuse_match, is_slip, predict_covariance
+from hsloc.localisation.kalman_filter import (
+    Innovations,
+    difference,
+    fuse_match,
+    innovation_weight,
+    is_slip,
+    predict_covariance,
+)
 from hsloc.localisation.map_scale import MapScale, MapScaleEstimator
 from hsloc.localisation.odometry_scale import OdometryScale, OdometryScaleEstimator
 from hsloc.localisation.place_check import PlaceCheck
@@ -45,6 +53,8 @@ if TYPE_CHECKING:
 
 _AS_USUAL = 0.98
 """Ratio to the usual fitness from which the optimum next to the prediction is taken without a search."""
+_TRUSTED = 0.5
+"""Trust in a match from which on the robot was there: at 0.85 of the usual fitness."""
 _MOVED_M, _MOVED_RAD = 0.1, radians(3.0)
 """How far a robot whose odometry stands still is found from there if it was moved: less makes no pose wrong, and people
 shift the optimum by some centimetres."""
@@ -96,6 +106,7 @@ class Localiser:
         self._innovations = Innovations()
         self._odometry_scale = OdometryScaleEstimator()
         self._rest_gate = RestGate()
+        self._contradicted = ContradictedOdometry(likelihood.sigma)
         # Where a proof is asked for, the optimum next to the prediction has none.
         proves = parameters.certify or heuristic(matcher) is not matcher
         self._refines = parameters.refine_first and not proves
@@ -173,13 +184,13 @@ class Localiser:
         if not self._match_gate.is_fresh and not self._motion_gate.is_open(motion, unsure):
             if not (self._rest_gate.stands and self._is_moved(paired, predicted)):
                 return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
-            self._covariance = self._covariance + self._slip_covariance(_MOVED_WINDOW)
+            self._covariance = self._covariance + self._parameters.slip_covariance(_MOVED_WINDOW)
         propagated = predict_covariance(self._covariance, self._T_map_match, motion, np.zeros((3, 3)))
         noise = rotated(self._motion_model.covariance(motion), self._T_map_match.theta)
         covariance = propagated + max(self._innovations.noise_scale, 1.0) * noise
         points = paired.points_base()
         self._odometry_scale.predict(self._T_map_match, motion)
-        for each in (self._monitor, self._map_scale):
+        for each in (self._monitor, self._map_scale, self._contradicted):
             if each is not None:
                 each.move(hypot(motion.x, motion.y))
         if len(points) < p.min_points:
@@ -188,11 +199,12 @@ class Localiser:
             evidence = None if self._monitor is None else self._monitor.skipped()
             covariance = self._reported(covariance)
             return Estimate(scan.stamp_ns, predicted, Status.NO_RETURNS, covariance, reason=reason, evidence=evidence)
-        match, evaluations = self._match(points, predicted, covariance)
+        match, evaluations = self._match(points, T_odom_base, predicted, covariance)
         reason = self._match_gate.refusal(match.fitness)
         is_hidden = bool(reason) and self._is_hidden(paired, match)
         if reason and not is_hidden:
             return self._refuse(paired, predicted, covariance, match, evaluations, reason)
+        is_usual = self._match_gate.fits_as_usual(match.fitness)
         information = match_information(points, self._field, match.pose, self._wall_variance())
         if p.fuse:
             off = difference(match.pose, predicted)
@@ -202,10 +214,13 @@ class Localiser:
                 information = self._match_gate.trust(match.fitness) * information
                 weight = self._innovations.add(off, information, propagated, noise)
             self._odometry_scale.update(off, covariance, weight)
+            if is_usual and is_slip(off, weight) and self._contradicted.is_seen(T_odom_base, match.pose, points):
+                covariance = covariance + np.outer(off, off)  # a mean of prediction and match would be neither
             pose, covariance = fuse_match(predicted, covariance, match, information)
         else:
             pose, covariance = match.pose, match.covariance
-        is_usual = self._match_gate.fits_as_usual(match.fitness)
+        if self._match_gate.trust(match.fitness) >= _TRUSTED:
+            self._contradicted.known(T_odom_base, pose, points)
         if is_hidden:
             self._match_gate.accept_hidden()
         else:
@@ -259,7 +274,8 @@ class Localiser:
             off = difference(match.pose, predicted)
             information = match_information(points, self._field, match.pose, self._wall_variance())
             is_far = hypot(off[0], off[1]) >= _MOVED_M or abs(off[2]) >= _MOVED_RAD
-            is_moved = is_far and information is not None and is_slip(off, self._covariance, information)
+            weight = None if information is None else innovation_weight(self._covariance, information)
+            is_moved = is_far and weight is not None and is_slip(off, weight)
         else:
             is_moved = bool(self._match_gate.refusal(match.fitness)) and self._is_astray(paired, match.pose)
         self._rest_gate.searched(is_moved)
@@ -269,11 +285,6 @@ class Localiser:
         """Whether more beams end behind walls or where nothing is mapped than with people around the robot."""
         return self._monitor is not None and self._monitor.astray(paired, pose) > _MOST_ASTRAY
 
-    def _slip_covariance(self, times: float = 1.0) -> F64:
-        """What a slip adds to the covariance: the window for it, `times` as wide, is three standard deviations."""
-        p = self._parameters
-        return np.diag((p.wide_window, p.wide_window, p.wide_window_angle)) ** 2 * (times / 3.0) ** 2
-
     def _wall_variance(self) -> float | None:
         """What the scans so far show of how walls are drawn (m^2)."""
         return None if self._map_scale is None else self._map_scale.wall_variance
@@ -281,6 +292,7 @@ class Localiser:
     def _lose(self) -> None:
         """The pose is unknown from now on: search."""
         self._searching = True
+        self._contradicted.lost()
         self._search_began = self._count
         self._global_search.start(None if self._monitor is None else self._monitor.usual_explained)
 
@@ -288,7 +300,7 @@ class Localiser:
         """A covariance with the scale of the innovations; never smaller than the filter's."""
         return self._innovations.excess * covariance
 
-    def _match(self, points: F64, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
+    def _match(self, points: F64, T_odom_base: Pose2, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
         """Match in the window of the prediction; a match that is not as fit as usual may give way in a wider window."""
         p = self._parameters
         window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
@@ -302,18 +314,19 @@ class Localiser:
         best = self._match_in(points, window)
         evaluations += best.evaluations
         if not self._match_gate.fits_as_usual(best.fitness):
-            wide = Window(
-                predicted,
-                max(window.half_x, p.wide_window),
-                max(window.half_y, p.wide_window),
-                max(window.half_theta, p.wide_window_angle),
-            )
+            wide = window.at_least(p.wide_window, p.wide_window, p.wide_window_angle)
             match = self._match_in(points, wide)
             evaluations += match.evaluations
-            is_refused = bool(self._match_gate.refusal(best.fitness))
-            takes = self._match_gate.is_recovered if is_refused else self._match_gate.is_regained
-            if takes(best.fitness, match.fitness):
-                best = match
+            if self._match_gate.gives_way(best.fitness, match.fitness):
+                return match, evaluations
+            x, y = self._contradicted.half_widths(predicted)
+            if max(x, y) > p.wide_window:
+                reach = wide.at_least(window.half_x + x, window.half_y + y, wide.half_theta)
+                match = self._match_in(points, reach)
+                evaluations += match.evaluations
+                is_fit = self._match_gate.gives_way(best.fitness, match.fitness)
+                if is_fit and self._contradicted.is_seen(T_odom_base, match.pose, points):
+                    best = match
         return best, evaluations
 
     def _match_in(self, points: F64, window: Window) -> Match:
@@ -327,7 +340,7 @@ class Localiser:
     ) -> Estimate:
         """The prediction stands; after too many refusals the pose is lost."""
         refusals = self._match_gate.refuse()
-        covariance = covariance + self._slip_covariance()
+        covariance = covariance + self._parameters.slip_covariance()
         self._take(predicted, covariance, paired)
         status = Status.REJECTED
         if refusals >= self._parameters.max_consecutive_rejections:

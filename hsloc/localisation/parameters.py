@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from math import radians
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
+
 from hsloc.localisation.gates import MatchLimits
 from hsloc.localisation.motion_models import MOTION_MODELS, AckermannNoise, OdometryNoise, OmnidirectionalNoise
 from hsloc.localisation.place_check import PlaceCheckParameters
@@ -14,6 +16,8 @@ from hsloc.matching.certificate import CertificateParameters
 from hsloc.parameters import Angle, Count, NonNegative, OneOf, Parameters, Positive, Ratio
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from hsloc.localisation.motion_models import MotionModel
 
 
@@ -90,3 +94,8 @@ class LocaliserParameters(Parameters):
             min_fitness_ratio=self.min_fitness_ratio,
             recovery_fitness_ratio=self.recovery_fitness_ratio,
         )
+
+    def slip_covariance(self, times: float = 1.0) -> NDArray[np.float64]:
+        """What a slip adds to the covariance (3, 3): the window for it, `times` as wide, is 3 standard deviations."""
+        half = np.array((self.wide_window, self.wide_window, self.wide_window_angle))
+        return np.diag((times / 3.0 * half) ** 2)

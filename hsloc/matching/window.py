@@ -32,6 +32,10 @@ class Window:
         x, y, theta = (sigmas * sqrt(max(variance, 0.0)) for variance in covariance.diagonal().tolist())
         return Window(centre, max(x, minimum[0]), max(y, minimum[0]), min(max(theta, minimum[1]), pi))
 
+    def at_least(self, half_x: float, half_y: float, half_theta: float) -> Window:
+        """The box with half-widths that are no smaller than these."""
+        return Window(self.centre, max(self.half_x, half_x), max(self.half_y, half_y), max(self.half_theta, half_theta))
+
     def half_widths(self) -> NDArray[np.float64]:
         """(half_x, half_y, half_theta), shape (3,)."""
         return np.array((self.half_x, self.half_y, self.half_theta))

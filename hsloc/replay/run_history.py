@@ -8,14 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hsloc.localisation.between_matches import between_matches, bridge_variances
 from hsloc.localisation.interpolated_odometry import AtStamp
-from hsloc.localisation.kalman_filter import (
-    Anchor,
-    SmoothedMatches,
-    between_matches,
-    bridge_variances,
-    smooth_matches,
-)
+from hsloc.localisation.kalman_filter import Anchor, SmoothedMatches, smooth_matches
 from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.localisation.mounting_error import mounting_error, mounting_error_of_steps
 from hsloc.localisation.states import StateLog, with_odometry_alone, with_pose_errors
@@ -264,8 +259,10 @@ class RunHistory:
             self._states.join_tracks(self.odometry().poses, model, grid)
         smoothed = self._smooth()
         covariances = dict(zip(self._anchor_states, smoothed.covariances, strict=True))
-        odometry = self.odometry().poses
-        between, unsure = bridge_variances(odometry, self._anchors, smoothed, model, self._interpolated)
+        odometry = self.odometry()
+        between, unsure = bridge_variances(
+            odometry.poses, self._anchors, smoothed, model, self._interpolated, stamps_ns=odometry.stamps_ns
+        )
         rows = self._states.at_odometry(len(self._odometry_stamps), covariances, between)
         if self._motion_model is not None:
             noise, factor = self._motion_model, self._anchors[-1].noise_scale if self._anchors else 1.0

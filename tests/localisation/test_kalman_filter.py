@@ -11,13 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hsloc.errors import ConfigError
+from hsloc.localisation.between_matches import between_matches, bridge_variances
 from hsloc.localisation.interpolated_odometry import AtStamp, motion_variances
 from hsloc.localisation.kalman_filter import (
     Anchor,
     Innovations,
     SmoothedMatches,
-    between_matches,
-    bridge_variances,
     fuse,
     predict_covariance,
     smooth_matches,
@@ -199,6 +198,17 @@ def test_matches_that_fit_worse_than_usual_before_a_jump_may_be_off_by_as_much()
     assert np.sqrt(covariances[:, 1, 1]).max() < 0.05
 
 
+def test_what_a_match_may_be_off_by_is_not_forgotten_at_a_smaller_jump() -> None:
+    anchors = [anchor(k, Pose2(0.2 * k, 0.0, 0.0), Pose2(0.2 * k, 0.0, 0.0), SURE, begins=k == 0) for k in range(7)]
+    anchors[2:6] = [replace(each, fits_as_usual=False) for each in anchors[2:6]]
+    anchors[4:6] = [replace(each, T_map_base=each.T_map_base @ Pose2(0.3, 0.0, 0.0)) for each in anchors[4:6]]
+    anchors[6] = replace(anchors[6], T_map_base=Pose2(4.2, 0.0, 0.0))
+    sigma = np.sqrt(smooth_matches(anchors, OdometryNoise()).covariances[:, 0, 0])
+    assert sigma[4:6] == pytest.approx(2.7, abs=0.1)
+    assert sigma[2:4].min() > 2.7
+    assert sigma[:2].max() < 0.05
+
+
 def test_between_two_matches_the_odometry_adds_its_noise() -> None:
     odometry = straight(7, 0.1)
     anchors = [
@@ -241,6 +251,25 @@ def test_of_a_slip_between_two_matches_it_is_not_known_when_it_was() -> None:
     assert np.sqrt(found[2, 0]) == pytest.approx(0.6 / np.sqrt(12.0), abs=0.01)
     assert 0.6 / np.sqrt(12.0) < np.sqrt(found[3, 0]) < 0.6 / np.sqrt(3.0)
     assert unsure.tolist() == [False, True, True, True, True]
+
+
+def test_a_robot_goes_no_farther_beside_its_mean_speed_than_it_can_accelerate() -> None:
+    odometry = straight(5, 0.1)
+    first = replace(anchor(1, Pose2(), Pose2(), SURE, begins=True), at=AtStamp(0))
+
+    def sigma(seconds: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        """Along the path, at even times in a slip of 0.6 m."""
+        stamps = np.round(np.arange(5) * seconds / 4.0 * 1e9).astype(np.int64)
+        last = replace(anchor(5, Pose2(0.4, 0.0, 0.0), Pose2(1.0, 0.0, 0.0), SURE), at=AtStamp(int(stamps[-1])))
+        matched = smooth_matches([first, last], OdometryNoise())
+        variances, _ = bridge_variances(odometry, [first, last], matched, OdometryNoise(), stamps_ns=stamps)
+        return np.asarray(np.sqrt(variances[:, 0]))
+
+    assert sigma(10.0)[2] == pytest.approx(0.6 / np.sqrt(12.0), abs=0.01), "there is time for all of it"
+    # 5 m/s^2 over 0.1 s to either side: 2.5 cm by the robot, and as much by the odometry.
+    expected = np.hypot(0.05 / np.sqrt(3.0), 0.02)
+    assert sigma(0.2)[2] == pytest.approx(expected, abs=0.01)
+    assert sigma(0.2)[1:4].max() < 0.05
 
 
 GAP = Interpolation(0, 1_000_000_000, 0.01, 0.04)

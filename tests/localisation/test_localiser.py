@@ -13,7 +13,7 @@ from scripted_matcher import ScriptedMatcher, localiser, odometry, paired
 from hsloc.errors import ConfigError
 from hsloc.localisation.parameters import LocaliserParameters
 from hsloc.matching import Hide
-from hsloc.model import Pose2, Status
+from hsloc.model import IDENTITY, Pose2, Status
 
 if TYPE_CHECKING:
     from hsloc.localisation.localiser import Localiser
@@ -66,15 +66,19 @@ def test_a_match_below_the_least_fitness_is_refused() -> None:
     assert estimate.T_map_base == Pose2()
 
 
+REFUSED = [0.1, 0.1, 0.1]
+"""Of a scan: in the narrow window, in the wide one, and within reach."""
+
+
 def test_a_match_far_below_the_usual_fitness_is_refused() -> None:
-    matcher = ScriptedMatcher([0.9, 0.5, 0.5])
+    matcher = ScriptedMatcher([0.9, 0.5, 0.5, 0.5])
     estimates = drive(localiser(matcher), range(2))
     assert estimates[1].status is Status.REJECTED
     assert estimates[1].reason == "fitness 0.50 far below the usual 0.90"
 
 
 def test_a_refused_match_grows_the_covariance() -> None:
-    matcher = ScriptedMatcher([0.9, 0.2, 0.2])
+    matcher = ScriptedMatcher([0.9, 0.2, 0.2, 0.2])
     first, second = drive(localiser(matcher), range(2))
     assert first.covariance is not None
     assert second.covariance is not None
@@ -93,27 +97,36 @@ def test_after_a_refusal_a_wide_window_is_searched_and_a_convincing_match_in_it_
 
 @pytest.mark.parametrize("wide_fitness", [0.80, 0.58])
 def test_a_wide_match_must_reach_most_of_the_usual_fitness(wide_fitness: float) -> None:
-    matcher = ScriptedMatcher([0.9, 0.5, wide_fitness])
+    matcher = ScriptedMatcher([0.9, 0.5, wide_fitness, 0.5])
     assert drive(localiser(matcher), range(2))[1].status is Status.REJECTED
 
 
+def test_a_match_within_reach_is_taken_only_where_scans_say_that_the_odometry_is_wrong() -> None:
+    # The scan is the same from everywhere: from scan to scan the robot did not move.
+    matcher = ScriptedMatcher([0.9, 0.5, 0.5, 0.9])
+    assert drive(localiser(matcher), range(2))[1].status is Status.REJECTED
+    assert matcher.windows[3].half_x == pytest.approx(0.6 + matcher.windows[1].half_x)
+    matcher = ScriptedMatcher([0.9, 0.5, 0.5, 0.9], offsets=[IDENTITY] * 3 + [Pose2(-0.3, 0.0, 0.0)])
+    assert drive(localiser(matcher), range(2))[1].status is Status.MATCHED
+
+
 def test_the_window_widens_with_every_refusal() -> None:
-    matcher = ScriptedMatcher([0.9] + [0.1, 0.1] * 4)
+    matcher = ScriptedMatcher([0.9, *REFUSED * 4])
     drive(localiser(matcher), range(5))
-    half = [window.half_x for window in matcher.windows[1::2]]
+    half = [window.half_x for window in matcher.windows[1::3]]
     assert half == sorted(half)
     assert half[-1] > half[0]
 
 
 def test_the_fifth_refusal_in_a_row_starts_the_search() -> None:
-    matcher = ScriptedMatcher([0.9] + [0.1, 0.1] * 5)
+    matcher = ScriptedMatcher([0.9, *REFUSED * 5])
     estimates = drive(localiser(matcher), range(6))
     assert [e.status for e in estimates] == [Status.MATCHED] + [Status.REJECTED] * 4 + [Status.SEARCHING]
     assert estimates[-1].reason == "lost: fitness 0.10 below 0.30"
 
 
 def test_an_accepted_match_forgives_the_refusals_before() -> None:
-    matcher = ScriptedMatcher([0.9] + [0.1, 0.1] * 4 + [0.9] + [0.1, 0.1] * 4)
+    matcher = ScriptedMatcher([0.9, *REFUSED * 4, 0.9, *REFUSED * 4])
     statuses = [e.status for e in drive(localiser(matcher), range(10))]
     assert Status.SEARCHING not in statuses
 

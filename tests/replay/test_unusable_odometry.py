@@ -13,8 +13,6 @@ import pytest
 from hsloc.cli.main import main
 from hsloc.evaluation import evaluate
 from hsloc.log import ReadOptions, open_log
-from hsloc.log.messages import definitions, encode
-from hsloc.log.messages.decode import odometry as decode_odometry
 from hsloc.model import Odometry, Pose2, Scan
 from hsloc.preprocessing.odometry import OdometryWatch, UnusableOdometry
 from hsloc.replay.run import run
@@ -25,29 +23,6 @@ if TYPE_CHECKING:
 
 OFFICE = Path(__file__).resolve().parents[2] / "recordings" / "office.mcap"
 END = ReadOptions(end_s=14.0)
-
-
-def rewritten(target: Path, change: Callable[[int, Pose2], Pose2 | None]) -> Path:
-    """The office with other odometry: `change` gets number and pose of a message; None is a quaternion of zeros."""
-
-    def items() -> list[log_formats.Message]:
-        found, number = [], 0
-        for schema, channel, log_time, data in log_formats.messages(OFFICE):
-            if channel.topic == "/tf":
-                continue
-            if schema.name == definitions.ODOMETRY and channel.topic == "/odom":
-                message = decode_odometry(data)
-                pose = change(number, message.pose)
-                number += 1
-                kept = message.pose if pose is None else pose
-                data = encode.odometry(message.stamp_ns, kept, None, (0.0, 0.0, 0.0), ("odom", "base_link"))
-                if pose is None:
-                    at = len(data) - 680
-                    data = data[: at + 24] + bytes(32) + data[at + 56 :]
-            found.append((schema, channel, log_time, data))
-        return found
-
-    return log_formats.write(target, items(), OFFICE)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +38,7 @@ def rewritten(target: Path, change: Callable[[int, Pose2], Pose2 | None]) -> Pat
 def test_unusable_odometry_is_ignored_with_a_warning(
     tmp_path: Path, change: Callable[[int, Pose2], Pose2 | None], reason: str
 ) -> None:
-    log = rewritten(tmp_path / "log.mcap", change)
+    log = log_formats.with_odometry(tmp_path / "log.mcap", OFFICE, change)
     result = run(RunRequest(logs=(log,), read=END))
     (warning,) = [warning for warning in result.warnings if warning.code == "odometry_unusable"]
     assert reason in warning.text
@@ -85,7 +60,7 @@ def test_sound_odometry_is_kept(tmp_path: Path) -> None:
 def test_a_map_is_built_without_the_odometry_that_does_not_move(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = rewritten(tmp_path / "log.mcap", lambda number, pose: Pose2(0.0, 0.0, 0.0))
+    log = log_formats.with_odometry(tmp_path / "log.mcap", OFFICE, lambda number, pose: Pose2(0.0, 0.0, 0.0))
     result = run(RunRequest(logs=(log,), read=END, mode="slam"))
     assert any(warning.code == "odometry_unusable" for warning in result.warnings)
     assert result.reference is not None

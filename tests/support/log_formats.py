@@ -17,13 +17,15 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from hsloc.log.messages import decode, definitions
+from hsloc.log.messages import decode, definitions, encode
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
     from mcap.records import Channel, Schema
+
+    from hsloc.model import Pose2
 
 SECOND = 1_000_000_000
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
@@ -304,3 +306,26 @@ def _fill(message: Any, content: dict[str, Any]) -> None:
             getattr(message, key).extend(value)
         else:
             setattr(message, key, value)
+
+
+def with_odometry(target: Path, source: Path, change: Callable[[int, Pose2], Pose2 | None]) -> Path:
+    """A simulated log with other odometry: `change` gets number and pose of a message; None is no rotation."""
+
+    def items() -> list[Message]:
+        found, number = [], 0
+        for schema, channel, log_time, data in messages(source):
+            if channel.topic == "/tf":
+                continue
+            if schema.name == definitions.ODOMETRY and channel.topic == "/odom":
+                message = decode.odometry(data)
+                pose = change(number, message.pose)
+                number += 1
+                kept = message.pose if pose is None else pose
+                data = encode.odometry(message.stamp_ns, kept, None, (0.0, 0.0, 0.0), ("odom", "base_link"))
+                if pose is None:
+                    at = len(data) - 680
+                    data = data[: at + 24] + bytes(32) + data[at + 56 :]
+            found.append((schema, channel, log_time, data))
+        return found
+
+    return write(target, items(), source)

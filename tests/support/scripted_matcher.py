@@ -43,17 +43,22 @@ def odometry(x: float, stamp_s: float) -> Odometry:
 
 
 class ScriptedMatcher:
-    """Answers with the next fitness of a list, at the window's centre moved by `offset`; records each window."""
+    """Answers with the next fitness of a list, at the window's centre moved by `offset`; records each window.
 
-    def __init__(self, fitness: Sequence[float], offset: Pose2 = IDENTITY) -> None:
+    `offsets`, one for each fitness, go before `offset`.
+    """
+
+    def __init__(
+        self, fitness: Sequence[float], offset: Pose2 = IDENTITY, offsets: Sequence[Pose2] | None = None
+    ) -> None:
         self.fitness = list(fitness)
-        self.offset = offset
+        self.offsets = [offset] * len(fitness) if offsets is None else list(offsets)
         self.windows: list[Window] = []
 
     def match(self, points: NDArray[np.float64], field: LikelihoodField, window: Window, rng: Generator) -> Match:
         self.windows.append(window)
         fitness = self.fitness.pop(0)
-        return Match(window.centre @ self.offset, fitness, np.eye(3) * 1e-4, 7, StopReason.BUDGET)
+        return Match(window.centre @ self.offsets.pop(0), fitness, np.eye(3) * 1e-4, 7, StopReason.BUDGET)
 
 
 def localiser(

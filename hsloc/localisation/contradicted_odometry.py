@@ -43,6 +43,8 @@ class ContradictedOdometry:
         self._sigma = sigma
         self._known: _Known | None = None
         self._way = 0.0
+        self.is_slipping = False
+        """Whether the wheels slipped before the last match: they may go on."""
 
     def move(self, way: float) -> None:
         """The odometry counted `way` (m) more."""
@@ -54,7 +56,12 @@ class ContradictedOdometry:
 
     def lost(self) -> None:
         """The pose is unknown from now on."""
-        self._known, self._way = None, 0.0
+        self._known, self._way, self.is_slipping = None, 0.0, False
+
+    def slipped(self, may_be: bool, T_odom_base: Pose2, T_map_base: Pose2, points: F64) -> bool:
+        """Whether the wheels slipped before a match where they may have, by what the scans show."""
+        self.is_slipping = may_be and self.is_seen(T_odom_base, T_map_base, points)
+        return self.is_slipping
 
     def half_widths(self, predicted: Pose2) -> tuple[float, float]:
         """Half-widths (m) of the window around a prediction that has all places within reach; 0 if these are many."""

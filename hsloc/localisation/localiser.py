@@ -28,10 +28,9 @@ from hsloc.localisation.odometry_scale import OdometryScale, OdometryScaleEstima
 from hsloc.localisation.place_check import PlaceCheck
 from hsloc.localisation.relocaliser import Relocaliser
 from hsloc.localisation.track_evidence import TrackMonitor
-from hsloc.matching.certificate import certify
+from hsloc.localisation.track_matcher import TrackMatcher
 from hsloc.matching.covariance import match_information
 from hsloc.matching.exact import heuristic
-from hsloc.matching.local_refinement import refine
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Estimate, Evidence, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
@@ -51,10 +50,6 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
 
 
-_AS_USUAL = 0.98
-"""Ratio to the usual fitness from which the optimum next to the prediction is taken without a search."""
-_TRUSTED = 0.5
-"""Trust in a match from which on the robot was there: at 0.85 of the usual fitness."""
 _MOVED_M, _MOVED_RAD = 0.1, radians(3.0)
 """How far a robot whose odometry stands still is found from there if it was moved: less makes no pose wrong, and people
 shift the optimum by some centimetres."""
@@ -106,13 +101,11 @@ class Localiser:
         self._innovations = Innovations()
         self._odometry_scale = OdometryScaleEstimator()
         self._rest_gate = RestGate()
-        self._contradicted = ContradictedOdometry(likelihood.sigma)
-        # Where a proof is asked for, the optimum next to the prediction has none.
-        proves = parameters.certify or heuristic(matcher) is not matcher
-        self._refines = parameters.refine_first and not proves
         self._motion_gate = MotionGate(parameters.update_min_d, parameters.update_min_a)
         self._match_gate = MatchGate(parameters.match_limits())
         self._searching = initial_pose is None
+        self._contradicted = ContradictedOdometry(likelihood.sigma)
+        self._track_matcher = TrackMatcher(likelihood, matcher, parameters, self._match_gate, self._contradicted, rng)
 
     @classmethod
     def from_parameters(
@@ -199,7 +192,7 @@ class Localiser:
             evidence = None if self._monitor is None else self._monitor.skipped()
             covariance = self._reported(covariance)
             return Estimate(scan.stamp_ns, predicted, Status.NO_RETURNS, covariance, reason=reason, evidence=evidence)
-        match, evaluations = self._match(points, T_odom_base, predicted, covariance)
+        match, evaluations = self._track_matcher.match(points, T_odom_base, predicted, covariance)
         reason = self._match_gate.refusal(match.fitness)
         is_hidden = bool(reason) and self._is_hidden(paired, match)
         if reason and not is_hidden:
@@ -214,12 +207,13 @@ class Localiser:
                 information = self._match_gate.trust(match.fitness) * information
                 weight = self._innovations.add(off, information, propagated, noise)
             self._odometry_scale.update(off, covariance, weight)
-            if is_usual and is_slip(off, weight) and self._contradicted.is_seen(T_odom_base, match.pose, points):
+            may_slip = is_usual and is_slip(off, weight)
+            if self._contradicted.slipped(may_slip, T_odom_base, match.pose, points):
                 covariance = covariance + np.outer(off, off)  # a mean of prediction and match would be neither
             pose, covariance = fuse_match(predicted, covariance, match, information)
         else:
             pose, covariance = match.pose, match.covariance
-        if self._match_gate.trust(match.fitness) >= _TRUSTED:
+        if is_usual:
             self._contradicted.known(T_odom_base, pose, points)
         if is_hidden:
             self._match_gate.accept_hidden()
@@ -299,41 +293,6 @@ class Localiser:
     def _reported(self, covariance: F64) -> F64:
         """A covariance with the scale of the innovations; never smaller than the filter's."""
         return self._innovations.excess * covariance
-
-    def _match(self, points: F64, T_odom_base: Pose2, predicted: Pose2, covariance: F64) -> tuple[Match, int]:
-        """Match in the window of the prediction; a match that is not as fit as usual may give way in a wider window."""
-        p = self._parameters
-        window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
-        usual = self._match_gate.usual
-        evaluations = 0
-        if self._refines and usual is not None:
-            refined = refine(points, self._field, window)
-            if refined.fitness >= _AS_USUAL * usual and self._match_gate.refusals == 0:
-                return refined, refined.evaluations
-            evaluations = refined.evaluations
-        best = self._match_in(points, window)
-        evaluations += best.evaluations
-        if not self._match_gate.fits_as_usual(best.fitness):
-            wide = window.at_least(p.wide_window, p.wide_window, p.wide_window_angle)
-            match = self._match_in(points, wide)
-            evaluations += match.evaluations
-            if self._match_gate.gives_way(best.fitness, match.fitness):
-                return match, evaluations
-            x, y = self._contradicted.half_widths(predicted)
-            if max(x, y) > p.wide_window:
-                reach = wide.at_least(window.half_x + x, window.half_y + y, wide.half_theta)
-                match = self._match_in(points, reach)
-                evaluations += match.evaluations
-                is_fit = self._match_gate.gives_way(best.fitness, match.fitness)
-                if is_fit and self._contradicted.is_seen(T_odom_base, match.pose, points):
-                    best = match
-        return best, evaluations
-
-    def _match_in(self, points: F64, window: Window) -> Match:
-        match = self._matcher.match(points, self._field, window, self._rng)
-        if self._parameters.certify and match.certificate is None:
-            return certify(match, points, self._field, window, self._parameters.certificate)
-        return match
 
     def _refuse(
         self, paired: PairedScan, predicted: Pose2, covariance: F64, match: Match, evaluations: int, reason: str

@@ -40,6 +40,14 @@ class Window:
         """(half_x, half_y, half_theta), shape (3,)."""
         return np.array((self.half_x, self.half_y, self.half_theta))
 
+    def has_on_border(self, pose: Pose2) -> bool:
+        """Whether a pose lies on the border of the box, or within a hundredth of it: an optimum may lie beyond."""
+        return (
+            abs(pose.x - self.centre.x) >= 0.99 * self.half_x
+            or abs(pose.y - self.centre.y) >= 0.99 * self.half_y
+            or abs(wrap_angle(pose.theta - self.centre.theta)) >= 0.99 * self.half_theta
+        )
+
     def contains(self, pose: Pose2) -> bool:
         """Whether a pose lies in the box, its border included."""
         return (

@@ -12,7 +12,7 @@ from hsloc.analysis.map_changes import HIDDEN
 from hsloc.evaluation.association import interpolate_poses
 from hsloc.evaluation.maps import MOST_GONE
 from hsloc.localisation.mounting_error import mounting_error_of_steps
-from hsloc.localisation.states import localisation_reasons
+from hsloc.localisation.reasons import localisation_reasons
 from hsloc.model.pose2 import Pose2
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
 from hsloc.replay.clock_offset import KNOWN, matched_headings

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hsloc.model.estimate import Evidence
+    from hsloc.model.estimate import Evidence, Revised
     from hsloc.model.events import PairedScan
     from hsloc.model.pose2 import Pose2
 
@@ -49,8 +49,8 @@ class RelocaliserResult:
     evaluations: int
     is_sure: bool
     reason: str
-    track: tuple[tuple[int, Pose2], ...] = ()
-    """Once it is sure: T_map_odom since the search began, as (odometry messages before, T_map_odom)."""
+    track: tuple[Revised, ...] = ()
+    """Once it is sure: the poses at the scans since the search began."""
     track_is_whole: bool = False
     """Whether the track goes back to the first scan of the search."""
     state: State = State.LOST

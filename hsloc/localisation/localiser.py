@@ -32,7 +32,7 @@ from hsloc.localisation.track_matcher import TrackMatcher
 from hsloc.matching.covariance import match_information
 from hsloc.matching.exact import heuristic
 from hsloc.matching.window import Window
-from hsloc.model.estimate import Estimate, Evidence, Status
+from hsloc.model.estimate import Estimate, Evidence, Revised, Status
 from hsloc.model.events import HELD, Odometry, PairedScan
 from hsloc.model.pose2 import IDENTITY, Pose2, rotated
 
@@ -340,12 +340,11 @@ class Localiser:
             places=result.places,
         )
 
-    def _revision(self, result: RelocaliserResult) -> tuple[tuple[int, Pose2], ...]:
+    def _revision(self, result: RelocaliserResult) -> tuple[Revised, ...]:
         """The winner's way since the search began; its first pose holds back to that moment, if it goes back so far."""
         if not result.track or not result.track_is_whole:
             return result.track
-        (_, first), *rest = result.track
-        return ((self._search_began, first), *rest)
+        return Revised(self._search_began, result.track[0].T_map_odom), *result.track
 
     def _take(self, pose: Pose2, covariance: F64, paired: PairedScan) -> None:
         self._covariance = covariance

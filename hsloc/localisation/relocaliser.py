@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise
-from math import hypot, radians
+from math import hypot
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,11 +31,10 @@ from hsloc.localisation.hypotheses import (
     quick_matcher,
     search_text,
 )
-from hsloc.localisation.kalman_filter import fuse_match, predict_covariance
 from hsloc.localisation.place_check import USUAL_EXPLAINED, PlaceCheck
+from hsloc.localisation.retraced_scans import STEP_WINDOW, RetracedScan, Retracer, revised
 from hsloc.localisation.track_evidence import MOST_FROM_RIVAL, place_evidence, rival_evidence
 from hsloc.localisation.whole_map_search import join_scans
-from hsloc.matching.covariance import match_information
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Evidence, State
 from hsloc.model.pose2 import Pose2
@@ -100,7 +99,6 @@ class RelocaliserParameters(Parameters):
     """Mean fitness of the best hypothesis below which the search starts again."""
 
 
-_STEP_WINDOW = (0.25, 0.25, radians(8.0))
 _REFINE_POINTS = 120
 """Points with which a place is refined before its record is made."""
 _OF_SEVERAL = 0.5
@@ -117,8 +115,6 @@ _WEIGHED_AGAIN = 4
 """It is weighed again after at most this number of scans: on a large map that takes a second."""
 _OFF_MAP = 0.87
 """Explained fitness by the usual one below which the best place does not fit."""
-_TRACE_LOST = 3
-"""Scans in a row that fit nowhere near, going backwards: before them the robot was elsewhere, or is not known."""
 REMEMBERED = 1000
 """Scans of a search that are kept to retrace the way; older ones are forgotten, so that memory is bounded."""
 
@@ -247,7 +243,7 @@ class Relocaliser:
         seen = list(self._seen)[-min(count, _JOINED if self._is_poor() else RECORDED) :]
         for k in range(len(seen) - 1, -1, -1):
             _, points, paired = seen[k]
-            match = self._quick.match(points, self._field, Window(at, *_STEP_WINDOW), self._rng)
+            match = self._quick.match(points, self._field, Window(at, *STEP_WINDOW), self._rng)
             evaluations += match.evaluations
             history.append(match.fitness)
             if not trail:
@@ -261,7 +257,7 @@ class Relocaliser:
     def _advance(self, points: F64, motion: Pose2) -> int:
         """Move the hypotheses with the odometry and match them again."""
         evaluations = 0
-        half, _, half_angle = _STEP_WINDOW
+        half, _, half_angle = STEP_WINDOW
         spread = 3.0 * np.sqrt(np.diag(self._motion_model.covariance(motion)))
         half = max(half, float(spread[:2].max()))
         half_angle = max(half_angle, float(spread[2]))
@@ -312,7 +308,7 @@ class Relocaliser:
             evidence = self._weigh(best, motion)
             of_rivals = MOST_FROM_RIVAL if proven else max(rival_evidence(ratio), 0.0)
             sure = place_evidence(evidence, of_rivals, self._usual) >= p.min_evidence
-        track, whole = self._retrace(best, motion) if sure else ((), False)
+        track, fits = revised(self._trace(best, motion, REMEMBERED)) if sure else ((), False)
         return RelocaliserResult(
             pose,
             best.covariance if sure else None,
@@ -321,7 +317,7 @@ class Relocaliser:
             sure,
             search_text(best, len(self._hypotheses), lead),
             track,
-            whole,
+            fits and len(self._seen) < REMEMBERED,
             self._state,
             evidence if sure else None,
             self._places,
@@ -348,53 +344,19 @@ class Relocaliser:
         """What the last scans say for the winner: how the map explains them, and whether another place fits as well."""
         assert self._check is not None
         traced = self._trace(winner, motion, _WEIGHED)
-        said = [self._check.explain(paired, pose) for _, pose, paired, _ in traced]
-        scans = [(pose, self._check.few(paired.points_base())) for _, pose, paired, _ in traced]
-        path = sum(a[1].distance(b[1]) for a, b in pairwise(traced))
+        said = [self._check.explain(each.paired, each.pose) for each in traced]
+        scans = [(each.pose, self._check.few(each.paired.points_base())) for each in traced]
+        path = sum(a.pose.distance(b.pose) for a, b in pairwise(traced))
         means = np.mean([(e.fitness, e.short, e.through, e.unmapped) for e in said], axis=0)
         compared = self._check.compare(scans, winner.pose @ motion)
         return Evidence(path, float(means[0]), float(means[1]), float(means[2]), float(means[3]), *compared)
 
-    def _retrace(self, winner: Hypothesis, motion: Pose2) -> tuple[tuple[tuple[int, Pose2], ...], bool]:
-        """The scans seen while searching, localised backwards from where the robot is now known to be.
-
-        As far as they fit, and whether that is all of them: where several in a row do not, the trace is lost.
-        """
-        track: list[tuple[int, Pose2]] = []
-        misses = 0
-        for count, pose, paired, fits in self._trace(winner, motion, REMEMBERED):
-            misses = 0 if fits else misses + 1
-            track.append((count, pose @ paired.T_odom_base.inverse()))
-            if misses == _TRACE_LOST:
-                return tuple(reversed(track[:-misses])), False
-        whole = len(self._seen) < REMEMBERED
-        return tuple(reversed(track[: len(track) - misses])), whole and misses == 0
-
-    def _trace(self, winner: Hypothesis, motion: Pose2, most: int) -> list[tuple[int, Pose2, PairedScan, bool]]:
-        """(odometry messages before, T_map_base, scan, whether it fits) of the last scans, back to where none does."""
-        pose, covariance = winner.pose @ motion, winner.covariance
+    def _trace(self, winner: Hypothesis, motion: Pose2, most: int) -> list[RetracedScan]:
+        """The last scans, back to where none fits."""
         least = max(self._parameters.min_fitness, _FITS * winner.fitness)
-        traced: list[tuple[int, Pose2, PairedScan, bool]] = []
-        misses = 0
-        T_odom_next: Pose2 | None = None
-        for count, points, paired in reversed(self._seen):
-            T_odom_base = paired.T_odom_base
-            if T_odom_next is not None:
-                motion = T_odom_next.between(T_odom_base)
-                covariance = predict_covariance(covariance, pose, motion, self._motion_model.covariance(motion))
-                pose = pose @ motion
-            T_odom_next = T_odom_base
-            match = self._matcher.match(points, self._field, Window(pose, *_STEP_WINDOW), self._rng)
-            misses += 1
-            # What hides the walls is no reason to lose the trace.
-            fits = match.fitness >= least or (
-                self._check is not None and self._check.is_hidden(paired, match.pose, self._usual)
-            )
-            if fits:
-                information = match_information(points, self._field, match.pose)
-                pose, covariance = fuse_match(pose, covariance, match, information)
-                misses = 0
-            traced.append((count, pose, paired, fits))
-            if misses == _TRACE_LOST or len(traced) == most:
-                break
-        return traced
+        retracer = Retracer(self._field, self._matcher, self._motion_model, self._rng, self._is_hidden)
+        return retracer.trace(winner.pose @ motion, winner.covariance, least, reversed(self._seen), most)
+
+    def _is_hidden(self, paired: PairedScan, pose: Pose2) -> bool:
+        """What hides the walls is no reason to lose the trace."""
+        return self._check is not None and self._check.is_hidden(paired, pose, self._usual)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -14,7 +13,7 @@ from hsloc.localisation.kalman_filter import predict_covariance
 from hsloc.localisation.track_evidence import CONFIDENCE, States, TrackRow, mirrored_map, smooth, usual_explained
 from hsloc.model.estimate import Ambiguity, Evidence, LikelyPlace, State, Status
 from hsloc.model.pose2 import Pose2
-from hsloc.model.verdict import Verdict, VerdictReason, spans_of
+from hsloc.model.verdict import spans_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 
     F64 = NDArray[np.float64]
     from hsloc.model.occupancy_grid import OccupancyGrid
-    from hsloc.model.trajectory import Trajectory
 
 MAX_SIGMA = 0.1
 """Largest standard deviation of a localised pose in any direction (m): 2.5 of them are 0.25 m."""
@@ -38,29 +36,9 @@ _POOR_FIT = 0.92
 """Explained fitness by the usual one below which a doubted pose is taken for off the map."""
 _SETTLED = 5
 """Matches after which the covariance no longer knows how a track began."""
-_NAMED = 3
-"""Places that are named where several fit."""
 _CONTRADICTED = "scans fit, but by the odometry other stretches of the run are elsewhere"
 _OTHER_MAP = "scans fit, but not for long: the map may be of another place"
 _MIRRORED = "the scans fit the map better when they are mirrored"
-USABLE_SHARE = 0.5
-"""Least share of localised poses of a result that is usable as a whole."""
-TOLERATED_SHARE = 0.01
-"""Share of poses in another state than localised and predicted that is no reason against a result."""
-TOLERATED_PREDICTED = 0.05
-"""Share of predicted poses that is no reason against a result."""
-_REMEDIES = {
-    State.PREDICTED: "use the standard deviations in states.csv; a lidar with more range or field of view sees more",
-    State.AMBIGUOUS: "give the start (--initial-pose), or a longer log",
-    State.OFF_MAP: "give a map that covers the path, or extend this one (--resume)",
-    State.LOST: "give the start (--initial-pose); check map, mounting (--laser-pose) and odometry (hsloc check)",
-}
-_WORDS = {
-    State.PREDICTED: "predicted: no scan holds them well enough",
-    State.AMBIGUOUS: "ambiguous: several places of the map fit",
-    State.OFF_MAP: "off the map, or the map has changed there",
-    State.LOST: "lost",
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -279,7 +257,7 @@ class StateLog:
             owners[k] = len(rows)
             rows.append(TrackRow(estimate.status, estimate.evidence, begins))
             if estimate.revision:
-                since = estimate.revision[0][0]
+                since = estimate.revision[0].odometry_count
                 for j in range(k - 1, -1, -1):
                     if self._counts[j] < since or owners[j] >= 0:
                         break
@@ -290,14 +268,19 @@ class StateLog:
         """Standard deviations (n, 3): of a guess unknown; of refused scans between agreeing matches interpolated."""
         n = len(self._estimates)
         sigma = np.full((n, 3), np.nan)
+        revised: dict[int, F64 | None] = {}
         for k in range(n - 1, -1, -1):
             estimate = self._estimates[k]
             if owners[k] < 0:
                 continue
-            covariance = smoothed.get(k, estimate.covariance)
+            if estimate.revision:
+                revised = {each.odometry_count: each.covariance for each in estimate.revision}
+            is_revised = k + 1 < n and owners[k] == owners[k + 1]
+            of_trace = revised.get(self._counts[k]) if is_revised else None
+            covariance = smoothed.get(k, estimate.covariance) if of_trace is None else of_trace
             if covariance is not None:
                 sigma[k] = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-            elif k + 1 < n and owners[k] == owners[k + 1]:
+            elif is_revised:
                 sigma[k] = sigma[k + 1]
             if estimate.status is Status.RELOCALISED:
                 # Before it the scans were matched backwards, and are as sure as those matched forwards after it.
@@ -332,15 +315,6 @@ def _judge(probabilities: F64, sigma: F64, usual: float, before: Sequence[TrackR
     return State.LOCALISED, ""
 
 
-def _named_places(ambiguities: Sequence[Ambiguity]) -> str:
-    """The most probable places of the longest stretch."""
-    if not ambiguities:
-        return ""
-    longest = max(ambiguities, key=lambda each: each.end_ns - each.begin_ns)
-    places = [f"x {pose.x:.1f} m, y {pose.y:.1f} m ({100.0 * p:.0f} %)" for pose, p in longest.places[:_NAMED]]
-    return f", at {' or '.join(places)} {'' if len(longest.places) <= _NAMED else 'or others '}(hypotheses.csv)"
-
-
 def _named_rival(rows: Sequence[TrackRow]) -> str:
     """The other place of the last comparison, where it was found."""
     for row in reversed(rows):
@@ -360,40 +334,3 @@ def _last_explained(rows: Sequence[TrackRow]) -> Evidence | None:
         if np.isfinite(row.evidence.explained):
             return row.evidence
     return None
-
-
-def localisation_reasons(
-    rows: StateRows, trajectory: Trajectory, ambiguities: Sequence[Ambiguity] = ()
-) -> tuple[VerdictReason, ...]:
-    """A reason for each state that more poses are in than is tolerated, with where and when; none for a good result.
-
-    Of the longest of `ambiguities` it names the most probable places.
-    The result is to be checked, or has failed where less than half of the poses are localised.
-    """
-    n = len(rows)
-    if n == 0:
-        return ()
-    share = {state: count / n for state, count in Counter(rows.state).items()}
-    verdict = Verdict.CHECK if share.get(State.LOCALISED, 0.0) >= USABLE_SHARE else Verdict.FAILED
-    reasons = []
-    kinds = (State.OFF_MAP, State.LOST, State.AMBIGUOUS, State.PREDICTED)
-    for state in sorted(kinds, key=lambda each: -share.get(each, 0.0)):
-        part = share.get(state, 0.0)
-        if part <= (TOLERATED_PREDICTED if state is State.PREDICTED else TOLERATED_SHARE):
-            continue
-        spans = spans_of(np.array([each is state for each in rows.state]))
-        firsts = [first for first, _ in spans]
-        names = _named_places(ambiguities) if state is State.AMBIGUOUS else ""
-        start = int(trajectory.stamps_ns.min())
-        seconds = ((trajectory.stamps_ns - start) / 1e9).tolist()
-        reasons.append(
-            VerdictReason(
-                verdict,
-                f"poses_{state.value}",
-                f"{100.0 * part:.1f} % of the poses are {_WORDS[state]}{names}",
-                _REMEDIES[state],
-                places=() if names else tuple((float(x), float(y)) for x, y in trajectory.poses[firsts, :2]),
-                times=tuple((seconds[first], seconds[last]) for first, last in spans),
-            )
-        )
-    return tuple(reasons)

@@ -94,14 +94,24 @@ class Ambiguity:
     places: tuple[LikelyPlace, ...]
 
 
+class Revised(NamedTuple):
+    """What is known of earlier poses: T_map_odom from an odometry message (counted from 0) on, until the next.
+
+    `covariance` (3, 3) is that of T_map_base there, where a scan was matched; None where an end of those holds.
+    """
+
+    odometry_count: int
+    T_map_odom: Pose2
+    covariance: NDArray[np.float64] | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The pose of the base in the map at a stamp, and how it came about.
 
     `covariance` is 3 x 3 over (x, y, theta) in the map frame (m^2, m rad, rad^2). `fitness` is in (0, 1] where
     a scan was matched, else None. `evaluations` counts the fitness evaluations spent. `reason` is a text on
-    why a scan was skipped or refused. `revision` corrects earlier estimates:
-    pairs (k, T_map_odom), each valid from the k-th odometry message (from 0) until the next pair's.
+    why a scan was skipped or refused. `revision` corrects earlier estimates.
     """
 
     stamp_ns: int
@@ -111,7 +121,7 @@ class Estimate:
     fitness: float | None = None
     evaluations: int = 0
     reason: str = ""
-    revision: tuple[tuple[int, Pose2], ...] = ()
+    revision: tuple[Revised, ...] = ()
     state: State | None = None
     """What is known at once; None where the scans to come decide."""
     evidence: Evidence | None = None

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from array import array
+from dataclasses import replace
 from math import isfinite, sqrt
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from hsloc.localisation.between_matches import between_matches, bridge_variances
 from hsloc.localisation.interpolated_odometry import AtStamp
-from hsloc.localisation.kalman_filter import Anchor, SmoothedMatches, smooth_matches
+from hsloc.localisation.kalman_filter import Anchor, SmoothedMatches, noise_around, smooth_matches
 from hsloc.localisation.motion_models import OdometryNoise
 from hsloc.localisation.mounting_error import mounting_error, mounting_error_of_steps
+from hsloc.localisation.revised_poses import composed, revised_matches
 from hsloc.localisation.states import StateLog, with_odometry_alone, with_pose_errors
 from hsloc.model.estimate import ScanDiagnostics, State, Status
 from hsloc.model.events import Odometry, PairedScan, Truth
-from hsloc.model.pose2 import Pose2, compose_poses
+from hsloc.model.pose2 import Pose2
 from hsloc.model.trajectory import Trajectory
 from hsloc.preprocessing.scans import half_sweep_ns
 from hsloc.replay.matched_scans import are_matched, is_lost, mean_fitness
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
     from hsloc.localisation.mounting_error import MountingError
     from hsloc.localisation.states import StateRows
     from hsloc.model.certificate import Certificate
-    from hsloc.model.estimate import Ambiguity, Estimate
+    from hsloc.model.estimate import Ambiguity, Estimate, Revised
     from hsloc.model.occupancy_grid import OccupancyGrid
     from hsloc.slam.heading_offset import Offset
     from hsloc.slam.result import MappingResult
@@ -42,6 +44,14 @@ _SILENT_NS = 1e9
 """Time without scans (ns) from which poses follow the odometry alone: no lidar turns so slowly ..."""
 _SILENT_INTERVALS = 3.0
 """... and, in usual intervals of the scans, where a log holds only some of them."""
+
+
+class _Revision(NamedTuple):
+    """What a relocalisation says of the poses before the `end`-th, and the number of its anchor."""
+
+    end: int
+    track: tuple[Revised, ...]
+    anchor: int
 
 
 class RunHistory:
@@ -77,7 +87,7 @@ class RunHistory:
         self._certificates: list[Certificate] = []
         self._believed = 0
         self._searching = False
-        self._revisions: list[tuple[int, tuple[tuple[int, Pose2], ...]]] = []
+        self._revisions: list[_Revision] = []
 
     def add(self, event: Odometry | PairedScan | Truth, estimate: Estimate | None) -> None:
         """Take an event and what the estimator said to it."""
@@ -121,7 +131,7 @@ class RunHistory:
         if estimate.certificate is not None:
             self._certificates.append(estimate.certificate)
         if estimate.revision:
-            self._revisions.append((len(self._odometry_stamps), estimate.revision))
+            self._revisions.append(_Revision(len(self._odometry_stamps), estimate.revision, len(self._anchors)))
 
     def _anchor(self, paired: PairedScan, estimate: Estimate) -> None:
         if estimate.status is Status.SEARCHING:
@@ -210,10 +220,9 @@ class RunHistory:
             matched = self._smooth()
             # Where scans were refused before, the first match may be that of another place.
             is_first = self._anchor_scans[0] == 0
-            odometry = self.odometry().poses
             poses = between_matches(
                 estimated.poses,
-                odometry,
+                self.odometry().poses,
                 self._anchors,
                 matched,
                 leads_to_first=is_first,
@@ -222,15 +231,25 @@ class RunHistory:
             estimated = Trajectory(estimated.stamps_ns, poses)
         if not self._revisions:
             return estimated, np.array(self._localised, dtype=np.bool_)
-        odometry = self.odometry().poses
-        poses = estimated.poses.copy()
+        odometry = self.odometry()
+        poses = estimated.poses
         localised = np.array(self._localised, dtype=np.bool_)
-        for end, revision in self._revisions:
-            bounds = [k for k, _ in revision[1:]] + [end]
-            for (first, T_map_odom), last in zip(revision, bounds, strict=True):
-                poses[first:last] = compose_poses(T_map_odom.to_array(), odometry[first:last])
-                localised[first:last] = True
+        for revision in self._revisions:
+            poses = composed(poses, odometry.poses, revision.track, revision.end)
+            localised[revision.track[0].odometry_count : revision.end] = True
+            if self._motion_model is not None:
+                matches = self._revised(revision, odometry, self._motion_model)
+                poses = between_matches(poses, odometry.poses, *matches, interpolated=self._interpolated)
         return Trajectory(estimated.stamps_ns, poses), localised
+
+    def _revised(
+        self, revision: _Revision, odometry: Trajectory, model: MotionModel
+    ) -> tuple[list[Anchor], SmoothedMatches]:
+        """The matches of a revision, and the one that it leads to, smoothed."""
+        at, smoothed = revision.anchor, self._smooth()
+        found = replace(self._anchors[at], T_map_base=Pose2.from_array(smoothed.poses[at]))
+        found = replace(found, covariance=smoothed.covariances[at])
+        return revised_matches(revision.track, found, noise_around(self._anchors, at), odometry, model)
 
     def _smooth(self) -> SmoothedMatches:
         """The smoothed poses at the matches; of none without a motion model."""
@@ -263,6 +282,15 @@ class RunHistory:
         between, unsure = bridge_variances(
             odometry.poses, self._anchors, smoothed, model, self._interpolated, stamps_ns=odometry.stamps_ns
         )
+        for revision in self._revisions if self._motion_model is not None else ():
+            variances, of_slips = bridge_variances(
+                odometry.poses,
+                *self._revised(revision, odometry, model),
+                model,
+                self._interpolated,
+                stamps_ns=odometry.stamps_ns,
+            )
+            between, unsure = between + variances, unsure | of_slips
         rows = self._states.at_odometry(len(self._odometry_stamps), covariances, between)
         if self._motion_model is not None:
             noise, factor = self._motion_model, self._anchors[-1].noise_scale if self._anchors else 1.0

@@ -69,11 +69,11 @@ def test_the_winner_carries_the_poses_of_the_scans_before() -> None:
     _, verdicts, truth = search(L_SHAPE, ONE, 5)
     verdict = next(verdict for verdict in verdicts if verdict.is_sure)
     assert verdict.track_is_whole
-    counts = [count for count, _ in verdict.track]
+    counts = [each.odometry_count for each in verdict.track]
     assert counts == list(range(len(counts)))
     odometry = Pose2()
-    for (_, T_map_odom), true in zip(verdict.track, truth, strict=False):
-        assert near(T_map_odom @ odometry, true)
+    for each, true in zip(verdict.track, truth, strict=False):
+        assert near(each.T_map_odom @ odometry, true)
         odometry = odometry @ STEP
 
 

@@ -10,9 +10,10 @@ import pytest
 
 from hsloc.export.results_folder import STATES_HEADER, write_states
 from hsloc.localisation.motion_models import OdometryNoise
-from hsloc.localisation.states import StateLog, StateRows, localisation_reasons, with_odometry_alone, with_pose_errors
+from hsloc.localisation.reasons import localisation_reasons
+from hsloc.localisation.states import StateLog, StateRows, with_odometry_alone, with_pose_errors
 from hsloc.model import Estimate, Evidence, Pose2, State, Status, Trajectory
-from hsloc.model.estimate import LikelyPlace
+from hsloc.model.estimate import LikelyPlace, Revised
 from hsloc.model.verdict import Verdict, verdict_of
 
 if TYPE_CHECKING:
@@ -116,10 +117,18 @@ def test_an_ambiguous_stretch_names_its_places() -> None:
 
 def test_scans_before_a_relocalisation_belong_to_the_track_that_was_found() -> None:
     searching = [Estimate(k, Pose2(), Status.SEARCHING, evidence=Evidence(0.0), state=State.LOST) for k in range(4)]
-    found = estimate(4, status=Status.RELOCALISED, revision=((6, Pose2()),))
+    found = estimate(4, status=Status.RELOCALISED, revision=(Revised(6, Pose2()),))
     states = judged(*searching, found, *(estimate(k) for k in range(5, 20)))
     assert set(states.state[:6]) == {State.LOST}
     assert states.is_localised()[6:].all()
+
+
+def test_scans_before_a_relocalisation_are_as_sure_as_their_matches() -> None:
+    searching = [Estimate(k, Pose2(), Status.SEARCHING, evidence=Evidence(0.0), state=State.LOST) for k in range(4)]
+    track = (Revised(0, Pose2()), Revised(4, Pose2(), 0.04**2 * np.eye(3)))
+    states = judged(*searching, estimate(4, status=Status.RELOCALISED, revision=track))
+    np.testing.assert_allclose(states.sigma[:5, 0], 0.04)
+    np.testing.assert_allclose(states.sigma[6:, 0], 0.02)
 
 
 def test_a_pose_between_two_scans_is_no_surer_than_either() -> None:

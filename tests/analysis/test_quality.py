@@ -47,6 +47,7 @@ def test_a_sound_run_is_good() -> None:
     assert [each.code for each in quality_warnings(guessed)] == [WarningCode.SCANS_WITHOUT_PLACE]
 
 
+@pytest.mark.unmeasured
 def test_a_laser_that_is_mounted_upside_down_unstated_is_warned_of(tmp_path: Path) -> None:
     def mirrored(event: Any) -> Any:
         return replace(event, ranges=event.ranges[::-1].copy()) if isinstance(event, Scan) else event
@@ -71,6 +72,7 @@ def test_a_mirrored_map_is_named() -> None:
     assert [reason.verdict for reason in verdict_reasons(found, [warning])] == ["failed"]
 
 
+@pytest.mark.unmeasured
 def test_a_log_too_short_to_be_sure_is_all_guesses() -> None:
     found = run(RunRequest(logs=(OFFICE,), read=ReadOptions(end_s=0.5), unknown_start=True))
     assert not found.localised.any()

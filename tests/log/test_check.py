@@ -284,6 +284,7 @@ def test_as_json(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert report["intervals"]["/scan scans"]["usual_s"] == pytest.approx(0.1)
 
 
+@pytest.mark.unmeasured
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     peaks = []
     for scans in (1000, 4000):

@@ -70,6 +70,7 @@ def values(event: Event) -> tuple[object, ...]:
     return event.stamp_ns, event.T_odom_base if isinstance(event, Odometry) else event.T_map_base
 
 
+@pytest.mark.unmeasured
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_gives_the_same_trajectory(source: Path, name: str) -> None:
     file, convert = FORMATS[name]

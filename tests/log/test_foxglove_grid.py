@@ -119,6 +119,7 @@ def test_a_map_that_cannot_be_used_is_reported(tmp_path: Path, capsys: pytest.Ca
     assert "cannot use /map (foxglove.Grid); give one with --map map.yaml" in capsys.readouterr().err
 
 
+@pytest.mark.unmeasured
 def test_a_map_beside_the_log_is_reported_but_not_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = str(without_map(tmp_path / "hall.mcap"))
     options = ["--end", "2", "--overwrite", "--out", str(tmp_path / "out" / "run")]

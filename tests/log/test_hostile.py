@@ -124,6 +124,7 @@ def test_random_records_behind_a_good_start(
     read_all(path)
 
 
+@pytest.mark.unmeasured
 def test_every_truncation_is_a_log_with_losses_or_an_error(tmp_path: Path, seeds: list[bytes]) -> None:
     path = tmp_path / "log.mcap"
     for content in seeds:

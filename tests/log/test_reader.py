@@ -356,6 +356,7 @@ def test_a_log_that_vanishes_under_way_is_a_log_error(tmp_path: Path) -> None:
         list(log.events())
 
 
+@pytest.mark.unmeasured
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     import tracemalloc
 

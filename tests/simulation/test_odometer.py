@@ -100,6 +100,7 @@ def test_a_draw_is_held_so_that_the_interval_has_the_books_noise() -> None:
     assert fresh[:, 0].std() == pytest.approx(0.1 / 10**0.5, rel=0.07)
 
 
+@pytest.mark.unmeasured
 @pytest.mark.parametrize(
     "noise",
     [OdometryNoise(), OdometryNoise(interval_s=0.0, alpha2=1e-4), SteeringNoise(steering=radians(0.2))],

@@ -47,6 +47,7 @@ def test_checksums(name: str) -> None:
     assert sha256((FOLDER / f"{name}.mcap").read_bytes()).hexdigest() == SUMS[name]
 
 
+@pytest.mark.unmeasured
 @pytest.mark.parametrize("name", NAMES)
 def test_recorded_again_by_its_command(name: str, tmp_path: Path) -> None:
     """The same messages always; the same bytes wherever the same zstd packs them."""
@@ -73,6 +74,7 @@ def _contents(path: Path) -> tuple[Any, ...]:
         return messages, metadata, [(a.name, a.data) for a in reader.iter_attachments()]
 
 
+@pytest.mark.unmeasured
 @pytest.mark.parametrize("name", NAMES)
 def test_they_hold_what_the_readme_lists(name: str) -> None:
     world, seed, seconds = TABLE[name]

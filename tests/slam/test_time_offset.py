@@ -142,6 +142,7 @@ def test_scans_that_turn_against_the_odometry_are_mirrored_and_not_late() -> Non
     assert "angles=negate" in warning.remedy
 
 
+@pytest.mark.unmeasured
 @pytest.mark.parametrize("late", [0.0, 0.1, -0.25])
 def test_the_scans_of_a_log_alone_show_it(late: float) -> None:
     def shifted() -> list[Odometry | Scan]:
@@ -242,6 +243,7 @@ def test_late_scans_of_a_log_that_is_mapped_are_corrected(tmp_path: Path) -> Non
     assert max(means) < 0.02
 
 
+@pytest.mark.unmeasured
 def test_stamps_of_a_log_that_is_localised_are_corrected_unless_the_user_gives_them(tmp_path: Path) -> None:
     late = tmp_path / "late.mcap"
     convert_log(open_log((OFFICE,), replace(END, time_offset="/scan=0.2", end_s=20.0)), late)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import os
 import pkgutil
@@ -25,6 +26,10 @@ os.environ.setdefault("MPLCONFIGDIR", str(ROOT / "build" / "matplotlib"))
 import hsloc
 import hsloc_service
 from hsloc.trajectory_io.tum import write_tum
+
+# To look for garbage among all that is imported takes a quarter of the time of tests that compute; `hsloc` itself looks
+# even less often.
+gc.set_threshold(20_000, 20, 20)
 
 # How long an example takes depends on how busy the machine is.
 settings.register_profile("hsloc", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -51,6 +56,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     mixed = [file for pair in zip_longest(computing, waiting) for file in pair if file is not None]
     places = {file: place for place, file in enumerate(mixed)}
     items.sort(key=lambda item: places[item.path])
+
+
+def pytest_collection_finish() -> None:
+    """Tests, modules and what they hold stay to the end: the collection of garbage need not look at them."""
+    gc.collect()
+    gc.freeze()
 
 
 @cache

@@ -82,7 +82,7 @@ def _with_choices(
     """Options and findings; of mountings that are stated twice the one that scans and odometry agree with."""
     from hsloc.errors import HslocError
     from hsloc.log import Finding, Severity
-    from hsloc.slam.front_end import FrontEndParameters
+    from hsloc.slam.front_end_parameters import FrontEndParameters
     from hsloc.slam.mounting_choice import direction_warnings, with_chosen_mountings
     from hsloc.warnings import WarningCode
 
@@ -121,7 +121,7 @@ def _of_odometry(log: Log) -> list[Finding]:
 def _offsets(options: ReadOptions, log: Log) -> dict[str, Offset]:
     """The offset between the stamps of scans and odometry, where the motion determines it."""
     from hsloc.errors import HslocError
-    from hsloc.slam.front_end import FrontEndParameters
+    from hsloc.slam.front_end_parameters import FrontEndParameters
     from hsloc.slam.time_offset import offsets_of_log
 
     if log.summary.scan_topic is None or not (log.summary.odom_topic or log.summary.heading_topic):

@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hsloc.atomic_write import is_there
     from hsloc.errors import OutputError
     from hsloc.log import convert_log, open_log
-    from hsloc.slam.front_end import FrontEndParameters
+    from hsloc.slam.front_end_parameters import FrontEndParameters
     from hsloc.slam.mounting_choice import with_chosen_mountings
     from hsloc.warnings import WarningCode
 

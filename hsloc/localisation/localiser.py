@@ -175,7 +175,7 @@ class Localiser:
         interpolated = motion_variances(self._matched_at, AtStamp(scan.stamp_ns, paired.interpolation))
         unsure = _UNSURE * sqrt(interpolated[0]), _UNSURE * sqrt(interpolated[2])
         if not self._match_gate.is_fresh and not self._motion_gate.is_open(motion, unsure):
-            if not (self._rest_gate.stands and self._is_moved(paired, predicted)):
+            if not self._is_moved(paired, predicted):
                 return Estimate(scan.stamp_ns, predicted, Status.PREDICTED, reason="motion gate")
             self._covariance = self._covariance + self._parameters.slip_covariance(_MOVED_WINDOW)
         propagated = predict_covariance(self._covariance, self._T_map_match, motion, np.zeros((3, 3)))
@@ -250,7 +250,7 @@ class Localiser:
         return self._monitor.is_hidden(paired, match.pose)
 
     def _is_moved(self, paired: PairedScan, predicted: Pose2) -> bool:
-        """Whether a scan shows that a robot moves whose odometry stands still: pushed, carried, or with frozen wheels.
+        """Whether a scan shows that a robot moves whose odometry hardly does: pushed, carried, or with frozen wheels.
 
         It then fits elsewhere nearby, or nowhere, and beams end behind walls: those that people hide do not.
         """

@@ -9,20 +9,17 @@ the log is read, a scan that it explains is followed on it and is no keyscan (`h
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from math import hypot, radians
+from dataclasses import dataclass, replace
+from math import hypot
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate
+from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate, RestGate
 from hsloc.localisation.kalman_filter import predict_covariance
-from hsloc.localisation.motion_models import OdometryNoise
-from hsloc.matching.hide import Hide
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Status
 from hsloc.model.pose2 import IDENTITY, Pose2, rotated, wrap_angle
-from hsloc.parameters import Angle, Count, NonNegative, Parameters, Positive, Ratio
 from hsloc.slam.calibration import FLOOR, WeighedOdometry
 from hsloc.slam.known_map import KnownMap, KnownMapTracker
 from hsloc.slam.local_map import LocalMap
@@ -33,59 +30,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.model.events import PairedScan
+    from hsloc.slam.front_end_parameters import FrontEndParameters
     from hsloc.slam.known_map import Anchor
     from hsloc.slam.scan_registration import MovingScan, ScanRegistration
 
     F64 = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrontEndParameters(Parameters):
-    """When a scan becomes a keyscan, what it is matched against and in which window."""
-
-    keyscan_min_d: NonNegative = 0.1
-    """Minimum translation between two keyscans [m]; a larger rotation alone makes a keyscan, too."""
-    keyscan_min_a: NonNegative = 0.05
-    """Minimum rotation between two keyscans [rad]; a larger translation alone makes a keyscan, too."""
-    min_points: Count = 20
-    """Minimum number of hits of a scan that is matched."""
-    local_range: Positive = 30.0
-    """Maximum range of the hits that the front end uses [m]."""
-    resolution: Positive = 0.05
-    """Distance of two nodes of the local likelihood field [m]."""
-    sigma: Positive = 0.1
-    """Decay length of a point's score with its distance from a wall of the local map [m]."""
-    max_distance: Positive = 0.4
-    """Distance from a wall of the local map beyond which a point scores zero [m]."""
-    submap_length: Positive = 4.0
-    """Path length after which a new local map begins [m]; it is matched against after the same length again."""
-    turn_length: NonNegative = 0.3
-    """Path length that a rotation of one radian counts as [m]."""
-    window_sigmas: Positive = 3.0
-    """Half-width of the search window in standard deviations of the prediction."""
-    window_min: Positive = 0.1
-    """Minimum half-width of the search window in x and y [m]."""
-    window_min_angle: Angle = radians(4.0)
-    """Minimum half-width of the search window in heading [rad]."""
-    wide_window: Positive = 0.6
-    """Half-width of the window that is searched after a refused registration [m]; the length of the step is added."""
-    wide_window_angle: Angle = radians(90.0)
-    """Half-width in heading of the window that is searched after a refused registration [rad]."""
-    min_fitness: Ratio = 0.35
-    """Minimum fitness of a match that contradicts the odometry."""
-    min_fitness_ratio: Ratio = 0.9
-    """Minimum ratio of the fitness of a match that contradicts the odometry to the usual fitness, a running mean."""
-    restart_after: Count = 3
-    """Number of refused matches in a row after which a new local map begins."""
-    hide: Hide = field(default_factory=lambda: Hide(restarts=6, agreement=2, budget=200, memory_size=20))
-    """Search of the window of the prediction."""
-    hide_wide: Hide = field(default_factory=lambda: Hide(restarts=16, agreement=3, budget=400))
-    """Search of the wide window."""
-    odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
-    no_odometry_window: Positive = 0.6
-    """Half-width of the window around the constant-velocity prediction where there is no odometry [m]."""
-    no_odometry_window_angle: Angle = radians(45.0)
-    """Half-width in heading of the window around the constant-velocity prediction [rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,6 +83,7 @@ _SLIP = 0.3
 """Standard deviation [m] of a motion that the scans contradict, without saying what it was."""
 _SLIP_ANGLE = 0.3
 """And of its turn [rad]."""
+_OF_SLIP = np.diag((_SLIP**2, _SLIP**2, _SLIP_ANGLE**2))
 _LONGEST_SLIP_M = 5.0
 """Way [m] that wheels may slip in a step, at most. Scans may be 2.8 m apart in logs of which only some were kept (ACES,
 every fourth scan: with 2.5 m its map is lost); over gaps of 10 m and more look-alikes were taken for the same place."""
@@ -158,6 +108,7 @@ class FrontEnd:
         self._way = 0.0
         p = parameters
         self._motion_gate = MotionGate(p.keyscan_min_d, p.keyscan_min_a)
+        self._rest_gate = RestGate()
         self._known_map_gate = MotionGate(_SPARSER * p.keyscan_min_d, _SPARSER * p.keyscan_min_a)
         ratio = p.min_fitness_ratio
         self._match_gate = MatchGate(
@@ -198,10 +149,13 @@ class FrontEnd:
             first = LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.MATCHED, True, 1.0)
             return self._keep(paired, points, self._near(points), first)
         motion, covariance = self._predict(paired)
+        self._rest_gate.follow(paired.T_odom_base)
         predicted, tracker = self._T_map_key @ motion, self._tracker
         gate = self._known_map_gate if tracker is not None and tracker.is_following else self._motion_gate
         if self._use_odometry and not gate.is_open(motion):
-            return LocalMatch(predicted, motion, covariance, Status.PREDICTED, False, reason="motion gate")
+            if not self._is_moved(paired, predicted):
+                return LocalMatch(predicted, motion, covariance, Status.PREDICTED, False, reason="motion gate")
+            covariance = covariance + _OF_SLIP
         points = paired.points_base()
         near = self._near(points)
         if len(points) < p.min_points:
@@ -215,6 +169,22 @@ class FrontEnd:
         if not self._use_odometry:
             found = self._without_odometry(paired, found)
         return self._keep(paired, points, near, found) if found.is_keyscan else found
+
+    def _is_moved(self, paired: PairedScan, predicted: Pose2) -> bool:
+        """Whether a scan shows that a robot moves whose odometry hardly does: pushed, or with frozen wheels."""
+        is_on_map = self._tracker is not None and self._tracker.is_following
+        if is_on_map:
+            return False
+        points = paired.points_base()
+        near = self._near(points)
+        if len(points) < self._parameters.min_points:
+            return False
+        if not self._rest_gate.is_open(self._maps[0][0].fitness(near, predicted)):
+            return False
+        found, _ = self._search(near, moving_scans(paired, points), predicted, _OF_SLIP)
+        is_moved = not found.refusal() and self._motion_gate.is_open(predicted.between(found.pose))
+        self._rest_gate.searched(is_moved)
+        return is_moved
 
     def _near(self, points: F64) -> F64:
         """The points (n, 2) within the range that is used."""
@@ -285,11 +255,12 @@ class FrontEnd:
         if reason := found.refusal():
             self._match_gate.refuse()
             if found.is_contradicted():
-                covariance = covariance + np.diag((_SLIP**2, _SLIP**2, _SLIP_ANGLE**2))
+                covariance = covariance + _OF_SLIP
             return LocalMatch(predicted, motion, covariance, Status.REJECTED, True, fitness, evaluations, reason, True)
         # What is measured is the pose in the local map; the step to it also holds what the refused steps may hide.
         after_refusal = self._match_gate.refusals > 0
         self._match_gate.accept(fitness)
+        self._rest_gate.matched(fitness)
         fused = rotated(fused_covariance(found), -key.theta) + FLOOR
         if self._use_odometry:
             self._odometry.add(motion, key.between(found.pose))

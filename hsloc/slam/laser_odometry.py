@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
 
     from hsloc.model.events import Event
-    from hsloc.slam.front_end import FrontEndParameters
+    from hsloc.slam.front_end_parameters import FrontEndParameters
 
 
 def with_laser_odometry(events: Iterable[Event], parameters: FrontEndParameters, rng: Generator) -> Iterator[Event]:

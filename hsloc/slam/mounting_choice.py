@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from hsloc.log import LaserSummary, Log, ReadOptions, Transform3
     from hsloc.model.events import Event
-    from hsloc.slam.front_end import FrontEndParameters
+    from hsloc.slam.front_end_parameters import FrontEndParameters
 
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]

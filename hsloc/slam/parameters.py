@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from hsloc.parameters import Count, Parameters
-from hsloc.slam.front_end import FrontEndParameters
+from hsloc.slam.front_end_parameters import FrontEndParameters
 from hsloc.slam.joint_registration import JointRegistrationParameters
 from hsloc.slam.loop_matcher import LoopParameters
 from hsloc.slam.occupancy_mapper import OccupancyMapperParameters

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.model.events import Event
-    from hsloc.slam.front_end import FrontEndParameters
+    from hsloc.slam.front_end_parameters import FrontEndParameters
 
     F64 = NDArray[np.float64]
 

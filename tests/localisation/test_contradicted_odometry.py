@@ -87,7 +87,7 @@ def test_nothing_is_within_reach_of_a_place_that_is_not_known_or_far() -> None:
     assert contradicted.half_widths(IDENTITY) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize("factor", [-1.0, 2.0], ids=["backwards as forwards", "wheels slip"])
+@pytest.mark.parametrize("factor", [-1.0, 2.0, 0.0], ids=["backwards as forwards", "wheels slip", "pushed"])
 def test_a_robot_is_followed_while_its_odometry_is_wrong(tmp_path: Path, factor: float) -> None:
     """Over 300 messages, 6 s and 4 m, the odometry counts the distance `factor` times."""
     last, now = IDENTITY, IDENTITY
@@ -106,5 +106,5 @@ def test_a_robot_is_followed_while_its_odometry_is_wrong(tmp_path: Path, factor:
     assert result.states is not None
     assert set(result.states.state) <= {State.LOCALISED, State.PREDICTED}
     assert np.count_nonzero(~result.localised) <= 300
-    assert error[result.localised].max() < 0.15
+    assert error[result.localised].max() < 0.25
     assert error.max() < 0.5

@@ -26,7 +26,8 @@ def drive(subject: Localiser, steps: range, step: float = 0.3) -> list[Estimate]
 
 
 def test_the_first_scan_is_matched_and_a_small_motion_is_not() -> None:
-    subject = localiser(ScriptedMatcher([0.9, 0.9]))
+    # The scan does not fit the room: the second one is searched for, and found where it was.
+    subject = localiser(ScriptedMatcher([0.9, 0.9, 0.9]))
     assert subject.update(paired(0.0)).status is Status.MATCHED
     still = subject.update(paired(0.1))
     assert (still.status, still.reason, still.fitness) == (Status.PREDICTED, "motion gate", None)
@@ -34,7 +35,7 @@ def test_the_first_scan_is_matched_and_a_small_motion_is_not() -> None:
 
 
 def test_a_turn_opens_the_motion_gate_too() -> None:
-    subject = localiser(ScriptedMatcher([0.9, 0.9]))
+    subject = localiser(ScriptedMatcher([0.9, 0.9, 0.9]))
     subject.update(paired(0.0))
     assert subject.update(paired(0.0, theta=0.1)).status is Status.PREDICTED
     assert subject.update(paired(0.0, theta=0.25)).status is Status.MATCHED

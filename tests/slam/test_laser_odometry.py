@@ -10,7 +10,7 @@ from hsloc.model import Heading, Odometry, Scan, Truth
 from hsloc.simulation.scenario import Scenario
 from hsloc.simulation.simulator import events
 from hsloc.simulation.world_files import load_world
-from hsloc.slam.front_end import FrontEndParameters
+from hsloc.slam.front_end_parameters import FrontEndParameters
 from hsloc.slam.laser_odometry import with_laser_odometry
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from hsloc.simulation.scenario import Scenario
 from hsloc.simulation.sensors import Lidar
 from hsloc.simulation.simulator import events
 from hsloc.simulation.world_files import load_world
-from hsloc.slam.front_end import FrontEndParameters
+from hsloc.slam.front_end_parameters import FrontEndParameters
 from hsloc.slam.heading_offset import UNKNOWN
 from hsloc.slam.mounting_choice import direction_warnings, with_chosen_mountings
 from hsloc.warnings import WarningCode

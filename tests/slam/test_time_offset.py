@@ -19,7 +19,7 @@ from hsloc.model.pose2 import relative_poses
 from hsloc.replay.clock_offset import as_option
 from hsloc.replay.run import run
 from hsloc.request import RunRequest
-from hsloc.slam.front_end import FrontEndParameters
+from hsloc.slam.front_end_parameters import FrontEndParameters
 from hsloc.slam.heading_offset import UNKNOWN, Headings, Offset, find_offset
 from hsloc.slam.time_offset import best_offset, clock_warnings, estimate_offset, find_drift, offsets_of_log
 

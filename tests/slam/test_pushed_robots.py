@@ -1,0 +1,42 @@
+"""A robot that is pushed while its wheels stand: the scans show that it moves, and are used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import log_formats
+import numpy as np
+import pytest
+
+from hsloc.log import ReadOptions
+from hsloc.model import IDENTITY, Pose2
+from hsloc.model.pose2 import compose_poses
+from hsloc.replay.run import run
+from hsloc.request import RunRequest
+
+OFFICE = Path(__file__).resolve().parents[2] / "recordings" / "office.mcap"
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0], ids=["nothing is counted", "turns are counted"])
+def test_a_map_is_right_where_the_odometry_stands_for_metres(tmp_path: Path, turn: float) -> None:
+    last, now = IDENTITY, IDENTITY
+
+    def change(number: int, pose: Pose2) -> Pose2:
+        """Six seconds, in which the robot goes 4 m."""
+        nonlocal last, now
+        motion = last.between(pose)
+        if 600 <= number < 900:
+            motion = Pose2(0.0, 0.0, turn * motion.theta)
+        now, last = now @ motion, pose
+        return now
+
+    log = log_formats.with_odometry(tmp_path / "log.mcap", OFFICE, change)
+    result = run(RunRequest(logs=(log,), mode="slam", read=ReadOptions(end_s=24.0)))
+    assert result.reference is not None
+    true = result.reference.interpolated(result.trajectory.stamps_ns)
+    begin = Pose2.from_array(true[0]) @ Pose2.from_array(result.trajectory.poses[0]).inverse()
+    off = compose_poses(begin.to_array(), result.trajectory.poses) - true
+    error = np.hypot(off[:, 0], off[:, 1])
+    assert np.sqrt(np.mean(error**2)) < 0.03
+    # Between two scans nothing says where the robot was; 0.1 s are 7 cm.
+    assert error.max() < 0.15

@@ -26,6 +26,10 @@ _REGAINED = 0.05
 scatters by 0.02 from scan to scan, so that two of them differ by as much once in thirteen times."""
 _STILL_M, _STILL_RAD = 1e-3, 1e-3
 """Motion (m, rad) from message to message up to which the odometry stands still: less than wheels that turn."""
+_NO_WAY_M, _NO_TURN_RAD = 0.01, 0.005
+"""Motion (m, rad) from scan to scan that counts as none: a tenth of what makes a keyscan."""
+_FEW_SCANS = 2
+"""Scans in a row in which the odometry counts nothing, from which on it does so for longer than stamps jitter."""
 _AS_LAST = 0.97
 """Ratio to the fitness of the last match, or of one nearby, that scans at rest reach, unless people pass."""
 _NEAR_LAST = 0.9
@@ -53,6 +57,36 @@ class MotionGate:
         """
         way, turn = unsure
         return hypot(motion.x, motion.y) + way >= self.min_distance or abs(motion.theta) + turn >= self.min_angle
+
+
+class StandingOdometry:
+    """For how many scans in a row the odometry has counted no way, and no turn.
+
+    Stamps that jitter pair scans of a robot that drives with odometry that is a few centimetres off: one scan in which
+    nothing is counted says little.
+    """
+
+    def __init__(self) -> None:
+        self._last: Pose2 | None = None
+        self._way = self._turn = 0
+
+    def follow(self, T_odom_base: Pose2) -> None:
+        """The odometry at the next scan."""
+        if self._last is not None:
+            step = self._last.between(T_odom_base)
+            self._way = self._way + 1 if hypot(step.x, step.y) < _NO_WAY_M else 0
+            self._turn = self._turn + 1 if abs(step.theta) < _NO_TURN_RAD else 0
+        self._last = T_odom_base
+
+    @property
+    def counts_no_way(self) -> bool:
+        """Whether it has counted no way for some scans."""
+        return self._way >= _FEW_SCANS
+
+    @property
+    def counts_no_turn(self) -> bool:
+        """Whether it has counted no turn for some scans."""
+        return self._turn >= _FEW_SCANS
 
 
 class RestGate:

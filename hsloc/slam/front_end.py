@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate, RestGate
+from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate, RestGate, StandingOdometry
 from hsloc.localisation.kalman_filter import predict_covariance
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Status
@@ -109,6 +109,7 @@ class FrontEnd:
         p = parameters
         self._motion_gate = MotionGate(p.keyscan_min_d, p.keyscan_min_a)
         self._rest_gate = RestGate()
+        self._standing = StandingOdometry()
         self._known_map_gate = MotionGate(_SPARSER * p.keyscan_min_d, _SPARSER * p.keyscan_min_a)
         ratio = p.min_fitness_ratio
         self._match_gate = MatchGate(
@@ -149,7 +150,8 @@ class FrontEnd:
             first = LocalMatch(IDENTITY, IDENTITY, FLOOR, Status.MATCHED, True, 1.0)
             return self._keep(paired, points, self._near(points), first)
         motion, covariance = self._predict(paired)
-        self._rest_gate.follow(paired.T_odom_base)
+        for each in (self._rest_gate, self._standing):
+            each.follow(paired.T_odom_base)
         predicted, tracker = self._T_map_key @ motion, self._tracker
         gate = self._known_map_gate if tracker is not None and tracker.is_following else self._motion_gate
         if self._use_odometry and not gate.is_open(motion):
@@ -171,9 +173,9 @@ class FrontEnd:
         return self._keep(paired, points, near, found) if found.is_keyscan else found
 
     def _is_moved(self, paired: PairedScan, predicted: Pose2) -> bool:
-        """Whether a scan shows that a robot moves whose odometry hardly does: pushed, or with frozen wheels."""
+        """Whether a scan shows that a robot moves whose odometry counts no way: pushed, or with frozen wheels."""
         is_on_map = self._tracker is not None and self._tracker.is_following
-        if is_on_map:
+        if is_on_map or not self._standing.counts_no_way:
             return False
         points = paired.points_base()
         near = self._near(points)
@@ -182,7 +184,9 @@ class FrontEnd:
         if not self._rest_gate.is_open(self._maps[0][0].fitness(near, predicted)):
             return False
         found, _ = self._search(near, moving_scans(paired, points), predicted, _OF_SLIP)
-        is_moved = not found.refusal() and self._motion_gate.is_open(predicted.between(found.pose))
+        off = predicted.between(found.pose)
+        turn = off.theta if self._standing.counts_no_turn else 0.0
+        is_moved = not found.refusal() and self._motion_gate.is_open(Pose2(off.x, off.y, turn))
         self._rest_gate.searched(is_moved)
         return is_moved
 

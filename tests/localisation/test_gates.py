@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate, RestGate
+from hsloc.localisation.gates import MatchGate, MatchLimits, MotionGate, RestGate, StandingOdometry
 from hsloc.model import Pose2
 
 LIMITS = MatchLimits(min_fitness=0.3, min_fitness_ratio=0.7, recovery_fitness_ratio=0.9)
@@ -113,3 +113,31 @@ def test_a_rest_gate_opens_less_often_where_nothing_is_found() -> None:
     assert sum(opened[20:]) < sum(opened[:20]) / 2
     gate.matched(0.8)
     assert gate.is_open(0.7)
+
+
+def test_odometry_counts_nothing_where_two_scans_in_a_row_say_so() -> None:
+    standing = StandingOdometry()
+    standing.follow(Pose2())
+    standing.follow(Pose2(0.2, 0.0, 0.0))
+    standing.follow(Pose2(0.2, 0.0, 0.1))
+    assert not standing.counts_no_way, "one scan may be the jitter of stamps"
+    standing.follow(Pose2(0.205, 0.0, 0.2))
+    assert standing.counts_no_way
+    assert not standing.counts_no_turn
+    for _ in range(2):
+        standing.follow(Pose2(0.205, 0.0, 0.2))
+    assert standing.counts_no_turn
+    standing.follow(Pose2(0.3, 0.0, 0.2))
+    assert not standing.counts_no_way
+    assert standing.counts_no_turn
+
+
+def test_a_scan_near_the_last_match_may_fit_a_little_worse_than_one_at_rest() -> None:
+    gate = RestGate()
+    gate.matched(0.9)
+    gate.follow(Pose2())
+    gate.follow(Pose2(0.05, 0.0, 0.0))
+    assert not gate.is_open(0.85)
+    assert gate.is_open(0.8)
+    gate.follow(Pose2(0.05, 0.0, 0.0))
+    assert gate.is_open(0.85)

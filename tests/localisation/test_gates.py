@@ -116,20 +116,14 @@ def test_a_rest_gate_opens_less_often_where_nothing_is_found() -> None:
 
 
 def test_odometry_counts_nothing_where_two_scans_in_a_row_say_so() -> None:
-    standing = StandingOdometry()
-    standing.follow(Pose2())
-    standing.follow(Pose2(0.2, 0.0, 0.0))
-    standing.follow(Pose2(0.2, 0.0, 0.1))
-    assert not standing.counts_no_way, "one scan may be the jitter of stamps"
-    standing.follow(Pose2(0.205, 0.0, 0.2))
-    assert standing.counts_no_way
-    assert not standing.counts_no_turn
-    for _ in range(2):
-        standing.follow(Pose2(0.205, 0.0, 0.2))
-    assert standing.counts_no_turn
-    standing.follow(Pose2(0.3, 0.0, 0.2))
-    assert not standing.counts_no_way
-    assert standing.counts_no_turn
+    standing, found = StandingOdometry(), []
+    for x, theta in ((0.0, 0.0), (0.2, 0.0), (0.2, 0.1), (0.205, 0.2), (0.205, 0.2), (0.205, 0.2), (0.3, 0.2)):
+        standing.follow(Pose2(x, 0.0, theta))
+        found.append((standing.counts_no_way, standing.counts_no_turn))
+    # One scan may be the jitter of stamps.
+    no_way = [False, False, False, True, True, True, False]
+    no_turn = [False, False, False, False, False, True, True]
+    assert found == list(zip(no_way, no_turn, strict=True))
 
 
 def test_a_scan_near_the_last_match_may_fit_a_little_worse_than_one_at_rest() -> None:

@@ -38,5 +38,5 @@ def test_a_map_is_right_where_the_odometry_stands_for_metres(tmp_path: Path, tur
     off = compose_poses(begin.to_array(), result.trajectory.poses) - true
     error = np.hypot(off[:, 0], off[:, 1])
     assert np.sqrt(np.mean(error**2)) < 0.03
-    # Between two scans nothing says where the robot was; 0.1 s are 7 cm.
-    assert error.max() < 0.15
+    # It is seen after two scans without a way, and 0.1 m: until then nothing says where the robot was.
+    assert error.max() < 0.3

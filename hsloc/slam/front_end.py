@@ -79,6 +79,9 @@ _BETTER = 0.03
 """A pose that HIDE found replaces the registered prediction if this much more of the points agree, or fit."""
 _HEADING_DRIFT = 0.02
 """Drift of a heading [rad/s]: the zero-rate offset of common gyroscopes at rest, one degree per second."""
+_USUAL, _USUAL_IN_SLIP = 0.9, 0.95
+"""Ratio to the usual fitness below which a registration may have ended beside the right place, and after a step that
+contradicts the odometry: then the prediction is wrong, and the nearest walls are others than those that are seen."""
 _SLIP = 0.3
 """Standard deviation [m] of a motion that the scans contradict, without saying what it was."""
 _SLIP_ANGLE = 0.3
@@ -110,6 +113,7 @@ class FrontEnd:
         self._motion_gate = MotionGate(p.keyscan_min_d, p.keyscan_min_a)
         self._rest_gate = RestGate()
         self._standing = StandingOdometry()
+        self._slips = False
         self._known_map_gate = MotionGate(_SPARSER * p.keyscan_min_d, _SPARSER * p.keyscan_min_a)
         ratio = p.min_fitness_ratio
         self._match_gate = MatchGate(
@@ -265,6 +269,7 @@ class FrontEnd:
         after_refusal = self._match_gate.refusals > 0
         self._match_gate.accept(fitness)
         self._rest_gate.matched(fitness)
+        self._slips = found.chi * self._odometry.scale > SURPRISE
         fused = rotated(fused_covariance(found), -key.theta) + FLOOR
         if self._use_odometry:
             self._odometry.add(motion, key.between(found.pose))
@@ -291,10 +296,10 @@ class FrontEnd:
         evaluations = 1
         window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
         certain = max(window.half_x, window.half_y) <= _BASIN and window.half_theta <= _BASIN_ANGLE
-        if certain and not best.refusal():
+        fitness = self._maps[0][0].fitness(points, best.pose)
+        if certain and self._is_usual(fitness) and not best.refusal():
             return best, evaluations
         local = self._maps[0][0].field
-        fitness = local.fitness(points, best.pose)
         # Wheels may have slipped all the way. Farther away are other places, which may look alike after a gap.
         slip = max(p.wide_window, p.no_odometry_window) + min(self._T_map_key.distance(predicted), _LONGEST_SLIP_M)
         window = replace(window, half_x=min(window.half_x, slip), half_y=min(window.half_y, slip))
@@ -308,9 +313,14 @@ class FrontEnd:
             credible = not found.refusal() and self._is_credible(found, fits, predicted, best.is_contradicted())
             if (better or best.refusal()) and credible:
                 best, fitness = found, fits
-            if not best.refusal():
+            if self._is_usual(fitness) and not best.refusal():
                 break
         return best, evaluations
+
+    def _is_usual(self, fitness: float) -> bool:
+        """Whether a registration of this fitness is where it should be; where wheels slip others fit nearly as well."""
+        usual = self._match_gate.usual
+        return usual is None or fitness >= (_USUAL_IN_SLIP if self._slips else _USUAL) * usual
 
     def _is_credible(self, found: ScanRegistration, fitness: float, predicted: Pose2, refuted: bool) -> bool:
         """Whether a pose is evidence against the prediction, where it contradicts it.

@@ -1,4 +1,4 @@
-"""A robot that is pushed while its wheels stand: the scans show that it moves, and are used."""
+"""Odometry that is wrong for metres: a robot that is pushed, wheels that spin, or count backwards as forwards."""
 
 from __future__ import annotations
 
@@ -17,8 +17,12 @@ from hsloc.request import RunRequest
 OFFICE = Path(__file__).resolve().parents[2] / "recordings" / "office.mcap"
 
 
-@pytest.mark.parametrize("turn", [0.0, 1.0], ids=["nothing is counted", "turns are counted"])
-def test_a_map_is_right_where_the_odometry_stands_for_metres(tmp_path: Path, turn: float) -> None:
+@pytest.mark.parametrize(
+    ("way", "turn"),
+    [(0.0, 0.0), (0.0, 1.0), (-1.0, 1.0), (3.0, 1.0), (1.0, -1.0)],
+    ids=["pushed", "turns are counted", "backwards as forwards", "wheels spin", "turned the other way"],
+)
+def test_a_map_is_right_where_the_odometry_is_wrong_for_metres(tmp_path: Path, way: float, turn: float) -> None:
     last, now = IDENTITY, IDENTITY
 
     def change(number: int, pose: Pose2) -> Pose2:
@@ -26,7 +30,7 @@ def test_a_map_is_right_where_the_odometry_stands_for_metres(tmp_path: Path, tur
         nonlocal last, now
         motion = last.between(pose)
         if 600 <= number < 900:
-            motion = Pose2(0.0, 0.0, turn * motion.theta)
+            motion = Pose2(way * motion.x, way * motion.y, turn * motion.theta)
         now, last = now @ motion, pose
         return now
 
@@ -38,5 +42,5 @@ def test_a_map_is_right_where_the_odometry_stands_for_metres(tmp_path: Path, tur
     off = compose_poses(begin.to_array(), result.trajectory.poses) - true
     error = np.hypot(off[:, 0], off[:, 1])
     assert np.sqrt(np.mean(error**2)) < 0.03
-    # It is seen after two scans without a way, and 0.1 m: until then nothing says where the robot was.
+    # A push is seen after two scans without a way, and 0.1 m: until then nothing says where the robot was.
     assert error.max() < 0.3

@@ -128,7 +128,7 @@ def finish_session(
     of_log = refined.poses[gathered.first :]
     calibration = track.calibrated(of_log) if parameters.use_odometry else OdometryCalibration()
     odometry_poses, scan_poses = track.corrected(of_log, calibration)
-    odometry_covariances, scan_covariances = track.covariances(of_log, covariances[gathered.first :])
+    odometry_covariances, scan_covariances = track.covariances(of_log, covariances[gathered.first :], calibration)
     return MappingResult(
         odometry_poses=odometry_poses,
         scan_poses=scan_poses,

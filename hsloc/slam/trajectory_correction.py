@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
     I64 = NDArray[np.int64]
 
+_NOISE_M, _NOISE_SHARE, _LARGEST_NOISE = 0.005, 0.1, 4.0
+"""Standard deviation of what the odometry says of a motion: half a centimetre of the keyscans, and a tenth of its way,
+as is assumed of odometry; and the multiple of it that noise does not reach."""
+_STILL_M = 1e-9
+"""Motion (m) that an event counts for in which the odometry counts none: there a push is shared out evenly."""
+
 
 class EventLog:
     """Odometry of all messages and scans in the order of the log.
@@ -73,34 +79,55 @@ class EventLog:
         Each event lies between two keyscans or anchored scans, on the odometry seen from both; what they disagree in is
         shared out along the path: a wheel errs while it turns, not while it stands.
         """
-        odometry = np.array(self._poses).reshape(-1, 3)
         is_scan = np.array(self._is_scan, dtype=bool)
         if len(self._keys) == 0:
+            odometry = np.array(self._poses).reshape(-1, 3)
             return odometry[~is_scan], odometry[is_scan]
-        if calibration is not None:
-            odometry = apply(calibration, self._index(), odometry)
-        keys, key_poses = self._known(), self._known_poses(key_poses)
-        before, after, fraction = self._between(odometry, keys)
-        from_before = compose_poses(key_poses[before], relative_poses(odometry[keys[before]], odometry))
-        from_after = compose_poses(key_poses[after], relative_poses(odometry[keys[after]], odometry))
-        poses = from_before + fraction[:, None] * pose_differences(from_after, from_before)
+        from_before, apart, *_, fraction = self._seen_from_both(key_poses, calibration)
+        poses = from_before + fraction[:, None] * apart
         poses[:, 2] = wrap_angles(poses[:, 2])
         return poses[~is_scan], poses[is_scan]
 
-    def covariances(self, key_poses: F64, key_covariances: F64) -> tuple[F64, F64]:
+    def covariances(
+        self, key_poses: F64, key_covariances: F64, calibration: OdometryCalibration | None = None
+    ) -> tuple[F64, F64]:
         """Covariances of all odometry messages (k, 3, 3) and of all scans (m, 3, 3), from those of the keyscans.
 
-        Interpolated along the path, as if the errors of two keyscans were equal: never too small. NaN without keyscans.
+        Interpolated along the path, as if the errors of two keyscans were equal, with what the odometry seen from both
+        disagrees in: as the middle of a random walk whose ends are known, or, where it is more than noise, as a slip at
+        any time between the two. NaN without keyscans.
         """
         is_scan = np.array(self._is_scan, dtype=bool)
         if len(self._keys) == 0:
             unknown = np.full((len(is_scan), 3, 3), np.nan)
             return unknown[~is_scan], unknown[is_scan]
         known = self._known_covariances(key_poses, key_covariances)
-        before, after, fraction = self._between(np.array(self._poses).reshape(-1, 3), self._known())
+        _, apart, before, after, span, fraction = self._seen_from_both(key_poses, calibration)
         part = fraction[:, None, None]
         found = (1.0 - part) * known[before] + part * known[after]
+        walk = fraction * (1.0 - fraction)
+        limit = _LARGEST_NOISE * (_NOISE_M + _NOISE_SHARE * span)
+        slips = np.hypot(apart[:, 0], apart[:, 1]) + self._turn_length * np.abs(apart[:, 2]) > limit
+        weight = np.where(slips, 1.0 / 3.0 - walk, walk)
+        weight[self._known()] = 0.0
+        found += (weight[:, None] * apart)[:, :, None] * apart[:, None, :]
         return found[~is_scan], found[is_scan]
+
+    def _seen_from_both(
+        self, key_poses: F64, calibration: OdometryCalibration | None
+    ) -> tuple[F64, F64, I64, I64, F64, F64]:
+        """Each event on the odometry seen from the known event before it, and how far from there it is by that after.
+
+        Both are (n, 3). Then the numbers of these two, the length of the path between them and the part of it (n,).
+        """
+        odometry = np.array(self._poses).reshape(-1, 3)
+        if calibration is not None:
+            odometry = apply(calibration, self._index(), odometry)
+        keys, key_poses = self._known(), self._known_poses(key_poses)
+        before, after, span, fraction = self._between(odometry, keys)
+        from_before = compose_poses(key_poses[before], relative_poses(odometry[keys[before]], odometry))
+        from_after = compose_poses(key_poses[after], relative_poses(odometry[keys[after]], odometry))
+        return from_before, pose_differences(from_after, from_before), before, after, span, fraction
 
     def _known(self) -> I64:
         """Events (n,) whose poses are known: keyscans and anchored scans, in the order of the log."""
@@ -130,16 +157,16 @@ class EventLog:
         values: F64 = np.concatenate((of_keys, of_anchored))[np.argsort([*self._keys, *self._anchored], kind="stable")]
         return values
 
-    def _between(self, odometry: F64, keys: I64) -> tuple[I64, I64, F64]:
-        """Of each event the keyscans before and after it, and the part of the path between them that was driven."""
+    def _between(self, odometry: F64, keys: I64) -> tuple[I64, I64, F64, F64]:
+        """Of each event the keyscans before and after it, the path between them, and the part of it that was driven."""
         steps = relative_poses(odometry[:-1], odometry[1:])
-        lengths = np.hypot(steps[:, 0], steps[:, 1]) + self._turn_length * np.abs(steps[:, 2])
+        lengths = _STILL_M + np.hypot(steps[:, 0], steps[:, 1]) + self._turn_length * np.abs(steps[:, 2])
         path_length = np.concatenate(([0.0], np.cumsum(lengths)))
         before = np.clip(np.searchsorted(keys, np.arange(len(odometry)), side="right") - 1, 0, len(keys) - 1)
         after = np.minimum(before + 1, len(keys) - 1)
         span = path_length[keys[after]] - path_length[keys[before]]
         fraction = np.clip((path_length - path_length[keys[before]]) / np.maximum(span, 1e-12), 0.0, 1.0)
-        return before, after, fraction
+        return before, after, span, fraction
 
     def _index(self) -> F64:
         """For each event the number of odometry messages before it, a scan between two messages being half-way."""

@@ -46,3 +46,31 @@ def test_without_keyscans_there_is_only_odometry() -> None:
     odometry, scans = track.corrected(np.zeros((0, 3)))
     assert odometry[0, 0] == 1.0
     assert scans[0, 0] == 2.0
+
+
+def between_two_keyscans(*x: float) -> EventLog:
+    """A keyscan, odometry at these places, and a keyscan at the last of them."""
+    track = EventLog(0.3)
+    track.add(Pose2(), is_scan=True, is_key=True)
+    for each in x:
+        track.add(Pose2(each), is_scan=False)
+    track.add(Pose2(x[-1]), is_scan=True, is_key=True)
+    return track
+
+
+def test_a_push_is_shared_out_evenly_while_the_wheels_stand() -> None:
+    track = between_two_keyscans(0.0, 0.0, 0.0, 0.0)
+    odometry, _ = track.corrected(np.array(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))))
+    np.testing.assert_allclose(odometry[:, 0], (0.2, 0.4, 0.6, 0.8), atol=1e-9)
+
+
+def test_what_is_no_noise_may_have_happened_at_any_time_between_two_keyscans() -> None:
+    sure = np.zeros((2, 3, 3))
+    track = between_two_keyscans(0.25, 0.5, 0.75, 1.0)
+    for gap, half_way, at_the_end in ((0.2, 0.2 / 2.0, 0.0), (0.8, 0.8 / np.sqrt(12.0), 0.8 / np.sqrt(3.0))):
+        of_odometry, of_scans = track.covariances(np.array(((0.0, 0.0, 0.0), (1.0 + gap, 0.0, 0.0))), sure)
+        sigma = np.sqrt(of_odometry[:, 0, 0])
+        np.testing.assert_allclose(sigma[1], half_way, rtol=1e-6)
+        np.testing.assert_allclose(sigma[3], at_the_end, atol=1e-4)
+        assert (of_odometry[:, 1:, 1:] == 0.0).all()
+        assert (of_scans == 0.0).all(), "the keyscans are where they are"

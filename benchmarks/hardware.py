@@ -196,8 +196,8 @@ KINDS: dict[str, Kind] = {
 }
 
 
-def judged(kind: Kind, shape: str, seed: int, start: str, folder: Path) -> dict[str, Any]:
-    """One run, as `hsloc replay` makes it."""
+def written(kind: Kind, shape: str, seed: int, folder: Path) -> tuple[Path, drives.Drive]:
+    """The log of a drive, and the drive."""
     world = world_of(shape, seed)
     scenario = Scenario(
         world.name, seed, robot=presets.BRISK, sensor=SENSORS[shape], scan_rate_hz=5.0, duration_s=drives.SECONDS
@@ -213,6 +213,13 @@ def judged(kind: Kind, shape: str, seed: int, start: str, folder: Path) -> dict[
                 writer.scan(event, log_time_ns=event.stamp_ns)
             elif isinstance(event, Odometry):
                 writer.odometry(event.stamp_ns, event.T_odom_base, covariance=event.covariance)
+    return path, drive
+
+
+def judged(kind: Kind, shape: str, seed: int, start: str, folder: Path) -> dict[str, Any]:
+    """One run, as `hsloc replay` makes it."""
+    path, drive = written(kind, shape, seed, folder)
+    world, rng = drive.world, drive.rng
     of_map = world_of(shape, seed + 1000) if kind.is_wrong and kind.change is same else world
     grid = kind.change(of_map.occupancy_grid(kind.cell), rng)
     truth = drive.truth()

@@ -290,6 +290,7 @@ class FrontEnd:
         """Registration from the prediction, and from what HIDE finds in the prediction's window and in a wide one.
 
         HIDE is asked where the prediction is too uncertain for the registration to begin at, or where that is refused.
+        It is asked, too, where a registration that is not fits less than usual; then another one has to fit as usual.
         """
         p = self._parameters
         best = self._recent.register(scans, predicted, predicted, covariance)
@@ -297,7 +298,8 @@ class FrontEnd:
         window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
         certain = max(window.half_x, window.half_y) <= _BASIN and window.half_theta <= _BASIN_ANGLE
         fitness = self._maps[0][0].fitness(points, best.pose)
-        if certain and self._is_usual(fitness) and not best.refusal():
+        stands = certain and not best.refusal()
+        if stands and self._is_usual(fitness):
             return best, evaluations
         local = self._maps[0][0].field
         # Wheels may have slipped all the way. Farther away are other places, which may look alike after a gap.
@@ -309,7 +311,8 @@ class FrontEnd:
             evaluations += spent
             found = self._recent.register(scans, start, predicted, covariance)
             fits = local.fitness(points, found.pose)
-            better = found.agreement > best.agreement + _BETTER or fits > fitness + _BETTER
+            more = found.agreement > best.agreement + _BETTER, fits > fitness + _BETTER
+            better = all(more) and self._is_usual(fits) if stands else any(more)
             credible = not found.refusal() and self._is_credible(found, fits, predicted, best.is_contradicted())
             if (better or best.refusal()) and credible:
                 best, fitness = found, fits

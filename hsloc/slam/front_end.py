@@ -290,7 +290,7 @@ class FrontEnd:
         """Registration from the prediction, and from what HIDE finds in the prediction's window and in a wide one.
 
         HIDE is asked where the prediction is too uncertain for the registration to begin at, or where that is refused.
-        It is asked, too, where a registration that is not fits less than usual; then another one has to fit as usual.
+        It is asked, too, where one that is not refused fits less than usual; then another one has to fit as usual.
         """
         p = self._parameters
         best = self._recent.register(scans, predicted, predicted, covariance)
@@ -312,11 +312,13 @@ class FrontEnd:
             found = self._recent.register(scans, start, predicted, covariance)
             fits = local.fitness(points, found.pose)
             more = found.agreement > best.agreement + _BETTER, fits > fitness + _BETTER
-            better = all(more) and self._is_usual(fits) if stands else any(more)
+            is_doubted = stands or (box is wide and not best.refusal())
+            better = all(more) and self._is_usual(fits) if is_doubted else any(more)
             credible = not found.refusal() and self._is_credible(found, fits, predicted, best.is_contradicted())
             if (better or best.refusal()) and credible:
                 best, fitness = found, fits
-            if self._is_usual(fitness) and not best.refusal():
+            may_be_wrong = (stands or self._slips) and not self._is_usual(fitness)
+            if not best.refusal() and not may_be_wrong:
                 break
         return best, evaluations
 

@@ -232,7 +232,7 @@ def smooth_matches(anchors: Sequence[Anchor], motion_model: MotionModel) -> Smoo
         if off @ weighted > MAX_SQUARED:
             slips[k + 1] = np.maximum(off**2 - np.diag(variance), 0.0)
             if not here.fits_as_usual:
-                jump = jump + np.outer(off, off)
+                jump = max(jump, np.outer(off, off), key=np.trace)
             covariances[k] += jump
             continue
         gain = np.linalg.solve(variance, transition(here.T_map_base, motion) @ here.covariance).T

@@ -207,7 +207,7 @@ class Localiser:
                 information = self._match_gate.trust(match.fitness) * information
                 weight = self._innovations.add(off, information, propagated, noise)
             self._odometry_scale.update(off, covariance, weight)
-            may_slip = is_usual and is_slip(off, weight)
+            may_slip = is_usual and _is_far(off) and is_slip(off, weight)
             if self._contradicted.slipped(may_slip, T_odom_base, match.pose, points):
                 covariance = covariance + np.outer(off, off)  # a mean of prediction and match would be neither
             pose, covariance = fuse_match(predicted, covariance, match, information)
@@ -267,9 +267,8 @@ class Localiser:
         if self._match_gate.is_elsewhere(fitness, match.fitness):
             off = difference(match.pose, predicted)
             information = match_information(points, self._field, match.pose, self._wall_variance())
-            is_far = hypot(off[0], off[1]) >= _MOVED_M or abs(off[2]) >= _MOVED_RAD
             weight = None if information is None else innovation_weight(self._covariance, information)
-            is_moved = is_far and weight is not None and is_slip(off, weight)
+            is_moved = _is_far(off) and weight is not None and is_slip(off, weight)
         else:
             is_moved = bool(self._match_gate.refusal(match.fitness)) and self._is_astray(paired, match.pose)
         self._rest_gate.searched(is_moved)
@@ -355,3 +354,8 @@ class Localiser:
         self._T_map_match = T_map_base
         self._T_odom_match = T_odom_base
         self._T_map_odom = T_map_base @ T_odom_base.inverse()
+
+
+def _is_far(off: F64) -> bool:
+    """Whether an innovation (3,) makes a pose wrong, and is more than people or stamps that are a little late make."""
+    return bool(hypot(off[0], off[1]) >= _MOVED_M or abs(off[2]) >= _MOVED_RAD)

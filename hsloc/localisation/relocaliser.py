@@ -32,7 +32,7 @@ from hsloc.localisation.hypotheses import (
     search_text,
 )
 from hsloc.localisation.place_check import USUAL_EXPLAINED, PlaceCheck
-from hsloc.localisation.retraced_scans import STEP_WINDOW, RetracedScan, Retracer, revised
+from hsloc.localisation.retraced_scans import STEP_WINDOW, RetracedScan, Retracer
 from hsloc.localisation.track_evidence import MOST_FROM_RIVAL, place_evidence, rival_evidence
 from hsloc.localisation.whole_map_search import join_scans
 from hsloc.matching.window import Window
@@ -149,6 +149,7 @@ class Relocaliser:
         self._motion_model = motion_model
         self._gate = MotionGate(parameters.step_min_d, parameters.step_min_a)
         self._rng = rng
+        self._retracer = Retracer(likelihood, matcher, motion_model, rng, self._is_hidden)
         self._grid = grid
         self._map_search: WholeMapSearch | None = None
         self._hypotheses: list[Hypothesis] = []
@@ -308,7 +309,7 @@ class Relocaliser:
             evidence = self._weigh(best, motion)
             of_rivals = MOST_FROM_RIVAL if proven else max(rival_evidence(ratio), 0.0)
             sure = place_evidence(evidence, of_rivals, self._usual) >= p.min_evidence
-        track, fits = revised(self._trace(best, motion, REMEMBERED)) if sure else ((), False)
+        track, fits = self._retracer.revised(self._trace(best, motion, REMEMBERED)) if sure else ((), False)
         return RelocaliserResult(
             pose,
             best.covariance if sure else None,
@@ -354,8 +355,7 @@ class Relocaliser:
     def _trace(self, winner: Hypothesis, motion: Pose2, most: int) -> list[RetracedScan]:
         """The last scans, back to where none fits."""
         least = max(self._parameters.min_fitness, _FITS * winner.fitness)
-        retracer = Retracer(self._field, self._matcher, self._motion_model, self._rng, self._is_hidden)
-        return retracer.trace(winner.pose @ motion, winner.covariance, least, reversed(self._seen), most)
+        return self._retracer.trace(winner.pose @ motion, winner.covariance, least, reversed(self._seen), most)
 
     def _is_hidden(self, paired: PairedScan, pose: Pose2) -> bool:
         """What hides the walls is no reason to lose the trace."""

@@ -7,11 +7,19 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hsloc.localisation.kalman_filter import Innovations, difference, fuse_match, predict_covariance
+from hsloc.localisation.interpolated_odometry import AtStamp
+from hsloc.localisation.kalman_filter import (
+    Anchor,
+    Innovations,
+    difference,
+    fuse_match,
+    predict_covariance,
+    smooth_matches,
+)
 from hsloc.matching.covariance import match_information
 from hsloc.matching.window import Window
 from hsloc.model.estimate import Revised
-from hsloc.model.pose2 import rotated
+from hsloc.model.pose2 import Pose2, rotated
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -23,7 +31,6 @@ if TYPE_CHECKING:
     from hsloc.matching.likelihood_field import LikelihoodField
     from hsloc.matching.match import Matcher
     from hsloc.model.events import PairedScan
-    from hsloc.model.pose2 import Pose2
 
     F64 = NDArray[np.float64]
     SeenScan = tuple[int, F64, PairedScan]
@@ -38,13 +45,17 @@ _SETTLED = 5
 
 
 class RetracedScan(NamedTuple):
-    """A scan and where it was taken: odometry messages before, T_map_base and its covariance (3, 3), if it fits."""
+    """A scan and where it was taken: odometry messages before, T_map_base and its covariance (3, 3), if it fits.
+
+    The odometry up to here is `noise_scale` times as noisy as assumed (variances).
+    """
 
     odometry_count: int
     pose: Pose2
     covariance: F64
     paired: PairedScan
     fits: bool
+    noise_scale: float = 1.0
 
 
 class Retracer:
@@ -95,21 +106,31 @@ class Retracer:
                     innovations.add(difference(match.pose, pose), information, propagated, noise)
                 pose, covariance = fuse_match(pose, covariance, match, information)
                 misses = 0
-            traced.append(RetracedScan(count, pose, innovations.excess * covariance, paired, fits))
+            traced.append(
+                RetracedScan(count, pose, innovations.excess * covariance, paired, fits, innovations.noise_scale)
+            )
             if misses == _TRACE_LOST or len(traced) == most:
                 break
         return traced
 
+    def revised(self, traced: Sequence[RetracedScan]) -> tuple[tuple[Revised, ...], bool]:
+        """Poses of a trace from its begin on, without the scans there that do not fit; and whether there are none such.
 
-def revised(traced: Sequence[RetracedScan]) -> tuple[tuple[Revised, ...], bool]:
-    """Poses of a trace from its begin on, without the scans there that do not fit; and whether there are none such.
-
-    The covariances of the first scans that were traced know how the trace began; those are as sure as the next ones.
-    """
-    misses = next((k for k, each in enumerate(reversed(traced)) if each.fits), len(traced))
-    kept = traced[: len(traced) - misses]
-    found = []
-    for k, each in enumerate(kept):
-        settled = kept[max(k, min(_SETTLED, len(kept) - 1))]
-        found.append(Revised(each.odometry_count, each.pose @ each.paired.T_odom_base.inverse(), settled.covariance))
-    return tuple(reversed(found)), misses == 0
+        They know the scans after them, and are smoothed by those before. The covariances of the first scans that were
+        traced know how the trace began; those are as sure as the next ones.
+        """
+        misses = next((k for k, each in enumerate(reversed(traced)) if each.fits), len(traced))
+        kept = traced[: len(traced) - misses]
+        anchors = []
+        for k, each in enumerate(kept):
+            settled = kept[max(k, min(_SETTLED, len(kept) - 1))]
+            T_odom_base, at = each.paired.T_odom_base, AtStamp(each.paired.scan.stamp_ns, each.paired.interpolation)
+            anchors.append(
+                Anchor(each.odometry_count, T_odom_base, each.pose, settled.covariance, k == 0, each.noise_scale, at=at)
+            )
+        smoothed = smooth_matches(anchors, self._motion_model)
+        found = [
+            Revised(anchor.count, Pose2.from_array(pose) @ anchor.T_odom_base.inverse(), covariance)
+            for anchor, pose, covariance in zip(anchors, smoothed.poses, smoothed.covariances, strict=True)
+        ]
+        return tuple(reversed(found)), misses == 0

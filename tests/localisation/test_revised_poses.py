@@ -11,7 +11,7 @@ from hsloc.localisation.interpolated_odometry import AtStamp
 from hsloc.localisation.kalman_filter import Anchor
 from hsloc.localisation.localiser import Localiser
 from hsloc.localisation.motion_models import OdometryNoise
-from hsloc.localisation.retraced_scans import RetracedScan, revised
+from hsloc.localisation.retraced_scans import RetracedScan, Retracer
 from hsloc.localisation.revised_poses import composed, revised_matches
 from hsloc.matching import LikelihoodField
 from hsloc.model import IDENTITY, Odometry, PairedScan, Pose2, Scan, Status, Trajectory, wrap_angles
@@ -90,20 +90,25 @@ def test_a_relocalisation_without_scans_before_it_revises_nothing() -> None:
     assert (matched.poses == [(0.8, 0.0, 0.0)]).all()
 
 
-def test_a_trace_is_kept_as_far_as_scans_fit_and_is_as_sure_as_it_settled() -> None:
+def test_a_trace_is_kept_as_far_as_scans_fit_and_is_smoothed() -> None:
+    grid, hide = load_world("office").occupancy_grid(0.05), Config().make_matcher()
+    field, rng = LikelihoodField.from_grid(grid), np.random.default_rng(0)
+    retracer = Retracer(field, hide, OdometryNoise(), rng, lambda paired, pose: False)
     scan = Scan(0, np.ones(4, dtype=np.float32), 0.0, 1.0, 0.1, 10.0)
-    traced = [
-        RetracedScan(20 - k, Pose2(float(20 - k), 0.0, 0.0), np.eye(3) / (k + 1.0), PairedScan(scan, IDENTITY), k < 7)
-        for k in range(9)
-    ]
-    track, is_whole = revised(traced)
+    traced = []
+    for k in range(9):
+        place = Pose2(0.1 * (20 - k), 0.0, 0.0)
+        covariance = 1e-4 * (k + 1.0) * np.eye(3)
+        traced.append(RetracedScan(20 - k, place, covariance, PairedScan(scan, place), k < 7))
+    track, is_whole = retracer.revised(traced)
     assert not is_whole
     assert [each.odometry_count for each in track] == list(range(14, 21))
-    assert [each.T_map_odom.x for each in track] == list(range(14, 21))
-    variances = [1.0 / each.covariance[0, 0] for each in track if each.covariance is not None]
-    assert variances == pytest.approx([7.0, *[6.0] * 6]), "the first know how the trace began"
-    assert revised(traced[:7])[1]
-    assert revised([each._replace(fits=False) for each in traced]) == ((), False)
+    assert all(each.T_map_odom.distance(IDENTITY) < 1e-9 for each in track), "the odometry is right"
+    variances = [each.covariance[0, 0] for each in track if each.covariance is not None]
+    assert variances[0] == pytest.approx(7e-4), "nothing comes before it"
+    assert max(variances[1:]) < 6.1e-4, "the first know how the trace began, and are as sure as the sixth"
+    assert retracer.revised(traced[:7])[1]
+    assert retracer.revised([each._replace(fits=False) for each in traced]) == ((), False)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

@@ -8,6 +8,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+    from scipy.spatial import cKDTree
 
     from hsloc.model.pose2 import Pose2
 
@@ -42,6 +43,7 @@ class ContradictedOdometry:
         """`sigma` is that of the fitness (m), as on the map."""
         self._sigma = sigma
         self._known: _Known | None = None
+        self._tree: cKDTree | None = None
         self._way = 0.0
         self.is_slipping = False
         """Whether the wheels slipped before the last match: they may go on."""
@@ -52,7 +54,7 @@ class ContradictedOdometry:
 
     def known(self, T_odom_base: Pose2, T_map_base: Pose2, points: F64) -> None:
         """A match with points (n, 2) is trusted."""
-        self._known, self._way = _Known(T_odom_base, T_map_base, points), 0.0
+        self._known, self._tree, self._way = _Known(T_odom_base, T_map_base, points), None, 0.0
 
     def lost(self) -> None:
         """The pose is unknown from now on."""
@@ -74,9 +76,11 @@ class ContradictedOdometry:
         """Whether a scan with points (m, 2) fits the last known one better from this place than by the odometry."""
         if self._known is None or len(self._known.points) == 0:
             return False
-        from scipy.spatial import cKDTree  # Here: it takes a fifth of a second, and few runs need it.
+        tree = self._tree
+        if tree is None:
+            from scipy.spatial import cKDTree  # Here: it takes a fifth of a second, and few runs need it.
 
-        tree = cKDTree(self._known.points)
+            tree = self._tree = cKDTree(self._known.points)
 
         def fitness(motion: Pose2) -> float:
             distance, _ = tree.query(motion @ points)

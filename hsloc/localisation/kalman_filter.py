@@ -8,7 +8,7 @@ corridor's end shows to the poses before it. Those between two matches are in `b
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import cos, exp, log, sin
+from math import cos, exp, hypot, log, radians, sin
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -29,6 +29,11 @@ if TYPE_CHECKING:
 MAX_SQUARED = 16.3
 """Squared difference by its covariance, prediction to smoothed pose, up to which it was noise: the 99.9 % quantile
 of chi squared with 3 degrees of freedom. Beyond it a wheel slipped."""
+_LEAST_M, _LEAST_RAD = 0.1, radians(3.0)
+"""How far a robot was moved, or its wheels slipped, at least (m, rad): less makes no pose wrong, and people shift the
+optimum by some centimetres."""
+SETTLED = 5
+"""Matches after which the covariance no longer knows how a track began."""
 _REMEMBERED = 0.98
 """Weight of an innovation after the next one: about 50 are remembered, the 10 m of a match each 0.2 m."""
 _HALF_MEMORY = 25
@@ -112,6 +117,11 @@ def innovation_weight(covariance: F64, information: F64) -> F64:
 def is_slip(innovation: F64, weight: F64) -> bool:
     """Whether an innovation (3,), by its inverse covariance (3, 3), is no noise."""
     return float(innovation @ weight @ innovation) > MAX_SQUARED
+
+
+def is_far(off: F64) -> bool:
+    """Whether a difference of poses (3,) makes one wrong: people, or stamps that are a little late, make less."""
+    return bool(hypot(off[0], off[1]) >= _LEAST_M or abs(off[2]) >= _LEAST_RAD)
 
 
 class Innovations:

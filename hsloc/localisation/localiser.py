@@ -6,7 +6,7 @@ While the pose is unknown the relocaliser decides.
 
 from __future__ import annotations
 
-from math import hypot, radians, sqrt
+from math import hypot, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +20,7 @@ from hsloc.localisation.kalman_filter import (
     difference,
     fuse_match,
     innovation_weight,
+    is_far,
     is_slip,
     predict_covariance,
 )
@@ -50,11 +51,8 @@ if TYPE_CHECKING:
     F64 = NDArray[np.float64]
 
 
-_MOVED_M, _MOVED_RAD = 0.1, radians(3.0)
-"""How far a robot whose odometry stands still is found from there if it was moved: less makes no pose wrong, and people
-shift the optimum by some centimetres."""
 _MOVED_WINDOW = 2.0
-"""Half-width of the window in which it is searched for, by the wide one: two scans of a robot at 2 m/s."""
+"""Half-width of the window in which a robot that was moved is searched for, by the wide one: two scans at 2 m/s."""
 _UNSURE = 2.0
 """Standard deviations by which a motion may be longer than interpolated odometry states, for the motion gate."""
 _MOST_ASTRAY = 0.2
@@ -207,7 +205,7 @@ class Localiser:
                 information = self._match_gate.trust(match.fitness) * information
                 weight = self._innovations.add(off, information, propagated, noise)
             self._odometry_scale.update(off, covariance, weight)
-            may_slip = is_usual and _is_far(off) and is_slip(off, weight)
+            may_slip = is_usual and is_far(off) and is_slip(off, weight)
             if self._contradicted.slipped(may_slip, T_odom_base, match.pose, points):
                 covariance = covariance + np.outer(off, off)  # a mean of prediction and match would be neither
             pose, covariance = fuse_match(predicted, covariance, match, information)
@@ -268,7 +266,7 @@ class Localiser:
             off = difference(match.pose, predicted)
             information = match_information(points, self._field, match.pose, self._wall_variance())
             weight = None if information is None else innovation_weight(self._covariance, information)
-            is_moved = _is_far(off) and weight is not None and is_slip(off, weight)
+            is_moved = is_far(off) and weight is not None and is_slip(off, weight)
         else:
             is_moved = bool(self._match_gate.refusal(match.fitness)) and self._is_astray(paired, match.pose)
         self._rest_gate.searched(is_moved)
@@ -354,8 +352,3 @@ class Localiser:
         self._T_map_match = T_map_base
         self._T_odom_match = T_odom_base
         self._T_map_odom = T_map_base @ T_odom_base.inverse()
-
-
-def _is_far(off: F64) -> bool:
-    """Whether an innovation (3,) makes a pose wrong, and is more than people or stamps that are a little late make."""
-    return bool(hypot(off[0], off[1]) >= _MOVED_M or abs(off[2]) >= _MOVED_RAD)

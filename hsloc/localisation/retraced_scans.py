@@ -9,6 +9,7 @@ import numpy as np
 
 from hsloc.localisation.interpolated_odometry import AtStamp
 from hsloc.localisation.kalman_filter import (
+    SETTLED,
     Anchor,
     Innovations,
     difference,
@@ -40,8 +41,6 @@ STEP_WINDOW = (0.25, 0.25, radians(8.0))
 """Half-widths (m, m, rad) of the window from one scan of a search to the next."""
 _TRACE_LOST = 3
 """Scans in a row that fit nowhere near, going backwards: before them the robot was elsewhere, or is not known."""
-_SETTLED = 5
-"""Scans after which the covariance no longer knows where the trace began."""
 
 
 class RetracedScan(NamedTuple):
@@ -79,7 +78,7 @@ class Retracer:
     def trace(
         self, pose: Pose2, covariance: F64, least: float, seen: Iterable[SeenScan], most: int
     ) -> list[RetracedScan]:
-        """The last of the `seen` scans, at most so many, back to where none fits with the fitness `least`.
+        """The last of the `seen` scans, at most `most` of them, back to where none fits with the fitness `least`.
 
         The robot was at `pose` at the first of them, the last one that was seen.
         """
@@ -123,7 +122,7 @@ class Retracer:
         kept = traced[: len(traced) - misses]
         anchors = []
         for k, each in enumerate(kept):
-            settled = kept[max(k, min(_SETTLED, len(kept) - 1))]
+            settled = kept[max(k, min(SETTLED, len(kept) - 1))]
             T_odom_base, at = each.paired.T_odom_base, AtStamp(each.paired.scan.stamp_ns, each.paired.interpolation)
             anchors.append(
                 Anchor(each.odometry_count, T_odom_base, each.pose, settled.covariance, k == 0, each.noise_scale, at=at)

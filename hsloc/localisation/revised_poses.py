@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import hypot, radians
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.localisation.interpolated_odometry import AtStamp
-from hsloc.localisation.kalman_filter import MAX_SQUARED, Anchor, SmoothedMatches, difference, predict_covariance
+from hsloc.localisation.kalman_filter import (
+    MAX_SQUARED,
+    Anchor,
+    SmoothedMatches,
+    difference,
+    is_far,
+    predict_covariance,
+)
 from hsloc.model.pose2 import Pose2, compose_poses, rotated
 
 if TYPE_CHECKING:
@@ -22,9 +28,6 @@ if TYPE_CHECKING:
     from hsloc.model.trajectory import Trajectory
 
     F64 = NDArray[np.float64]
-
-_LEAST_SLIP_M, _LEAST_SLIP_RAD = 0.1, radians(3.0)
-"""Difference (m, rad) to the odometry that is a slip, at least: stamps that are a little late make less."""
 
 
 def composed(poses: F64, odometry: F64, revision: Sequence[Revised], end: int) -> F64:
@@ -64,8 +67,7 @@ def revised_matches(
         variances[k] = np.diag(rotated(noise, before.T_map_base.theta))
         off = difference(after.T_map_base, before.T_map_base @ motion)
         covariance = predict_covariance(before.covariance, before.T_map_base, motion, noise) + after.covariance
-        is_far = hypot(off[0], off[1]) >= _LEAST_SLIP_M or abs(off[2]) >= _LEAST_SLIP_RAD
-        if is_far and off @ np.linalg.solve(covariance + 1e-10 * np.eye(3), off) > MAX_SQUARED:
+        if is_far(off) and off @ np.linalg.solve(covariance + 1e-10 * np.eye(3), off) > MAX_SQUARED:
             slips[k] = np.maximum(off**2 - np.diag(covariance), 0.0)
     poses = np.array([anchor.T_map_base.to_array() for anchor in anchors])
     return anchors, SmoothedMatches(poses, np.array([anchor.covariance for anchor in anchors]), variances, slips)

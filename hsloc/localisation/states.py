@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.localisation.joined_tracks import joined_begins
-from hsloc.localisation.kalman_filter import predict_covariance
+from hsloc.localisation.kalman_filter import SETTLED, predict_covariance
 from hsloc.localisation.track_evidence import CONFIDENCE, States, TrackRow, mirrored_map, smooth, usual_explained
 from hsloc.model.estimate import Ambiguity, Evidence, LikelyPlace, State, Status
 from hsloc.model.pose2 import Pose2
@@ -34,8 +34,6 @@ _WITHIN = 2.5
 """Standard deviations that an error of a localised pose stays within."""
 _POOR_FIT = 0.92
 """Explained fitness by the usual one below which a doubted pose is taken for off the map."""
-_SETTLED = 5
-"""Matches after which the covariance no longer knows how a track began."""
 _CONTRADICTED = "scans fit, but by the odometry other stretches of the run are elsewhere"
 _OTHER_MAP = "scans fit, but not for long: the map may be of another place"
 _MIRRORED = "the scans fit the map better when they are mirrored"
@@ -284,7 +282,7 @@ class StateLog:
                 sigma[k] = sigma[k + 1]
             if estimate.status is Status.RELOCALISED:
                 # Before it the scans were matched backwards, and are as sure as those matched forwards after it.
-                settled = next((j for j in range(k + _SETTLED, k, -1) if j < n and owners[j] - owners[k] == j - k), k)
+                settled = next((j for j in range(k + SETTLED, k, -1) if j < n and owners[j] - owners[k] == j - k), k)
                 sigma[k] = np.fmin(sigma[k], sigma[settled])
         return sigma
 

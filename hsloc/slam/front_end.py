@@ -298,8 +298,8 @@ class FrontEnd:
         window = Window.from_covariance(predicted, covariance, p.window_sigmas, (p.window_min, p.window_min_angle))
         certain = max(window.half_x, window.half_y) <= _BASIN and window.half_theta <= _BASIN_ANGLE
         fitness = self._maps[0][0].fitness(points, best.pose)
-        stands = certain and not best.refusal()
-        if stands and self._is_usual(fitness):
+        is_accepted = certain and not best.refusal()
+        if is_accepted and self._is_usual(fitness):
             return best, evaluations
         local = self._maps[0][0].field
         # Wheels may have slipped all the way. Farther away are other places, which may look alike after a gap.
@@ -312,12 +312,12 @@ class FrontEnd:
             found = self._recent.register(scans, start, predicted, covariance)
             fits = local.fitness(points, found.pose)
             more = found.agreement > best.agreement + _BETTER, fits > fitness + _BETTER
-            is_doubted = stands or (box is wide and not best.refusal())
+            is_doubted = is_accepted or (box is wide and not best.refusal())
             better = all(more) and self._is_usual(fits) if is_doubted else any(more)
             credible = not found.refusal() and self._is_credible(found, fits, predicted, best.is_contradicted())
             if (better or best.refusal()) and credible:
                 best, fitness = found, fits
-            may_be_wrong = (stands or self._slips) and not self._is_usual(fitness)
+            may_be_wrong = (is_accepted or self._slips) and not self._is_usual(fitness)
             if not best.refusal() and not may_be_wrong:
                 break
         return best, evaluations

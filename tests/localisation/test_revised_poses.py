@@ -33,7 +33,7 @@ def drive(way: float = 0.1) -> Trajectory:
 
 
 def revision(*matches: tuple[int, float]) -> tuple[Revised, ...]:
-    """The robot was at x after so many messages; in truth it went 20 % farther than the odometry says."""
+    """The robot was at x after a number of messages; in truth it went 20 % farther than the odometry says."""
     return tuple(Revised(count, Pose2(x - 0.1 * (count - 1), 0.0, 0.0), SURE) for count, x in matches)
 
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 SLOW = """#!{python}
 import json, os, sys, time
 found = {{"argv": sys.argv[1:], "variables": dict(os.environ), "nice": os.nice(0)}}
-open("{told}.part", "w").write(json.dumps(found))
-os.rename("{told}.part", "{told}")
+open("{report}.part", "w").write(json.dumps(found))
+os.rename("{report}.part", "{report}")
 time.sleep(600)
 """
 
@@ -37,15 +37,15 @@ def kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_process_of_low_priority_that_is_given_no_token_fills_them_and_ends_with_the_server(
     kernels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    script, told = tmp_path / "python", tmp_path / "told.json"
-    script.write_text(SLOW.format(python=sys.executable, told=told))
+    script, report = tmp_path / "python", tmp_path / "report.json"
+    script.write_text(SLOW.format(python=sys.executable, report=report))
     script.chmod(0o700)
     monkeypatch.setattr(sys, "executable", str(script))
     monkeypatch.setenv("HSLOC_TOKEN", "secret")
     warm_up = WarmUp(tmp_path)
     warm_up.start()
-    until(told.exists, "the process has begun")
-    found: dict[str, Any] = json.loads(told.read_text())
+    until(report.exists, "the process has begun")
+    found: dict[str, Any] = json.loads(report.read_text())
     warm_up.stop()
     assert warm_up._process is not None
     assert warm_up._process.returncode is not None

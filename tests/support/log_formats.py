@@ -18,6 +18,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hsloc.log.messages import decode, definitions, encode
+from hsloc.model import IDENTITY
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -306,6 +307,18 @@ def _fill(message: Any, content: dict[str, Any]) -> None:
             getattr(message, key).extend(value)
         else:
             setattr(message, key, value)
+
+
+def with_motions(target: Path, source: Path, change: Callable[[int, Pose2], Pose2]) -> Path:
+    """A simulated log whose odometry counts otherwise: `change` gets number and motion from message to message."""
+    last, now = IDENTITY, IDENTITY
+
+    def changed(number: int, pose: Pose2) -> Pose2:
+        nonlocal last, now
+        now, last = now @ change(number, last.between(pose)), pose
+        return now
+
+    return with_odometry(target, source, changed)
 
 
 def with_odometry(target: Path, source: Path, change: Callable[[int, Pose2], Pose2 | None]) -> Path:

@@ -175,8 +175,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"hsloc: error: {error}", file=sys.stderr)
         return EXIT_FAILED
     except KeyboardInterrupt:
-        print("hsloc: interrupted", file=sys.stderr)
-        return 130
+        return _interrupted()
+    except SystemError as error:
+        # In a kernel's first call Ctrl-C may come where numba does not expect it.
+        if not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
+        return _interrupted()
     except BrokenPipeError:  # Whoever read the output has enough; `program` leaves the rest.
         return EXIT_FAILED
     except OSError as error:
@@ -189,6 +193,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         where = error.filename or "standard output"
         print(f"hsloc: error: {where}: cannot be written ({error.strerror}); check the free space", file=sys.stderr)
         return EXIT_FAILED
+
+
+def _interrupted() -> int:
+    print("hsloc: interrupted", file=sys.stderr)
+    return 130
 
 
 def program() -> None:

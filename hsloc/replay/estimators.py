@@ -9,7 +9,6 @@ import numpy as np
 
 from hsloc.config import preset
 from hsloc.errors import ConfigError
-from hsloc.interrupts import interrupts_held_back
 from hsloc.matching.window import Window
 from hsloc.model.events import Heading, Odometry
 from hsloc.model.pose2 import IDENTITY
@@ -101,5 +100,4 @@ def _warm_up(matcher: Matcher, likelihood: LikelihoodField) -> None:
     """Have the kernels compiled (once after an installation, up to a minute) before the clock of the replay starts."""
     points = np.zeros((1, 2))
     window = Window(likelihood.T_map_field, 0.1, 0.1, 0.1)
-    with interrupts_held_back():  # A compiler that is interrupted may take the process with it.
-        matcher.match(points, likelihood, window, np.random.default_rng(0))
+    matcher.match(points, likelihood, window, np.random.default_rng(0))

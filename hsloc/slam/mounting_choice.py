@@ -72,6 +72,11 @@ _PLACE_M = 0.02
 """Standard deviation (m) up to which the place of such a laser is stated, too: what a ruler finds."""
 _LEAST_TURNED = 0.5
 """Rotation (rad) by the odometry from which the scans must turn the same way."""
+_MOST_IN_VAIN = 2
+"""Looks one after the other in which they do not, after which no more scans are matched: half as many more did not
+help. Where scans are 0.7 m apart (ACES) 600 were matched in vain, a fifth of the time of the run."""
+_NOTHING = Pose2(), inf, inf
+"""Of the place and the yaw of a laser nothing is known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,10 +182,14 @@ def _direction(motions: Iterable[_Motion]) -> tuple[Pose2, float, float]:
 
     Settled is that the laser looks where it is said to, as far beyond doubt as an error must be, and that its steps
     agree with those of the odometry: among pillars some matches are wrong, in either direction. Of a laser that looks
-    elsewhere the pose is stated, and all that is measured of it counts.
+    elsewhere the pose is stated, and all that is measured of it counts. It is given up where the scans turn otherwise
+    than the odometry in two motions one after the other: with more of such matches nothing is settled either.
     """
-    found = Pose2(), inf, inf
+    found, in_vain = _NOTHING, 0
     for motion in motions:
+        in_vain = 0 if _turns_agree(motion) else in_vain + 1
+        if in_vain == _MOST_IN_VAIN:
+            return _NOTHING
         found = _direction_by(motion)
         seen, driven = motion.by_scans[:, :2], motion.by_odometry[:, :2]
         agree = np.sum(seen * driven) >= LEAST_AGREEMENT * sqrt(float(np.sum(seen**2) * np.sum(driven**2)))
@@ -196,14 +205,10 @@ def _direction_by(motion: _Motion) -> tuple[Pose2, float, float]:
     `R(-yaw) (S + (R(turn) - 1) p)`. In complex numbers that is linear in two of them, which are found by robust least
     squares.
     """
-    nothing = Pose2(), inf, inf
-    if len(motion.by_scans) < _FEWEST_OF_DIRECTION:
-        return nothing
-    turned, driven_turn = motion.by_scans[:, 2], motion.by_odometry[:, 2]
+    if len(motion.by_scans) < _FEWEST_OF_DIRECTION or not _turns_agree(motion):
+        return _NOTHING
+    turned = motion.by_scans[:, 2]
     seen, driven = (each[:, 0] + 1j * each[:, 1] for each in (motion.by_scans, motion.by_odometry))
-    length = sqrt(float(np.sum(turned**2) * np.sum(driven_turn**2)))
-    if np.abs(driven_turn).sum() > _LEAST_TURNED and np.sum(turned * driven_turn) < LEAST_AGREEMENT * length:
-        return nothing  # The scans are mirrored, or one of the two is wrong.
     rows = np.stack((driven, np.exp(1j * turned) - 1.0), axis=1)
     values = np.zeros(2, dtype=np.complex128)
     for _ in range(10):
@@ -216,7 +221,7 @@ def _direction_by(motion: _Motion) -> tuple[Pose2, float, float]:
     without = without_each_part(information, vectors, PARTS)
     low, high = _SCALES_OF_DIRECTION
     if not all(low < abs(each) < high for each in (values[0], *without[:, 0])):
-        return nothing
+        return _NOTHING
     every = np.vstack((values, without))
     turns = every[:, 0].conj() / np.abs(every[:, 0])  # e^(i yaw)
     places = every[:, 1] * turns
@@ -225,6 +230,16 @@ def _direction_by(motion: _Motion) -> tuple[Pose2, float, float]:
     place_sigma = sqrt(spread * float(np.sum(np.abs(places[1:] - places[0]) ** 2)))
     error = Pose2(float(places[0].real), float(places[0].imag), float(np.angle(turns[0])))
     return error, place_sigma, yaw_sigma
+
+
+def _turns_agree(motion: _Motion) -> bool:
+    """Whether scans and odometry turn alike; if not, the scans are mirrored, or one of the two is wrong."""
+    if len(motion.by_scans) < _FEWEST_OF_DIRECTION:
+        return True
+    by_scans, by_odometry = motion.by_scans[:, 2], motion.by_odometry[:, 2]
+    length = sqrt(float(np.sum(by_scans**2) * np.sum(by_odometry**2)))
+    little = float(np.abs(by_odometry).sum()) <= _LEAST_TURNED
+    return little or float(np.sum(by_scans * by_odometry)) >= LEAST_AGREEMENT * length
 
 
 def _choice(

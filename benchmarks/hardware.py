@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import hardware_drives as drives
+import hardware_surfaces as surfaces
 import numpy as np
 from confusion import SENSORS, SHAPES, drive_of, half, world_of
 from false_certainty import mirrored
@@ -178,6 +179,23 @@ KINDS: dict[str, Kind] = {
     "begins carried": Kind(drives.carried(0.0, 8.0)),
     "ends carried": Kind(drives.carried(50.0, 99.0)),
     "carried": Kind(drives.carried(25.0, 35.0)),
+    "glass": Kind(surfaces.glass(0.25)),
+    "mirrors": Kind(surfaces.mirrors(0.1)),
+    "dark walls": Kind(surfaces.dark(0.4)),
+    "pitches": Kind(surfaces.pitching(np.radians(3.0))),
+    "knocked": Kind(surfaces.knocked(30.0, np.radians(5.0))),
+    "knocked twice": Kind(
+        lambda d: surfaces.knocked(40.0, np.radians(4.0))(surfaces.knocked(20.0, np.radians(-4.0))(d))
+    ),
+    "gives way": Kind(surfaces.giving_way(20.0, 45.0, np.radians(6.0))),
+    "shakes": Kind(surfaces.shaking(np.radians(0.7))),
+    "covered half way": Kind(surfaces.from_then_on(30.0, drives.blocked(np.radians(140.0)))),
+    "worn half way": Kind(surfaces.from_then_on(30.0, drives.low_cost)),
+    "odometry ends": Kind(surfaces.without_odometry_from(30.0)),
+    "odometry stands": Kind(drives.misled(30.0, 1e9, 0.0, 0.0)),
+    "turns x 1.3 half way": Kind(drives.misled(30.0, 1e9, 1.3, 1.0)),
+    "way x 0.8 half way": Kind(drives.misled(30.0, 1e9, 1.0, 0.8)),
+    "rearranged": Kind(surfaces.rearranged),
     "thick walls": Kind(change=thick),
     "cells 0.1": Kind(cell=0.1),
     "cells 0.02": Kind(cell=0.02),

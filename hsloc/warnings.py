@@ -67,6 +67,8 @@ class WarningCode(StrEnum):
     """The laser is mounted with a tilt; its ranges are used as if it were level."""
     LASER_MOVES = "laser_moves"
     """The mounting of the laser changes during the log; its last pose is used for the whole log."""
+    LASER_TURNED = "laser_turned"
+    """The laser was turned on the robot during the log, by what its scans and the odometry show."""
     LASER_POSE_SHARED = "laser_pose_shared"
     """One --laser-pose is used for several lasers."""
     ODOMETRY_FRAME_ASSUMED = "odometry_frame_assumed"

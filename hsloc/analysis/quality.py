@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from math import degrees, hypot, isfinite
+from math import degrees
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hsloc.analysis.map_changes import HIDDEN
-from hsloc.evaluation.association import interpolate_poses
+from hsloc.analysis.mounting_warnings import mounting_warnings, mounting_warnings_of_map
 from hsloc.evaluation.maps import MOST_GONE
-from hsloc.localisation.mounting_error import mounting_error_of_steps
 from hsloc.localisation.reasons import localisation_reasons
-from hsloc.model.pose2 import Pose2
 from hsloc.model.verdict import Verdict, VerdictReason, spans_of
 from hsloc.replay.clock_offset import KNOWN, matched_headings
 from hsloc.slam.heading_offset import find_offset
-from hsloc.slam.mounting_choice import laser_pose_option, right_mounting
 from hsloc.slam.time_offset import clock_warnings, drift_warning, find_drift, offsets_of_log
 from hsloc.trajectory_io.tum import NS_PER_S
 from hsloc.warnings import RunWarning, WarningCode
@@ -40,6 +36,7 @@ _VERDICTS = {
     WarningCode.LASER_MISFIT: Verdict.CHECK,
     WarningCode.EXTRINSICS_WRONG: Verdict.CHECK,
     WarningCode.EXTRINSICS_DISAGREE: Verdict.CHECK,
+    WarningCode.LASER_TURNED: Verdict.CHECK,
     WarningCode.EXTRINSICS_UNDECIDED: Verdict.CHECK,
     WarningCode.SCANS_FROZEN: Verdict.CHECK,
     WarningCode.SCAN_STAMPS_STUCK: Verdict.CHECK,
@@ -58,7 +55,6 @@ _MOST_NAMED = 5
 """Stray scans whose times a warning names."""
 _RANGES_REMEDY = "see what the lidar measured: hsloc check; correct its limits with --scan-fix, or choose --scan-topic"
 """Where beams or whole scans have no return, nothing else helps."""
-_ONE_SIDED = "; all turns go to one side, where slip of the wheels may be a part of that"
 _FAILING = {"failed": (Verdict.FAILED,), "check": (Verdict.FAILED, Verdict.CHECK)}
 
 
@@ -69,10 +65,10 @@ def quality_warnings(result: Result) -> list[RunWarning]:
     """
     if result.mapping is not None:
         of_map = [*_stray_warnings(result.mapping, result), *_plan_warnings(result.mapping, result)]
-        return [*of_map, *(_direction_warnings(result) or _place_warnings(result.mapping, result))]
+        return [*of_map, *mounting_warnings_of_map(result.mapping, result)]
     if result.mode != "localise":
         return []
-    of_sensor = [*_mirror_warnings(result), *_scale_warnings(result), *_mounting_warnings(result)]
+    of_sensor = [*_mirror_warnings(result), *_scale_warnings(result), *mounting_warnings(result)]
     without, scans = int(_without_place(result).sum()), len(result.diagnostics)
     if without <= _MAX_WITHOUT_PLACE * scans:
         return of_sensor
@@ -160,76 +156,6 @@ def _mirror_warnings(result: Result) -> list[RunWarning]:
             "flip the map's image; or, if the laser is mounted upside down, state it (--laser-pose, /tf_static)",
         )
     ]
-
-
-def _mounting_warnings(result: Result) -> list[RunWarning]:
-    found = result.mounting_error
-    if found is None or not found.is_significant or len(result.summary.lasers) != 1:
-        return []
-    (laser,) = result.summary.lasers
-    error, yaw = found.error, found.sigma[2]
-    place = f"{hypot(error.x, error.y):.3f} ± {sigma:.3f} m and " if isfinite(sigma := found.place_sigma) else ""
-    return [
-        RunWarning(
-            WarningCode.EXTRINSICS_WRONG,
-            f"scans and odometry agree if the laser is {place}"
-            f"{degrees(error.theta):.1f} ± {degrees(yaw):.1f} deg from where it is stated, and so are the poses"
-            f"{_ONE_SIDED if found.slip else ''}",
-            f"measure it, or hsloc calibrate; {laser_pose_option(error @ laser.T_base_laser)}",
-        )
-    ]
-
-
-def _direction_warnings(result: Result) -> list[RunWarning]:
-    """Where the mounting was given, or a map with the other one shows as much of an error."""
-    shown, request = result.mounting_error, result.request
-    if shown is None or not shown.is_turned or result.direction_is_right:
-        return []
-    if WarningCode.EXTRINSICS_WRONG in {each.code for each in result.warnings}:
-        return []
-    reading, front_end = result.reading or request.reading(), request.config.graph_mapper.front_end
-    found = right_mounting(request.logs, reading, front_end, used=False)
-    return [] if found is None else [found[1]]
-
-
-def _place_warnings(mapping: MappingResult, result: Result) -> list[RunWarning]:
-    """Where a laser is that is not where it is stated or assumed to be: by the finished map and the odometry.
-
-    Clocks that differ move it ahead or back, by the robot's way in that time: that much is no other place.
-    """
-    odometry, stamps = result.odometry, mapping.keyscan_stamps_ns
-    if result.lidar_only or len(odometry) == 0 or len(result.summary.lasers) > 1:
-        return []
-    # Those of a map that is extended are of other logs.
-    own = (stamps >= odometry.stamps_ns[0]) & (stamps <= odometry.stamps_ns[-1])
-    by_odometry = interpolate_poses(odometry, stamps[own])
-    found = mounting_error_of_steps(by_odometry, mapping.keyscan_poses[own])
-    if found is None or not found.is_displaced:
-        return []
-    offset = find_offset(*matched_headings(result.diagnostics, odometry, result.trajectory))
-    if not isfinite(offset.sigma):
-        return []
-    by_clocks = 0.0
-    if offset.is_significant:
-        metres, seconds = np.hypot(*np.diff(by_odometry[:, :2], axis=0).T), np.diff(stamps[own]) / NS_PER_S
-        by_clocks = abs(offset.seconds) * float(np.quantile(metres / np.maximum(seconds, 1e-3), 0.95))
-        left = replace(found.error, x=max(abs(found.error.x) - by_clocks, 0.0))
-        if not replace(found, error=left).is_displaced:
-            return []
-    stated = result.summary.T_base_laser
-    right, sigma = found.error @ stated, hypot(found.place_sigma, by_clocks)
-    option = laser_pose_option(Pose2(right.x, right.y, stated.theta))
-    if result.summary.extrinsics == "identity":
-        text = f"by scans and odometry the laser is at ({right.x:.3f}, {right.y:.3f}) ± {sigma:.3f} m in the base frame"
-        remedy = f"the poses are those of the laser; {option} makes them those of the base"
-        return [RunWarning(WarningCode.EXTRINSICS_MEASURED, text, remedy)]
-    by = hypot(found.error.x, found.error.y)
-    text = (
-        f"scans and odometry agree if the laser is {by:.3f} ± {sigma:.3f} m from where it is stated; where no wall "
-        "fixes the motion, the map is off by as much after each turn"
-        f"{_ONE_SIDED if found.slip else ''}"
-    )
-    return [RunWarning(WarningCode.EXTRINSICS_WRONG, text, f"measure it, or hsloc calibrate; {option}")]
 
 
 def change_warnings(changes: SeenChanges | None, trajectory: Trajectory) -> list[RunWarning]:

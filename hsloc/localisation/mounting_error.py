@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import hypot, inf, isinf, radians
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -42,11 +42,13 @@ _LONGEST_M = 1.0
 MIN_SIGMAS = 7.0
 """Minimum ratio of an error to its standard deviation: once in 16,000 runs, as it is Student's of 9 degrees of freedom:
 4 would be once in 320. True errors of 10 cm and 3 deg have ratios of 10 to 13 after a minute."""
+YAW = 3
+"""Number of the yaw among what is solved for: the scale of the odometry and the x, y and yaw of the laser."""
 PRIOR = 1e-6
 """Information of the prior, so that what no step shows is found to be zero."""
-_LEAST_M, _LEAST_RAD = 0.05, radians(2.0)
+_LEAST_M, LEAST_RAD = 0.05, radians(2.0)
 """Smaller errors are not reported: a ruler and an eye do no better."""
-_UNKNOWN_M = 0.07
+UNKNOWN_M = 0.07
 """Error of the place in x and in y (m) of a laser whose yaw is wrong, where nothing shows it: together 10 cm, as far as
 a laser is from the middle of a small robot. Assumed: whoever states a wrong yaw did not measure the place."""
 
@@ -80,7 +82,7 @@ class MountingError:
     @property
     def is_turned(self) -> bool:
         """Whether the yaw is wrong beyond doubt, and by enough to matter."""
-        return abs(self.error.theta) > max(_LEAST_RAD, MIN_SIGMAS * self.sigma[2])
+        return abs(self.error.theta) > max(LEAST_RAD, MIN_SIGMAS * self.sigma[2])
 
     @property
     def is_significant(self) -> bool:
@@ -102,51 +104,59 @@ class MountingError:
             errors[:, 0] = np.abs(c * self.error.x - s * self.error.y)
             errors[:, 1] = np.abs(s * self.error.x + c * self.error.y)
         elif self.is_turned and isinf(self.sigma[0]):
-            errors[:, :2] = _UNKNOWN_M
+            errors[:, :2] = UNKNOWN_M
         if self.is_turned:
             errors[:, 2] = abs(self.error.theta)
         return errors
 
 
-def mounting_error(anchors: Sequence[Anchor]) -> MountingError | None:
-    """By the matches of a run with one laser; None where they say too little."""
+class Steps(NamedTuple):
+    """Equations of the steps between matches: `rows` (n, 2, 4) times scale, x, y and yaw is `apart` (n, 2; m).
+
+    Each leads to the pose of number `second` (n,). `turned` (n,) is by how much the robot turned (rad).
+    """
+
+    rows: F64
+    apart: F64
+    turned: F64
+    second: NDArray[np.intp]
+
+
+def steps_of_anchors(anchors: Sequence[Anchor]) -> Steps | None:
+    """Of the matches of a run with one laser; None where there are too few."""
     if len(anchors) <= _FEWEST:
         return None
     odometry = np.array([anchor.T_odom_base.to_array() for anchor in anchors])
     matched = np.array([anchor.T_map_base.to_array() for anchor in anchors])
-    return mounting_error_of_steps(odometry, matched, np.array([anchor.begins for anchor in anchors]))
+    return steps_of_poses(odometry, matched, np.array([anchor.begins for anchor in anchors]))
 
 
-def mounting_error_of_steps(
-    odometry: F64, matched: F64, begins: NDArray[np.bool_] | None = None
-) -> MountingError | None:
+def steps_of_poses(odometry: F64, matched: F64, begins: NDArray[np.bool_] | None = None) -> Steps | None:
     """By poses (n, 3) of the odometry and of the matches; `begins` (n,): a new track begins there. None as above."""
     step, seen = relative_poses(odometry[:-1], odometry[1:]), relative_poses(matched[:-1], matched[1:])
     usable = np.hypot(step[:, 0], step[:, 1]) < _LONGEST_M
     if begins is not None:
         usable &= ~begins[1:]
     step, seen = step[usable], seen[usable]
-    turned = wrap_angles(seen[:, 2])  # noise of the odometry turns its translation, too: it would show as a place
     if len(step) < _FEWEST:
         return None
+    turned = wrap_angles(seen[:, 2])  # noise of the odometry turns its translation, too: it would show as a place
     # So would a scale of its turns: along an arc half of what is turned too far is in the direction of the step.
     half = np.column_stack((np.zeros((len(step), 2)), 0.5 * wrap_angles(turned - step[:, 2])))
     step = compose_poses(half, step)
-    other_side = min(turned[turned > 0.0].sum(), -turned[turned < 0.0].sum())
-    is_one_sided = other_side <= _LEAST_OTHER_SIDE * np.abs(turned).sum()
     c, s = np.cos(turned), np.sin(turned)
     along = np.stack((step[:, 0], c - 1.0, -s, step[:, 1]), axis=1)
     aside = np.stack((step[:, 1], s, c - 1.0, -step[:, 0]), axis=1)
-    rows, apart = np.stack((along, aside), axis=1), seen[:, :2] - step[:, :2]  # (n, 2, 4) and (n, 2)
-    values = np.zeros(4)
-    for _ in range(5):
-        residual = apart - rows @ values
-        scale = np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-4)
-        weight = 1.0 / scale**2 / (1.0 + ((residual / scale) ** 2).sum(axis=1, keepdims=True) / 4.0)
-        information = np.einsum("nip,ni,niq->npq", rows, weight, rows)
-        vectors = np.einsum("nip,ni,ni->np", rows, weight, apart)
-        values = np.linalg.solve(information.sum(axis=0) + PRIOR * np.eye(4), vectors.sum(axis=0))
-    without = without_each_part(information, vectors, PARTS)
+    return Steps(np.stack((along, aside), axis=1), seen[:, :2] - step[:, :2], turned, np.flatnonzero(usable) + 1)
+
+
+def mounting_error(steps: Steps) -> MountingError:
+    """The one that explains the steps best."""
+    turned = steps.turned
+    other_side = min(turned[turned > 0.0].sum(), -turned[turned < 0.0].sum())
+    is_one_sided = other_side <= _LEAST_OTHER_SIDE * np.abs(turned).sum()
+    values, information, vectors = robust_solution(steps.rows, steps.apart)
+    without = without_each_part(information, vectors, np.arange(len(vectors)) * PARTS // len(vectors))
     sigma = np.sqrt((PARTS - 1) / PARTS * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     x, y, yaw = values[1:].tolist()
     sigmas = (float(sigma[1]), float(sigma[2]), float(sigma[3]))
@@ -154,16 +164,33 @@ def mounting_error_of_steps(
     return found.of_yaw() if is_one_sided and not found.is_displaced else found
 
 
-def without_each_part(information: NDArray[Any], vectors: NDArray[Any], parts: int) -> NDArray[Any]:
-    """Solutions (parts, p) of normal equations without each of `parts` parts of their rows in turn (jackknife).
+def robust_solution(rows: F64, apart: F64) -> tuple[F64, F64, F64]:
+    """Values (p,) by robust least squares, and the normal equations (n, p, p) and (n, p) of each step.
 
-    `information` (n, p, p) and `vectors` (n, p), real or complex, are those of each row.
+    `rows` (n, 2, p) times the values is `apart` (n, 2).
     """
-    part = np.arange(len(vectors)) * parts // len(vectors)
+    parameters = rows.shape[2]
+    values = np.zeros(parameters)
+    for _ in range(5):
+        residual = apart - rows @ values
+        scale = np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-4)
+        weight = 1.0 / scale**2 / (1.0 + ((residual / scale) ** 2).sum(axis=1, keepdims=True) / 4.0)
+        information = np.einsum("nip,ni,niq->npq", rows, weight, rows)
+        vectors = np.einsum("nip,ni,ni->np", rows, weight, apart)
+        values = np.linalg.solve(information.sum(axis=0) + PRIOR * np.eye(parameters), vectors.sum(axis=0))
+    return values, information, vectors
+
+
+def without_each_part(information: NDArray[Any], vectors: NDArray[Any], part: NDArray[np.intp]) -> NDArray[Any]:
+    """Solutions (parts, p) of normal equations without each part of their rows in turn (jackknife).
+
+    `information` (n, p, p) and `vectors` (n, p), real or complex, are those of each row; `part` (n,) numbers the part
+    that it belongs to, -1 none.
+    """
     total, sums = information.sum(axis=0) + PRIOR * np.eye(vectors.shape[1]), vectors.sum(axis=0)
     return np.array(
         [
             np.linalg.solve(total - information[part == k].sum(axis=0), sums - vectors[part == k].sum(axis=0))
-            for k in range(parts)
+            for k in range(int(part.max()) + 1)
         ]
     )

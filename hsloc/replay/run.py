@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.localisation.map_scale import MapScale
+    from hsloc.localisation.mounting_changes import YawPiece
     from hsloc.localisation.mounting_error import MountingError
     from hsloc.localisation.states import StateRows
     from hsloc.log import Log, LogSummary, Losses, ReadOptions
@@ -81,7 +82,7 @@ class Result:
     `states` are the states of the poses of a localiser that weighs evidence; `localised` are those in this state,
     `tracked` the poses that were not searched for, whether their scans fit or not.
     `map_scale` is the size of a given map by what the lidar measures, `mounting_error` where the only laser is by the
-    odometry, from where it is said to be, `ambiguities` where several places of it fit.
+    odometry, from where it is said to be, `yaw_pieces` when it was turned, `ambiguities` where several places fit.
     `preparation` is what was done with the events of the log. Odometry that counts wrongly is corrected in `odometry`,
     with a warning. With `lidar_only` no odometry of the log was used: a localiser's `odometry` is that of the scans.
     """
@@ -110,6 +111,7 @@ class Result:
     odometry_scale: OdometryScale | None = None
     """How much more a metre and a radian of `odometry` are, by a localiser on a given map."""
     mounting_error: MountingError | None = None
+    yaw_pieces: tuple[YawPiece, ...] = ()
     ambiguities: tuple[Ambiguity, ...] = ()
     preparation: Preparation = field(default_factory=Preparation)
     clock_offsets: Mapping[str, Offset] | None = None
@@ -357,7 +359,8 @@ def _run_with(
     if scale is not None and isinstance(correction, tuple):
         scale = replace(scale, corrected=correction[0].value)
     mounting = history.mounting_error() if localise or not lidar_only else None
-    states = history.states(scale, mounting, grid) if localise else None
+    pieces = history.yaw_pieces() if localise else ()
+    states = history.states(scale, mounting, grid, pieces) if localise else None
     tracked, localised = localised, localised if states is None else states.is_localised()
     return Result(
         request=request,
@@ -382,6 +385,7 @@ def _run_with(
         odometry_scale=None if localiser is None else localiser.odometry_scale,
         given_resolution=given_resolution,
         mounting_error=mounting,
+        yaw_pieces=pieces,
         ambiguities=history.ambiguities(states),
         preparation=preparation,
         clock_offsets=offsets,

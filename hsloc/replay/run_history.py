@@ -13,7 +13,8 @@ from hsloc.localisation.between_matches import between_matches, bridge_variances
 from hsloc.localisation.interpolated_odometry import AtStamp
 from hsloc.localisation.kalman_filter import Anchor, SmoothedMatches, noise_around, smooth_matches
 from hsloc.localisation.motion_models import OdometryNoise
-from hsloc.localisation.mounting_error import mounting_error, mounting_error_of_steps
+from hsloc.localisation.mounting_changes import piece_errors, yaw_pieces
+from hsloc.localisation.mounting_error import mounting_error, steps_of_anchors, steps_of_poses
 from hsloc.localisation.revised_poses import composed, revised_matches
 from hsloc.localisation.states import StateLog, with_odometry_alone, with_pose_errors
 from hsloc.model.estimate import ScanDiagnostics, State, Status
@@ -26,11 +27,14 @@ from hsloc.slam.heading_offset import NANOSECONDS, UNKNOWN, Headings, find_offse
 from hsloc.slam.time_offset import LEAST_AGREEMENT, agreement, find_drift
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from hsloc.localisation.map_scale import MapScale
     from hsloc.localisation.motion_models import MotionModel
-    from hsloc.localisation.mounting_error import MountingError
+    from hsloc.localisation.mounting_changes import YawPiece
+    from hsloc.localisation.mounting_error import MountingError, Steps
     from hsloc.localisation.states import StateRows
     from hsloc.model.certificate import Certificate
     from hsloc.model.estimate import Ambiguity, Estimate, Revised
@@ -264,12 +268,13 @@ class RunHistory:
         scale: MapScale | None = None,
         mounting: MountingError | None = None,
         grid: OccupancyGrid | None = None,
+        pieces: Sequence[YawPiece] = (),
     ) -> StateRows | None:
         """The state of each pose of the trajectory in hindsight; None for an estimator that weighs no evidence.
 
         With the map, `grid`, the tracks of the run are weighed against each other by the odometry between them.
-        Where the map has another `scale` than the lidar, or the laser another `mounting` than stated, poses are as
-        uncertain as that makes them.
+        Where the map has another `scale` than the lidar, or the laser another `mounting` than stated, or from a time on
+        (`pieces`), poses are as uncertain as that makes them.
         """
         if len(self._states) == 0:
             return None
@@ -308,6 +313,10 @@ class RunHistory:
         if mounting is not None and mounting.is_significant:
             errors = mounting.pose_errors(self.trajectory()[0].poses)
             rows = with_pose_errors(rows, errors, "the laser is mounted elsewhere than stated")
+        if pieces:
+            rows = with_pose_errors(
+                rows, piece_errors(pieces, self.trajectory()[0]), "the laser was turned on the robot"
+            )
         return rows
 
     def _is_alone(self) -> NDArray[np.bool_]:
@@ -320,17 +329,33 @@ class RunHistory:
         return found
 
     def mounting_error(self) -> MountingError | None:
-        """How far the laser is from where it is said to be; None where that is not known, or with several lasers.
+        """How far the laser is from where it is said to be; None where that is not known or changes, or of several.
 
         Of a map that is built only the yaw, and a part of that: its scans are matched to each other with the odometry.
         """
+        steps = self._mounting_steps()
+        if steps is None or self.yaw_pieces():
+            return None
+        found = mounting_error(steps)
+        return found if self._motion_model is not None else found.of_yaw()
+
+    def yaw_pieces(self) -> tuple[YawPiece, ...]:
+        """Parts in which the only laser looks the same way; none where it never turned, or that is not known."""
+        steps = self._mounting_steps()
+        if steps is None:
+            return ()
+        if self._motion_model is None:  # Of a map that is built this says that it did; the finished map says when.
+            return yaw_pieces(steps, np.arange(len(self._mapped) // 6))
+        counts = np.array([anchor.count for anchor in self._anchors])
+        return yaw_pieces(steps, np.array(self._odometry_stamps)[np.maximum(counts - 1, 0)])
+
+    def _mounting_steps(self) -> Steps | None:
         if len(self._frames) != 1:
             return None
         if self._motion_model is not None:
-            return mounting_error(self._anchors)
+            return steps_of_anchors(self._anchors)
         poses = np.array(self._mapped).reshape(-1, 6)
-        found = mounting_error_of_steps(poses[:, :3], poses[:, 3:])
-        return None if found is None else found.of_yaw()
+        return steps_of_poses(poses[:, :3], poses[:, 3:])
 
     def ambiguities(self, states: StateRows | None) -> tuple[Ambiguity, ...]:
         """Between which places the run does not decide, and when; `states` are those of its poses."""

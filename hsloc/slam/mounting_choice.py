@@ -218,7 +218,7 @@ def _direction_by(motion: _Motion) -> tuple[Pose2, float, float]:
         information = np.einsum("np,n,nq->npq", rows.conj(), weight, rows)
         vectors = rows.conj() * (weight * seen)[:, None]
         values = np.linalg.solve(information.sum(axis=0) + PRIOR * np.eye(2), vectors.sum(axis=0))
-    without = without_each_part(information, vectors, PARTS)
+    without = without_each_part(information, vectors, np.arange(len(vectors)) * PARTS // len(vectors))
     low, high = _SCALES_OF_DIRECTION
     if not all(low < abs(each) < high for each in (values[0], *without[:, 0])):
         return _NOTHING

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from hsloc.analysis import quality
+from hsloc.analysis import mounting_warnings
 from hsloc.analysis.quality import quality_warnings
 from hsloc.log import LogWriter, ReadOptions, Transform3, open_log
 from hsloc.model import Odometry, Pose2, Scan
@@ -136,7 +136,7 @@ def test_scans_that_show_no_other_yaw_by_themselves_are_asked_once(
     tmp_path: Path, recorded: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
-    for module in (clock_offset, quality):
+    for module in (clock_offset, mounting_warnings):
         monkeypatch.setattr(module, "right_mounting", lambda *_, used: asked.append(used))
     path = write(tmp_path / "a.mcap", recorded, [Transform3.from_pose2(RIGHT @ Pose2(0.0, 0.0, 0.14))])
     result = run(path, mode="slam")
@@ -159,6 +159,7 @@ def test_a_map_shows_a_laser_that_is_elsewhere_than_it_is_stated(
     # Clocks that differ put it ahead or behind by the way in that time.
     for seconds, is_named in ((0.05, True), (1.0, False)):
         monkeypatch.setattr(
-            "hsloc.analysis.quality.find_offset", lambda *_, s=seconds: UNKNOWN._replace(seconds=s, sigma=1e-3)
+            "hsloc.analysis.mounting_warnings.find_offset",
+            lambda *_, s=seconds: UNKNOWN._replace(seconds=s, sigma=1e-3),
         )
         assert bool(quality_warnings(result)) == is_named

@@ -158,6 +158,11 @@ def knocked(at_s: float, turn: float) -> Callable[[Drive], Drive]:
     return change
 
 
+def knocked_twice(drive: Drive) -> Drive:
+    """By 4 deg at 20 s, and back at 40 s."""
+    return knocked(40.0, np.radians(4.0))(knocked(20.0, np.radians(-4.0))(drive))
+
+
 def rearranged(drive: Drive) -> Drive:
     """Forty round things of 0.3 to 0.5 m, half a metre to 3 m beside the path, are all moved by 1 m half way."""
     rng, poses = drive.rng, drive.truth().poses

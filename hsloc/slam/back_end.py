@@ -111,7 +111,8 @@ def finish_session(
     gathered, refined, passes = refine_with_calibration(
         poses, arrays, gathered, loop_edges, parameters, lambda part: report(0.5 + 0.4 * part)
     )
-    fit, edges = None, Edges.concatenate([without_slips(gathered.steps, gathered.slipped), loop_edges])
+    steps = gathered.believed_steps(parameters.joint_registration)
+    fit, edges = None, Edges.concatenate([steps, loop_edges])
     if plan is not None:
         fit = find_on_plan(plan, build_grid(refined.poses, gathered.scans, parameters.occupancy), refined.poses)
         if fit.is_certain:

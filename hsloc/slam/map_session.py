@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.model.estimate import Status
-from hsloc.model.pose2 import Pose2, compose_poses, relative_poses
+from hsloc.model.pose2 import Pose2, compose_poses, pose_differences, relative_poses
 from hsloc.slam.calibration import odometry_chi, odometry_scale
 from hsloc.slam.keyscans import KeyScans
 from hsloc.slam.loop_matcher import Loop
 from hsloc.slam.pose_graph import Edges
+from hsloc.slam.slips import without_slips
 from hsloc.slam.stated_loops import StatedLoops, stated_places
 from hsloc.slam.submaps import UNKNOWN_STEP, Submaps
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.slam.front_end import LocalMatch
+    from hsloc.slam.joint_registration import JointRegistrationParameters
     from hsloc.slam.keyscans import KeyScan
     from hsloc.slam.map_state import MapState
     from hsloc.slam.parameters import GraphMapperParameters
@@ -92,6 +94,16 @@ class MapSession:
         slipped = np.zeros(len(self.steps), dtype=np.bool_)
         slipped[list(self.slips)] = True
         return slipped
+
+    def believed_steps(self, registration: JointRegistrationParameters) -> Edges:
+        """The odometry's steps before the refined map is held against them: next to no weight for those that slipped.
+
+        Nor for those of which a scan that was believed says so much else that it would lose the walls it was paired
+        with where the odometry has it: standing wheels of a robot that moves say to the centimetre that it does not.
+        """
+        apart = pose_differences(self.motions[1:], self.steps.measured)
+        off = np.hypot(apart[:, 0], apart[:, 1]) + registration.radius * np.abs(apart[:, 2])
+        return without_slips(self.steps, self.slipped | (~self.refused[1:] & (off > registration.gates[0])))
 
     @property
     def chain(self) -> Edges:

@@ -10,7 +10,6 @@ import numpy as np
 from hsloc.model.pose2 import pose_differences
 from hsloc.slam.joint_registration import moved_scans, refine
 from hsloc.slam.pose_graph import Edges
-from hsloc.slam.slips import without_slips
 from hsloc.slam.systematic_errors import find_systematic_errors
 
 if TYPE_CHECKING:
@@ -57,13 +56,13 @@ def refine_with_calibration(
     been freed of its own.
     """
     most = parameters.passes
-    edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), loop_edges])
+    edges = Edges.concatenate([gathered.believed_steps(parameters.joint_registration), loop_edges])
     refined = refine(poses, scans, edges, parameters.joint_registration, lambda part: progress(part / most))
     if parameters.use_odometry:
         errors = find_systematic_errors(refined, gathered.steps, gathered.first)
         gathered = replace(gathered, steps=errors.added_to(gathered.steps), systematic=errors)
         if errors.are_found:
-            edges = Edges.concatenate([without_slips(gathered.steps, gathered.slipped), loop_edges])
+            edges = Edges.concatenate([gathered.believed_steps(parameters.joint_registration), loop_edges])
             refined = replace(refined, moved=np.inf)
     return gathered, *_settled(refined, scans, edges, parameters, progress)
 

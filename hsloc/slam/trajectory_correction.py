@@ -23,6 +23,8 @@ _NOISE_M, _NOISE_SHARE, _LARGEST_NOISE = 0.005, 0.1, 4.0
 as is assumed of odometry; and the multiple of it that noise does not reach."""
 _STILL_M = 1e-9
 """Motion (m) that an event counts for in which the odometry counts none: there a push is shared out evenly."""
+_UNCOUNTED_M = 1e3
+"""What each scan counts for before the odometry begins and after it ends: what it disagrees in happened there."""
 
 
 class EventLog:
@@ -161,6 +163,10 @@ class EventLog:
         """Of each event the keyscans before and after it, the path between them, and the part of it that was driven."""
         steps = relative_poses(odometry[:-1], odometry[1:])
         lengths = _STILL_M + np.hypot(steps[:, 0], steps[:, 1]) + self._turn_length * np.abs(steps[:, 2])
+        counted = np.flatnonzero(~np.array(self._is_scan, dtype=bool))
+        if len(counted):
+            # The last scan before the first message and the first after the last one are taken at these.
+            lengths[: max(counted[0] - 1, 0)] = lengths[counted[-1] + 1 :] = _UNCOUNTED_M
         path_length = np.concatenate(([0.0], np.cumsum(lengths)))
         before = np.clip(np.searchsorted(keys, np.arange(len(odometry)), side="right") - 1, 0, len(keys) - 1)
         after = np.minimum(before + 1, len(keys) - 1)

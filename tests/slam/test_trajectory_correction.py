@@ -64,6 +64,30 @@ def test_a_push_is_shared_out_evenly_while_the_wheels_stand() -> None:
     np.testing.assert_allclose(odometry[:, 0], (0.2, 0.4, 0.6, 0.8), atol=1e-9)
 
 
+def test_what_the_robot_does_after_its_odometry_has_ended_moves_no_pose_before() -> None:
+    track = EventLog(0.3)
+    track.add(Pose2(), is_scan=True, is_key=True)
+    for x in (0.1, 0.2):
+        track.add(Pose2(x), is_scan=False)
+    for k in range(4):
+        track.add(Pose2(0.2), is_scan=True, is_key=k == 3)
+    odometry, scans = track.corrected(np.array(((0.0, 0.0, 0.0), (0.8, 0.0, 0.0))))
+    np.testing.assert_allclose(odometry[:, 0], (0.1, 0.2), atol=1e-3)
+    np.testing.assert_allclose(scans[1:, 0], (0.2, 0.4, 0.6, 0.8), atol=1e-3)
+
+
+def test_what_it_does_before_its_odometry_begins_moves_no_pose_after() -> None:
+    track = EventLog(0.3)
+    for k in range(4):
+        track.add(Pose2(), is_scan=True, is_key=k == 0)
+    for x in (0.0, 0.1, 0.2):
+        track.add(Pose2(x), is_scan=False)
+    track.add(Pose2(0.2), is_scan=True, is_key=True)
+    odometry, scans = track.corrected(np.array(((-0.6, 0.0, 0.0), (0.2, 0.0, 0.0))))
+    np.testing.assert_allclose(odometry[:, 0], (0.0, 0.1, 0.2), atol=1e-3)
+    np.testing.assert_allclose(scans[:4, 0], (-0.6, -0.4, -0.2, 0.0), atol=1e-3)
+
+
 def test_what_is_no_noise_may_have_happened_at_any_time_between_two_keyscans() -> None:
     sure = np.zeros((2, 3, 3))
     track = between_two_keyscans(0.25, 0.5, 0.75, 1.0)

@@ -91,6 +91,8 @@ class WarningCode(StrEnum):
     """The same for half a metre and more: the lidar's driver hung."""
     SCAN_BODY_RETURNS = "scan_body_returns"
     """Beams that see the robot itself, at short ranges that never change, are left out."""
+    SCAN_COMPANIONS = "scan_companions"
+    """Returns of those who walk with the robot while a map is made are left out."""
     SCAN_STAMPS_STUCK = "scan_stamps_stuck"
     """Most scans have the stamp of the one before: when they were measured is not known."""
     TOPICS_END_APART = "topics_end_apart"

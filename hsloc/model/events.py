@@ -92,6 +92,10 @@ class Scan:
         """Direction of each beam in the laser's frame, radians, shape (n,)."""
         return self.angle_min + self.angle_increment * np.arange(len(self.ranges), dtype=np.float64)
 
+    def directions(self) -> NDArray[np.float64]:
+        """Unit vectors along the beams in the laser's frame, shape (n, 2); not to be written to."""
+        return _directions(len(self.ranges), self.angle_min, self.angle_increment)
+
     def hits(self) -> NDArray[np.bool_]:
         """Which beams hit something: finite and within [range_min, range_max] (both included)."""
         ranges = self.ranges
@@ -112,7 +116,7 @@ class Scan:
         count = place_hits(
             np.ascontiguousarray(self.ranges),
             (float(self.range_min), float(self.range_max)),
-            _directions(n, self.angle_min, self.angle_increment),
+            self.directions(),
             (float(laser.x), float(laser.y), cos(laser.theta), sin(laser.theta)),
             found,
         )

@@ -12,7 +12,7 @@ from hsloc.log import open_log
 from hsloc.model.events import Odometry, PairedScan, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2, wrap_angle
 from hsloc.preprocessing.scans import pair
-from hsloc.replay.prepared_events import PreparedEvents
+from hsloc.replay.prepared_events import PreparedEvents, Surroundings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -58,7 +58,7 @@ def posed_events(result: Result, progress: Callable[[float], None] | None = None
     T_map_odom: Pose2 | None = None
 
     with rarely_collected():
-        recorded = preparation.without_body(log.events())
+        recorded = Surroundings(log.events(), preparation)
         events = _with_recorded_odometry(recorded, result) if preparation.lidar_only else recorded
         prepared = PreparedEvents(events, preparation)
         for event in pair(prepared, deskew=preparation.deskewed, first=preparation.first):

@@ -1,4 +1,4 @@
-"""Things near a lidar that stand free: runs of beams between beams that see farther."""
+"""Things near a lidar that stand free: runs of beams that see nearer than those beside them."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ def find_free_standing(
     """Write first and last beam and the middle x, y (m) of each to `found` (n, 4); returns how many there are.
 
     `sizes` are the reach (m), the difference of range (m) to the beams on both sides, and the largest extent (m). Beams
-    of one thing differ by less than that from one to the next; it is seen by two at least. Where the beams go all the
-    way round (`is_turn`) the first follows the last: a thing may end at a beam of number n and more. Hits are within
-    the `limits` (2,); `directions` (n, 2) are unit vectors along the beams.
+    of one thing differ by less than that from one to the next; it is seen by two at least. The beams on one side may
+    be nearer: something else hides a part of it. Of what is at the first or the last beam nothing is known. Where the
+    beams go all the way round (`is_turn`) the first follows the last: a thing may end at a beam of number n and more.
+    Hits are within the `limits` (2,); `directions` (n, 2) are unit vectors along the beams.
     """
     reach, gap, widest = sizes
     n = len(ranges)
@@ -41,20 +42,17 @@ def find_free_standing(
         if here > reach or (first == 0 and not is_turn):
             continue
         before = _seen(ranges, first - 1 if first > 0 else n - 1, limits)
-        if before < here + gap:
+        if abs(before - here) <= gap:
             continue
-        x = here * directions[first, 0]
-        y = here * directions[first, 1]
-        begin_x, begin_y, end_x, end_y = x, y, x, y
-        last = first
-        edge = here
-        after = np.inf
+        begin_x, begin_y = here * directions[first, 0], here * directions[first, 1]
+        end_x, end_y, x, y = begin_x, begin_y, begin_x, begin_y
+        last, edge, after, is_whole = first, here, np.inf, True
         while last - first < n - 1:
-            if last + 1 >= n and not is_turn:
-                after = -np.inf  # what is beyond is not known
-                break
             k = (last + 1) % n
             after = _seen(ranges, k, limits)
+            if last + 1 >= n and not is_turn:
+                is_whole = False
+                break
             if after > reach or abs(after - edge) > gap:
                 break
             last += 1
@@ -63,7 +61,8 @@ def find_free_standing(
             x += end_x
             y += end_y
         size = last - first + 1
-        if size < 2 or after < edge + gap or (end_x - begin_x) ** 2 + (end_y - begin_y) ** 2 > widest * widest:
+        is_wide = (end_x - begin_x) ** 2 + (end_y - begin_y) ** 2 > widest * widest
+        if not is_whole or size < 2 or is_wide or (before < here and after < edge):
             continue
         found[count, 0] = first
         found[count, 1] = last

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field, replace
-from math import cos, hypot, sin
+from math import atan2, copysign, cos, hypot, pi, sin
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
 from hsloc.kernels.free_standing import find_free_standing
 from hsloc.model.events import Odometry, Scan
-from hsloc.model.pose2 import IDENTITY
+from hsloc.model.pose2 import IDENTITY, Pose2
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hsloc.model.events import Event
-    from hsloc.model.pose2 import Pose2
 
     F64 = NDArray[np.float64]
     Bools = NDArray[np.bool_]
@@ -41,13 +40,19 @@ _TOGETHER_M = 0.5
 _VIEW_M, _VIEW_RAD = 0.2, 0.3
 """Motion (m, rad) by the odometry after which the scans are compared: more than what stands is uncertain by."""
 _STANDS_M = 0.12
-"""Distance (m) from where a thing that stands is expected: by the odometry, and as another side of it is seen."""
+"""Distance (m) of a return from where one that stands is expected: by the odometry, and as another side is seen."""
+_NEAR_M = 0.3
+"""What one who walks with the robot may come nearer or go farther (m) from view to view; from one thing that stands to
+the next it is more, or both are where such things are expected."""
 _SWAY_M = 0.5
-"""What one who walks with the robot may be nearer or farther (m): a pace. In longer steps of the robot nothing is told
-from what stands."""
+"""What one who walks with the robot may be nearer or farther (m): a pace."""
+_LONGEST_M = 1.0
+"""Longest step of the robot (m) from view to view: after it something else may be at the same place beside it."""
 _WAY_M, _VIEWS = 2.0, 6
 """Way (m) and number of views for which it has to keep its place: two paces, and more than things are apart that might
 be taken for each other."""
+_MOST_WALKING = 3
+"""Where more of them seem to, it is the robot that stands, and its odometry that counts."""
 _MISSED = 2
 """Views in a row in which it may be hidden."""
 _STANDING = 0.3
@@ -84,6 +89,8 @@ class _Track:
     """Places of a thing in the last views."""
 
     places: list[_Place]
+    is_with_another: bool = False
+    """Whether it appeared beside one that walks with the robot: two people came apart."""
     missed: int = 0
     is_walking: bool = False
 
@@ -91,7 +98,7 @@ class _Track:
         """Whether it has kept its place beside the robot, which drove on; true if it had not before."""
         first, last, count = self.places[0], self.places[-1], len(self.places)
         was, self.is_walking = self.is_walking, False
-        if count >= _VIEWS and last.way - first.way >= _WAY_M:
+        if self.is_with_another or (count >= _VIEWS and last.way - first.way >= _WAY_M):
             x, y = sum(each.x for each in self.places) / count, sum(each.y for each in self.places) / count
             sway = max(hypot(each.x - x, each.y - y) for each in self.places)
             self.is_walking = sway <= _SWAY_M and sum(each.stood for each in self.places) <= _STANDING * count
@@ -104,7 +111,9 @@ class _Track:
             del self.places[0]
 
     def at(self, view: int) -> _Place | None:
-        """Where it was in this view, or last before it."""
+        """Where it was in this view, or last before it; from the view before the first one on."""
+        if view == self.places[0].view - 1:
+            return self.places[0]
         return next((each for each in reversed(self.places) if each.view <= view), None)
 
 
@@ -218,19 +227,22 @@ class WithoutCompanions:
         laser.at, laser.view = pose, laser.view + 1
         moved = hypot(step.x, step.y)
         laser.unseen += moved
-        if moved > _SWAY_M:
+        if moved > _LONGEST_M:
             laser.tracks, laser.unseen, laser.ranges = [], 0.0, ranges
         elif _is_changed(ranges, laser.ranges):
             laser.way, laser.unseen, laser.ranges = laser.way + laser.unseen, 0.0, ranges
         elif laser.unseen > _UNSEEN_M:
             laser.tracks, laser.unseen, laser.ranges = [], 0.0, ranges
-        laser.tracks = _followed(laser, held.things or [], step)
-        for track in laser.tracks:
-            if track.decide():
-                for before in self._held:
-                    place = track.at(before.view) if before.laser is laser else None
-                    if place is not None and before is not held:
-                        before.hide([place])
+        laser.tracks = _followed(laser, cast("Scan", held.event), held.things or [], step)
+        began = [track for track in laser.tracks if track.decide()]
+        if sum(track.is_walking for track in laser.tracks) > _MOST_WALKING:
+            laser.tracks = []
+            return
+        for track in began:
+            for before in self._held:
+                place = track.at(before.view) if before.laser is laser else None
+                if place is not None and before is not held:
+                    before.hide([place])
 
     def warnings(self) -> tuple[RunWarning, ...]:
         """What was left out."""
@@ -298,25 +310,36 @@ def _apart(a: _Thing, b: _Thing) -> float:
     return hypot(a.x - b.x, a.y - b.y)
 
 
-def _followed(laser: _Laser, things: list[_Thing], step: Pose2) -> list[_Track]:
+def _followed(laser: _Laser, scan: Scan, things: list[_Thing], step: Pose2) -> list[_Track]:
     """The tracks with the things that are nearest to where they were, seen from the robot, and new ones of the rest.
 
     `step` is the robot's motion since, by which one that stands has moved the other way.
     """
     free, kept = list(things), []
-    back = step.inverse()
-    c, s = cos(back.theta), sin(back.theta)
     for track in sorted(laser.tracks, key=lambda each: -len(each.places)):
         x, y = track.places[-1].x, track.places[-1].y
         nearest = min(free, key=lambda thing: hypot(thing.x - x, thing.y - y), default=None)
-        if nearest is None or hypot(nearest.x - x, nearest.y - y) > _SWAY_M:
+        if nearest is None or hypot(nearest.x - x, nearest.y - y) > _NEAR_M:
             track.missed += 1
             if track.missed <= _MISSED:
                 kept.append(track)
             continue
-        stays_x, stays_y = back.x + c * x - s * y, back.y + s * x + c * y
-        stood = any(hypot(thing.x - stays_x, thing.y - stays_y) <= _STANDS_M for thing in things)
         free.remove(nearest)
+        stood = _is_there(scan, step.inverse() @ Pose2(x, y, 0.0))
         track.add(_Place(laser.view, laser.way, nearest.x, nearest.y, stood))
         kept.append(track)
-    return kept + [_Track([_Place(laser.view, laser.way, thing.x, thing.y, stood=False)]) for thing in free]
+    walking = [track.places[-1] for track in kept if track.is_walking and not track.is_with_another]
+    for thing in free:
+        with_another = any(hypot(thing.x - each.x, thing.y - each.y) <= _WIDEST_M for each in walking)
+        kept.append(_Track([_Place(laser.view, laser.way, thing.x, thing.y, stood=False)], with_another))
+    return kept
+
+
+def _is_there(scan: Scan, place: Pose2) -> bool:
+    """Whether one of the beams towards a place in the base's frame ends there."""
+    seen = scan.T_base_laser.inverse() @ place
+    along = (atan2(seen.y, seen.x) - scan.angle_min) * copysign(1.0, scan.angle_increment)
+    beam = round(along % (2.0 * pi) / abs(scan.angle_increment))
+    ranges = scan.ranges[max(beam - 1, 0) : max(beam + 2, 0)]
+    with np.errstate(invalid="ignore"):
+        return bool((np.abs(ranges - hypot(seen.x, seen.y)) <= _STANDS_M).any())

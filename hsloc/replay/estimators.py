@@ -12,7 +12,6 @@ from hsloc.errors import ConfigError
 from hsloc.matching.window import Window
 from hsloc.model.events import Heading, Odometry
 from hsloc.model.pose2 import IDENTITY
-from hsloc.preprocessing.companions import WithoutCompanions
 from hsloc.preprocessing.left_out_hits import without_isolated
 from hsloc.preprocessing.odometry import OdometryWatch
 from hsloc.replay.map_and_start import load_grid, resumed
@@ -42,7 +41,7 @@ def events_of(request: RunRequest, recorded: Iterable[Event], lidar_only: bool, 
     if not lidar_only:
         # The point mapper cannot do without odometry, whatever that is like.
         events = recorded if request.config.mapper == "point" and not localise else OdometryWatch(recorded)
-        return events if localise else without_isolated(WithoutCompanions(events))
+        return events if localise else without_isolated(events)
     unused = (Odometry, Heading) if request.no_odometry else (Odometry,)
     events = (event for event in recorded if not isinstance(event, unused))
     if localise:

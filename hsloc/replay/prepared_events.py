@@ -1,4 +1,4 @@
-"""The events of a log as a run gets them: body beams left out, odometry continued and corrected, scans watched.
+"""The events of a log as a run gets them: without the robot itself and those who walk with it, the odometry continued.
 
 The run and the second pass over its log both come here, so that reports show what was matched.
 """
@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from hsloc.preprocessing.body_returns import without_beams
+from hsloc.preprocessing.companions import WithoutCompanions
 from hsloc.preprocessing.odometry import ContinuousOdometry
 from hsloc.preprocessing.scans import ScanWatch
 
@@ -31,6 +32,7 @@ class Preparation:
 
     `lidar_only`: no odometry of the log is used. `deskewed`: beams are moved to where the robot was when each was
     measured. `body_beams`: beams (n,) that see the robot itself and are left out, by the frame of a laser.
+    `is_mapped`: those who walk with the robot are left out, too; on a given map they do no harm.
     `odometry_correction`: what the odometry is corrected by. `first`: T_odom_base of the first message.
     """
 
@@ -39,10 +41,27 @@ class Preparation:
     body_beams: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
     odometry_correction: OdometryScale | None = None
     first: Pose2 | None = None
+    is_mapped: bool = False
 
-    def without_body(self, events: Iterable[Event]) -> Iterable[Event]:
-        """Events whose scans lack the beams that see the robot."""
-        return without_beams(events, self.body_beams) if self.body_beams else events
+
+class Surroundings:
+    """Events whose scans lack what moves with the robot: its body, and those who walk with it.
+
+    To be gone through once; then `warnings` gives who did.
+    """
+
+    def __init__(self, events: Iterable[Event], preparation: Preparation) -> None:
+        seen = without_beams(events, preparation.body_beams) if preparation.body_beams else events
+        followed = preparation.is_mapped and not preparation.lidar_only
+        self._companions = WithoutCompanions(seen) if followed else None
+        self._seen = self._companions or seen
+
+    def __iter__(self) -> Iterator[Event]:
+        return iter(self._seen)
+
+    def warnings(self) -> tuple[RunWarning, ...]:
+        """Who walked with the robot."""
+        return () if self._companions is None else self._companions.warnings()
 
 
 class PreparedEvents:

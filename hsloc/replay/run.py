@@ -37,7 +37,7 @@ from hsloc.replay.map_and_start import (
 )
 from hsloc.replay.matched_scans import mean_fitness
 from hsloc.replay.pose_covariances import pose_covariances
-from hsloc.replay.prepared_events import Preparation, PreparedEvents
+from hsloc.replay.prepared_events import Preparation, PreparedEvents, Surroundings
 from hsloc.replay.progress import Progress, share_of, with_progress
 from hsloc.replay.references import read_reference
 from hsloc.replay.run_history import RunHistory
@@ -329,11 +329,12 @@ def _run_with(
         body_beams=body_beams(log.events()),
         odometry_correction=correction if isinstance(correction, OdometryScale) else None,
         first=first,
+        is_mapped=not localise,
     )
     warnings = (*warnings, *body_warnings(preparation.body_beams))
     prepared = time.perf_counter()
     history = RunHistory(request.config.localiser.smoothing_model() if localise else None)
-    recorded = preparation.without_body(log.events())
+    recorded = Surroundings(log.events(), preparation)
     events = PreparedEvents(events_of(request, recorded, lidar_only, localise), preparation, log.summary)
     with rarely_collected():
         reported = with_progress(log, events, history, progress)
@@ -373,7 +374,7 @@ def _run_with(
         grid=require_map(grid),
         diagnostics=history.diagnostics(mapping),
         losses=log.losses,
-        warnings=(*log.summary.warnings, *warnings, *events.warnings(), *of_steps),
+        warnings=(*log.summary.warnings, *warnings, *recorded.warnings(), *events.warnings(), *of_steps),
         seconds=seconds,
         mode="localise" if localise else "slam",
         mapping=mapping,

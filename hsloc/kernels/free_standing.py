@@ -62,7 +62,8 @@ def find_free_standing(
             y += end_y
         size = last - first + 1
         is_wide = (end_x - begin_x) ** 2 + (end_y - begin_y) ** 2 > widest * widest
-        if not is_whole or size < 2 or is_wide or (before < here and after < edge):
+        is_free = abs(after - edge) > gap and not (before < here and after < edge)
+        if not is_whole or size < 2 or size == n or is_wide or not is_free:
             continue
         found[count, 0] = first
         found[count, 1] = last

@@ -63,25 +63,35 @@ part of the range: along walls only what is ahead changes, and where wheels spin
 _HELD_M, _HELD_S, _MOST_HELD = 3.0, 20.0, 5000
 """Way (m) and time (s) for which events are held back, and how many at most: of a base at 200 Hz and a lidar at 40."""
 _UNSEEN_M = 1.5
-"""Way (m) by the odometry in which nothing changed, after which nothing is said: then the wheels may spin."""
+"""Way (m) by the odometry in which nothing changed, after which nothing new is said: then the wheels may spin."""
 
 
 class _Thing(NamedTuple):
-    """What stands free near the robot: its middle in the base's frame (m), and its runs of beams, first and last."""
+    """What stands free near the robot: its middle in the base's frame (m), and its parts, as legs.
+
+    Of each part the first and the last beam, and the middle.
+    """
 
     x: float
     y: float
-    beams: tuple[tuple[int, int], ...]
+    parts: tuple[tuple[int, int, tuple[float, float]], ...]
 
 
 class _Place(NamedTuple):
-    """Where a thing was in a view (m), the way until then (m), and whether one that stands would have been there."""
+    """Where a thing was in a view (m), the way until then (m), and whether what stood in the view before is there."""
 
     view: int
     way: float
-    x: float
-    y: float
+    thing: _Thing
     stood: bool
+
+    @property
+    def x(self) -> float:
+        return self.thing.x
+
+    @property
+    def y(self) -> float:
+        return self.thing.y
 
 
 @dataclass(slots=True)
@@ -98,7 +108,7 @@ class _Track:
         """Whether it has kept its place beside the robot, which drove on; true if it had not before."""
         first, last, count = self.places[0], self.places[-1], len(self.places)
         was, self.is_walking = self.is_walking, False
-        if self.is_with_another or (count >= _VIEWS and last.way - first.way >= _WAY_M):
+        if was or self.is_with_another or (count >= _VIEWS and last.way - first.way >= _WAY_M):
             x, y = sum(each.x for each in self.places) / count, sum(each.y for each in self.places) / count
             sway = max(hypot(each.x - x, each.y - y) for each in self.places)
             self.is_walking = sway <= _SWAY_M and sum(each.stood for each in self.places) <= _STANDING * count
@@ -155,7 +165,7 @@ class _Held:
             if any(hypot(thing.x - place.x, thing.y - place.y) <= _SWAY_M for place in places):
                 if self.hidden is None:
                     self.hidden = np.zeros(len(scan.ranges), dtype=np.bool_)
-                for first, last in thing.beams:
+                for first, last, _ in thing.parts:
                     self.hidden[np.arange(first - 1, last + 2) % len(scan.ranges)] = True
 
 
@@ -232,7 +242,8 @@ class WithoutCompanions:
         elif _is_changed(ranges, laser.ranges):
             laser.way, laser.unseen, laser.ranges = laser.way + laser.unseen, 0.0, ranges
         elif laser.unseen > _UNSEEN_M:
-            laser.tracks, laser.unseen, laser.ranges = [], 0.0, ranges
+            laser.tracks = [track for track in laser.tracks if track.is_walking]
+            laser.unseen, laser.ranges = 0.0, ranges
         laser.tracks = _followed(laser, cast("Scan", held.event), held.things or [], step)
         began = [track for track in laser.tracks if track.decide()]
         if sum(track.is_walking for track in laser.tracks) > _MOST_WALKING:
@@ -282,12 +293,11 @@ def _things(scan: Scan) -> list[_Thing]:
         np.ascontiguousarray(scan.ranges), limits, scan.directions(), is_turn, (_REACH_M, _GAP_M, _WIDEST_M), found
     )
     c, s = cos(mounting.theta), sin(mounting.theta)
-    return _put_together(
-        [
-            _Thing(mounting.x + c * x - s * y, mounting.y + s * x + c * y, ((int(first), int(last)),))
-            for first, last, x, y in found[:count].tolist()
-        ]
-    )
+    things = []
+    for first, last, ahead, aside in found[:count].tolist():
+        x, y = mounting.x + c * ahead - s * aside, mounting.y + s * ahead + c * aside
+        things.append(_Thing(x, y, ((int(first), int(last), (x, y)),)))
+    return _put_together(things)
 
 
 def _put_together(things: list[_Thing]) -> list[_Thing]:
@@ -302,7 +312,7 @@ def _put_together(things: list[_Thing]) -> list[_Thing]:
         if max(_apart(a, b) for a in group for b in group) > _WIDEST_M:
             continue
         x, y = (sum(each) / len(group) for each in zip(*((thing.x, thing.y) for thing in group), strict=True))
-        found.append(_Thing(x, y, tuple(beams for thing in group for beams in thing.beams)))
+        found.append(_Thing(x, y, tuple(part for thing in group for part in thing.parts)))
     return found
 
 
@@ -317,7 +327,8 @@ def _followed(laser: _Laser, scan: Scan, things: list[_Thing], step: Pose2) -> l
     """
     free, kept = list(things), []
     for track in sorted(laser.tracks, key=lambda each: -len(each.places)):
-        x, y = track.places[-1].x, track.places[-1].y
+        thing_before = track.places[-1].thing
+        x, y = thing_before.x, thing_before.y
         nearest = min(free, key=lambda thing: hypot(thing.x - x, thing.y - y), default=None)
         if nearest is None or hypot(nearest.x - x, nearest.y - y) > _NEAR_M:
             track.missed += 1
@@ -325,13 +336,14 @@ def _followed(laser: _Laser, scan: Scan, things: list[_Thing], step: Pose2) -> l
                 kept.append(track)
             continue
         free.remove(nearest)
-        stood = _is_there(scan, step.inverse() @ Pose2(x, y, 0.0))
-        track.add(_Place(laser.view, laser.way, nearest.x, nearest.y, stood))
+        there = [_is_there(scan, step.inverse() @ Pose2(*middle, 0.0)) for *_, middle in thing_before.parts]
+        # Of one who walks one leg stands at any time.
+        track.add(_Place(laser.view, laser.way, nearest, stood=all(there)))
         kept.append(track)
     walking = [track.places[-1] for track in kept if track.is_walking and not track.is_with_another]
     for thing in free:
         with_another = any(hypot(thing.x - each.x, thing.y - each.y) <= _WIDEST_M for each in walking)
-        kept.append(_Track([_Place(laser.view, laser.way, thing.x, thing.y, stood=False)], with_another))
+        kept.append(_Track([_Place(laser.view, laser.way, thing, stood=False)], with_another))
     return kept
 
 

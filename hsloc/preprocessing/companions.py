@@ -60,6 +60,11 @@ _STANDING = 0.3
 _CHANGED_M, _CHANGED_PART, _CHANGED_SHARE, _FEWEST = 0.1, 0.05, 0.2, 20
 """The robot has driven where a fifth of the other beams, of at least so many, changed by more than this (m), and this
 part of the range: along walls only what is ahead changes, and where wheels spin nothing does."""
+_PARTS, _TURNS = (-1.0, 0.0, 0.15, 0.33, 0.5), (0.6, 0.8, 1.0, 1.25, 1.6)
+"""Parts of the counted way and turn that a robot may have made whose wheels spin, or count wrongly."""
+_BETTER, _FAR_OFF_M = 0.8, 0.5
+"""It made a part of the way if returns are off by so much less then; each by up to this (m), as what was hidden is."""
+_KEPT_VIEWS = 64
 _HELD_M, _HELD_S, _MOST_HELD = 3.0, 20.0, 5000
 """Way (m) and time (s) for which events are held back, and how many at most: of a base at 200 Hz and a lidar at 40."""
 _UNSEEN_M = 1.5
@@ -139,6 +144,8 @@ class _Laser:
     unseen: float = 0.0
     """Way by the odometry since then."""
     view: int = 0
+    views: deque[tuple[int, Pose2, F64]] = field(default_factory=lambda: deque(maxlen=_KEPT_VIEWS))
+    """Number, odometry and ranges of the last views."""
     tracks: list[_Track] = field(default_factory=list)
     hits: int = 0
     left_out: int = 0
@@ -233,7 +240,8 @@ class WithoutCompanions:
 
     def _view(self, laser: _Laser, held: _Held, pose: Pose2, step: Pose2) -> None:
         """Follow what is near the robot from the last view, `step` before, to this one."""
-        ranges = _ranges(cast("Scan", held.event))
+        scan = cast("Scan", held.event)
+        ranges = _ranges(scan)
         laser.at, laser.view = pose, laser.view + 1
         moved = hypot(step.x, step.y)
         laser.unseen += moved
@@ -244,16 +252,22 @@ class WithoutCompanions:
         elif laser.unseen > _UNSEEN_M:
             laser.tracks = [track for track in laser.tracks if track.is_walking]
             laser.unseen, laser.ranges = 0.0, ranges
-        laser.tracks = _followed(laser, cast("Scan", held.event), held.things or [], step)
+        laser.tracks = _followed(laser, scan, held.things or [], step)
         began = [track for track in laser.tracks if track.decide()]
+        for track in began:
+            before = next((each for each in laser.views if each[0] >= track.places[0].view), None)
+            if before is not None and _moved_less(before[2], scan, ranges, before[1].between(pose)):
+                track.is_walking = False
+                del track.places[:-1]
+        laser.views.append((laser.view, pose, ranges))
         if sum(track.is_walking for track in laser.tracks) > _MOST_WALKING:
             laser.tracks = []
             return
         for track in began:
-            for before in self._held:
-                place = track.at(before.view) if before.laser is laser else None
-                if place is not None and before is not held:
-                    before.hide([place])
+            for each in self._held if track.is_walking else ():
+                place = track.at(each.view) if each.laser is laser else None
+                if place is not None and each is not held:
+                    each.hide([place])
 
     def warnings(self) -> tuple[RunWarning, ...]:
         """What was left out."""
@@ -281,6 +295,29 @@ def _is_changed(ranges: F64, before: F64) -> bool:
     apart = np.abs(ranges - before)[both]
     changed = apart > np.maximum(_CHANGED_M, _CHANGED_PART * before[both])
     return len(changed) >= _FEWEST and float(changed.mean()) > _CHANGED_SHARE
+
+
+def _moved_less(before: F64, scan: Scan, ranges: F64, step: Pose2) -> bool:
+    """Whether since it measured the ranges `before` (n,) the robot rather moved by a part of the way than by all of it.
+
+    Its turn may be counted wrongly.
+    """
+    kept = np.flatnonzero(np.isfinite(before))
+    points = scan.directions()[kept] * before[kept, None]
+    seen = np.append(ranges, np.nan)  # the last is what is beyond the view: as far off as may be
+    laser = scan.T_base_laser
+
+    def off(part: float, turned: float) -> float:
+        moved = laser.inverse() @ Pose2(part * step.x, part * step.y, turned * step.theta).inverse() @ laser
+        c, s = cos(moved.theta), sin(moved.theta)
+        x = moved.x + c * points[:, 0] - s * points[:, 1]
+        y = moved.y + s * points[:, 0] + c * points[:, 1]
+        along = (np.arctan2(y, x) - scan.angle_min) * copysign(1.0, scan.angle_increment) % (2.0 * pi)
+        beams = np.minimum((along / abs(scan.angle_increment) + 0.5).astype(np.intp), len(ranges))
+        return float(np.fmin(np.abs(seen[beams] - np.hypot(x, y)), _FAR_OFF_M).mean())
+
+    whole, *parts = (min(off(part, turned) for turned in _TURNS) for part in (1.0, *_PARTS))
+    return len(kept) > 0 and min(parts) < _BETTER * whole
 
 
 def _things(scan: Scan) -> list[_Thing]:

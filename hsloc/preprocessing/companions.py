@@ -65,6 +65,7 @@ _PARTS, _TURNS = (-1.0, 0.0, 0.15, 0.33, 0.5), (0.6, 0.8, 1.0, 1.25, 1.6)
 _BETTER, _FAR_OFF_M = 0.8, 0.5
 """It made a part of the way if returns are off by so much less then; each by up to this (m), as what was hidden is."""
 _KEPT_VIEWS = 64
+"""Views that are kept to be compared: 2 m of them, and what turns on the spot has."""
 _HELD_M, _HELD_S, _MOST_HELD = 3.0, 20.0, 5000
 """Way (m) and time (s) for which events are held back, and how many at most: of a base at 200 Hz and a lidar at 40."""
 _UNSEEN_M = 1.5

@@ -75,19 +75,18 @@ def _turned(pieces: Sequence[YawPiece], result: Result) -> RunWarning:
     changes = list(pairwise(pieces))
     named = ", ".join(
         f"at {seconds(after)} by {degrees(after.yaw - before.yaw):.1f} "
-        f"± {degrees(hypot(before.sigma, after.sigma)):.1f} deg"
+        f"± {max(degrees(hypot(before.sigma, after.sigma)), 0.1):.1f} deg"
         for before, after in changes[:_MOST_NAMED]
     )
     more = f" and {len(changes) - _MOST_NAMED} times more" if len(changes) > _MOST_NAMED else ""
-    wrong = [piece for piece in pieces if piece.is_turned]
-    options = ", ".join(
+    options = "; ".join(
         f"from {seconds(piece)} on {laser_pose_option(Pose2(stated.x, stated.y, wrap_angle(stated.theta + piece.yaw)))}"
-        for piece in wrong[:_MOST_NAMED]
+        for piece in [each for each in pieces if each.is_turned][:_MOST_NAMED]
     )
     return RunWarning(
         WarningCode.LASER_TURNED,
-        f"by scans and odometry the laser was turned on the robot, {named}{more}, and so are the headings",
-        f"fasten the laser; for this log cut it there (--start, --end){f', with {options}' if options else ''}",
+        f"by scans and odometry the laser was turned on the robot: {named}{more}; headings are wrong by as much",
+        f"fasten the laser; cut this log there (--start, --end){f' and give {options}' if options else ''}",
     )
 
 

@@ -23,6 +23,8 @@ _NOISE_M, _NOISE_SHARE, _LARGEST_NOISE = 0.005, 0.1, 4.0
 as is assumed of odometry; and the multiple of it that noise does not reach."""
 _STILL_M = 1e-9
 """Motion (m) that an event counts for in which the odometry counts none: there a push is shared out evenly."""
+_FEWEST_STANDING, _SAME = 5, 1e-6
+"""Events between two keyscans in which the odometry counts no way (m), for a push: a few messages may be repeated."""
 _UNCOUNTED_M = 1e3
 """What each scan counts for before the odometry begins and after it ends: what it disagrees in happened there."""
 
@@ -127,6 +129,7 @@ class EventLog:
             odometry = apply(calibration, self._index(), odometry)
         keys, key_poses = self._known(), self._known_poses(key_poses)
         before, after, span, fraction = self._between(odometry, keys)
+        fraction = self._of_pushes(odometry, key_poses, (before, after, span), fraction)
         from_before = compose_poses(key_poses[before], relative_poses(odometry[keys[before]], odometry))
         from_after = compose_poses(key_poses[after], relative_poses(odometry[keys[after]], odometry))
         return from_before, pose_differences(from_after, from_before), before, after, span, fraction
@@ -173,6 +176,23 @@ class EventLog:
         span = path_length[keys[after]] - path_length[keys[before]]
         fraction = np.clip((path_length - path_length[keys[before]]) / np.maximum(span, 1e-12), 0.0, 1.0)
         return before, after, span, fraction
+
+    def _of_pushes(self, odometry: F64, key_poses: F64, between: tuple[I64, I64, F64], fraction: F64) -> F64:
+        """The part of each event, where the robot moved farther than the odometry counts: while this stood still.
+
+        It was pushed then. One that moved less than is counted slipped while it was counted.
+        """
+        before, after, span = between
+        keys = self._known()
+        moved = relative_poses(key_poses[before], key_poses[after])
+        counted = relative_poses(odometry[keys[before]], odometry[keys[after]])
+        more = np.hypot(moved[:, 0], moved[:, 1]) - np.hypot(counted[:, 0], counted[:, 1])
+        steps = relative_poses(odometry[:-1], odometry[1:])
+        stood = np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) < _SAME)))
+        first, last = stood[keys[before]], stood[keys[after]]
+        pushed = (more > _LARGEST_NOISE * (_NOISE_M + _NOISE_SHARE * span)) & (last - first >= _FEWEST_STANDING)
+        part = np.clip((stood - first) / np.maximum(last - first, 1.0), 0.0, 1.0)
+        return np.where(pushed, part, fraction)
 
     def _index(self) -> F64:
         """For each event the number of odometry messages before it, a scan between two messages being half-way."""

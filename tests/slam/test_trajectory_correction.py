@@ -64,6 +64,15 @@ def test_a_push_is_shared_out_evenly_while_the_wheels_stand() -> None:
     np.testing.assert_allclose(odometry[:, 0], (0.2, 0.4, 0.6, 0.8), atol=1e-9)
 
 
+def test_a_robot_that_moved_farther_than_is_counted_was_pushed_while_the_wheels_stood() -> None:
+    track = between_two_keyscans(0.1, 0.2, *[0.2] * 8)
+    odometry, _ = track.corrected(np.array(((0.0, 0.0, 0.0), (1.1, 0.0, 0.0))))
+    np.testing.assert_allclose(odometry[:, 0], (0.1, 0.2, *np.linspace(0.3, 1.0, 8)), atol=1e-9)
+    # One that moved less slipped while the wheels turned.
+    odometry, _ = track.corrected(np.array(((0.0, 0.0, 0.0), (0.04, 0.0, 0.0))))
+    np.testing.assert_allclose(odometry[:, 0], (0.02, *[0.04] * 9), atol=1e-6)
+
+
 def test_what_the_robot_does_after_its_odometry_has_ended_moves_no_pose_before() -> None:
     track = EventLog(0.3)
     track.add(Pose2(), is_scan=True, is_key=True)

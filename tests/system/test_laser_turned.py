@@ -61,7 +61,7 @@ def require_named(result: Result, turned: float) -> RunWarning | None:
     assert metrics.verdict is Verdict.CHECK
     assert WarningCode.LASER_TURNED in {reason.code for reason in metrics.verdict_reasons}
     (warning,) = found
-    seconds, angle = warning.text.partition("robot, at ")[2].split(" s by ")
+    seconds, angle = warning.text.partition("robot: at ")[2].split(" s by ")
     assert float(seconds) == pytest.approx(KNOCKED_S, abs=2.0)
     assert float(angle.split()[0]) == pytest.approx(turned, abs=0.5)
     yaw = float(warning.remedy.rpartition(",")[2])

@@ -6,13 +6,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from log_builders import write_events
 from paths import RECORDINGS
 
 from hsloc.analysis.analyse import analyse
 from hsloc.analysis.second_pass import posed_events
-from hsloc.log import LogWriter, Transform3, open_log
+from hsloc.log import open_log
 from hsloc.maps import save_map
-from hsloc.model import Odometry, Scan
+from hsloc.model import Scan
 from hsloc.model.events import PairedScan
 from hsloc.replay.run import run
 from hsloc.simulation.built_in import built_in
@@ -25,18 +26,13 @@ POST = slice(100, 160)
 
 def test_beams_that_see_the_robot_itself_are_left_out_as_in_the_run(tmp_path: Path) -> None:
     events = list(open_log(RECORDINGS / "office.mcap").events())
-    first = next(event for event in events if isinstance(event, Scan))
-    path, rng = tmp_path / "run.mcap", np.random.default_rng(0)
-    with LogWriter(path) as writer:
-        mounting = Transform3.from_pose2(first.T_base_laser)
-        writer.transforms(events[0].stamp_ns, [("base_link", first.frame_id, mounting)], static=True)
-        for event in events:
-            if isinstance(event, Odometry):
-                writer.odometry(event.stamp_ns, event.T_odom_base)
-            elif isinstance(event, Scan):
-                ranges = event.ranges.copy()
-                ranges[POST] = 0.3 + rng.normal(0.0, 0.005, 60)
-                writer.scan(replace(event, ranges=ranges), log_time_ns=event.stamp_ns)
+    rng = np.random.default_rng(0)
+    for k, event in enumerate(events):
+        if isinstance(event, Scan):
+            ranges = event.ranges.copy()
+            ranges[POST] = 0.3 + rng.normal(0.0, 0.005, 60)
+            events[k] = replace(event, ranges=ranges)
+    path = write_events(tmp_path / "run.mcap", events)
     world = built_in("office")
     result = run(path, map=save_map(world.occupancy_grid(0.05), tmp_path), initial_pose=world.start())
     assert [warning.code for warning in result.warnings] == ["scan_body_returns"]

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from log_builders import write_events
 from paths import RECORDINGS
 
 from hsloc.analysis.analyse import analyse
 from hsloc.localisation.odometry_scale import OdometryScale
-from hsloc.log import LogWriter, Transform3, open_log
+from hsloc.log import open_log
 from hsloc.maps import save_map
-from hsloc.model import Odometry, Scan, Trajectory, Truth
+from hsloc.model import Trajectory, Truth
 from hsloc.replay.run import run
 from hsloc.simulation.built_in import built_in
 from hsloc.warnings import WarningCode
@@ -25,16 +26,7 @@ if TYPE_CHECKING:
 def test_distances_that_are_counted_0_8_times_are_corrected(tmp_path: Path) -> None:
     events = list(open_log(RECORDINGS / "office.mcap").events())
     events = events[: 6 * len(events) // 10]
-    first = next(event for event in events if isinstance(event, Scan))
-    path = tmp_path / "run.mcap"
-    with LogWriter(path) as writer:
-        mounting = Transform3.from_pose2(first.T_base_laser)
-        writer.transforms(events[0].stamp_ns, [("base_link", first.frame_id, mounting)], static=True)
-        for event in OdometryScale(-0.2, 0.0).applied(events):
-            if isinstance(event, Odometry):
-                writer.odometry(event.stamp_ns, event.T_odom_base)
-            elif isinstance(event, Scan):
-                writer.scan(event, log_time_ns=event.stamp_ns)
+    path = write_events(tmp_path / "run.mcap", list(OdometryScale(-0.2, 0.0).applied(events)))
     world = built_in("office")
     found = run(path, map=save_map(world.occupancy_grid(0.05), tmp_path), initial_pose=world.start())
     (warning,) = found.warnings

@@ -13,7 +13,7 @@ from hsloc.log.writer import LogWriter
 from hsloc.model import Odometry, Pose2, Scan, Truth
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from hsloc.model import Event
@@ -52,6 +52,19 @@ def write_run(
                     log.scan(make_scan(stamp + SECOND // 100, number))
             if truth:
                 log.odometry(stamp, Pose2(float(number), 1.0, 0.0), topic="/ground_truth", frame_id="map")
+    return path
+
+
+def write_events(path: Path, events: Sequence[Event]) -> Path:
+    """A log of the scans and the odometry among these, with the mounting of the first scan; without truth."""
+    first = next(event for event in events if isinstance(event, Scan))
+    with LogWriter(path) as log:
+        log.transforms(events[0].stamp_ns, [("base_link", first.frame_id, first.T_base_laser)], static=True)
+        for event in events:
+            if isinstance(event, Odometry):
+                log.odometry(event.stamp_ns, event.T_odom_base)
+            elif isinstance(event, Scan):
+                log.scan(event, log_time_ns=event.stamp_ns)
     return path
 
 

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from log_builders import write_events
 
 from hsloc import run
 from hsloc.analysis.analyse import analyse
 from hsloc.analysis.second_pass import posed_events
 from hsloc.kernels.raycasting import cast_rays
-from hsloc.log import LogWriter, Transform3
 from hsloc.maps import save_map
-from hsloc.model import Odometry, Pose2, Scan, Trajectory, Truth
+from hsloc.model import Pose2, Scan, Trajectory, Truth
 from hsloc.model.events import PairedScan
 from hsloc.model.pose2 import compose_poses
 from hsloc.model.verdict import Verdict
@@ -53,19 +53,13 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trajectory
     scenario = Scenario(WORLD, seed=4, sensor=Lidar(beams=270), duration_s=40.0, scan_rate_hz=5.0)
     drive = list(events(scenario, load_world(WORLD)))
     truth = Trajectory.from_pairs([(e.stamp_ns, e.T_map_base) for e in drive if isinstance(e, Truth)])
-    path, on_person = tmp_path_factory.mktemp("followed") / "run.mcap", {}
-    with LogWriter(path) as log:
-        mounting = Transform3.from_pose2(scenario.sensor.mounting)
-        log.transforms(drive[0].stamp_ns, [("base_link", "laser", mounting)], static=True)
-        for event in drive:
-            if isinstance(event, Scan):
-                (pose,) = truth.interpolated(np.array([event.stamp_ns]))
-                scan, seen = followed(event, Pose2.from_array(pose), (event.stamp_ns - drive[0].stamp_ns) / 1e9)
-                on_person[event.stamp_ns] = seen
-                log.scan(scan)
-            elif isinstance(event, Odometry):
-                log.odometry(event.stamp_ns, event.T_odom_base)
-    return path, truth, on_person
+    on_person: dict[int, np.ndarray] = {}
+    for k, event in enumerate(drive):
+        if isinstance(event, Scan):
+            (pose,) = truth.interpolated(np.array([event.stamp_ns]))
+            seconds = (event.stamp_ns - drive[0].stamp_ns) / 1e9
+            drive[k], on_person[event.stamp_ns] = followed(event, Pose2.from_array(pose), seconds)
+    return write_events(tmp_path_factory.mktemp("followed") / "run.mcap", drive), truth, on_person
 
 
 def test_its_map_is_right_and_the_operator_is_left_out(

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from log_builders import write_events
 
 from hsloc import run
 from hsloc.analysis.analyse import analyse
-from hsloc.log import LogWriter, Transform3
 from hsloc.maps import save_map
-from hsloc.model import Odometry, Scan
+from hsloc.model import Scan
 from hsloc.model.verdict import Verdict
 from hsloc.simulation.scenario import Scenario
 from hsloc.simulation.sensors import Lidar
@@ -36,18 +36,15 @@ def drive(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     folder, world = tmp_path_factory.mktemp("drive"), load_world("office")
     scenario = Scenario("office", seed=4, sensor=Lidar(beams=180), duration_s=2.0 * KNOCKED_S, scan_rate_hz=5.0)
     recorded = list(events(scenario, world))
-    first = recorded[0].stamp_ns
-    with LogWriter(folder / "run.mcap") as log:
-        mounting = Transform3.from_pose2(scenario.sensor.mounting)
-        log.transforms(first, [("base_link", "laser", mounting)], static=True)
-        for event in recorded:
-            if isinstance(event, Scan):
-                # A laser that is turned to the left states angles that are too small.
-                by = -radians(request.param) if event.stamp_ns - first >= KNOCKED_S * 1e9 else 0.0
-                log.scan(replace(event, angle_min=event.angle_min + by))
-            elif isinstance(event, Odometry):
-                log.odometry(event.stamp_ns, event.T_odom_base)
-    return folder / "run.mcap", save_map(world.occupancy_grid(), folder / "map.yaml"), request.param
+    for k, event in enumerate(recorded):
+        if isinstance(event, Scan) and event.stamp_ns - recorded[0].stamp_ns >= KNOCKED_S * 1e9:
+            # A laser that is turned to the left states angles that are too small.
+            recorded[k] = replace(event, angle_min=event.angle_min - radians(request.param))
+    return (
+        write_events(folder / "run.mcap", recorded),
+        save_map(world.occupancy_grid(), folder / "map.yaml"),
+        request.param,
+    )
 
 
 def require_named(result: Result, turned: float) -> RunWarning | None:

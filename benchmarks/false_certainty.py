@@ -225,7 +225,7 @@ def _localised(
     scale = localiser.map_scale
     if scale is not None and corrected is not None:
         scale = replace(scale, corrected=corrected.value)
-    states = history.states(scale, history.mounting_error(), grid)
+    states = history.states(scale, *history.mounting(), grid)
     reference = history.reference()
     assert states is not None
     assert reference is not None

@@ -20,6 +20,7 @@ from hsloc.localisation.mounting_error import (
     UNKNOWN_M,
     YAW,
     Steps,
+    equal_parts,
     robust_solution,
     without_each_part,
 )
@@ -107,7 +108,7 @@ def _fitted(rows: F64, apart: F64, bounds: list[int]) -> tuple[F64, F64, F64]:
     yaws, part = np.zeros((n, 2, pieces)), np.empty(n, dtype=np.intp)
     for k, (begin, end) in enumerate(pairwise(bounds)):
         yaws[begin:end, :, k] = rows[begin:end, :, YAW]
-        part[begin:end] = k * _PARTS + np.arange(end - begin) * _PARTS // (end - begin)
+        part[begin:end] = k * _PARTS + equal_parts(end - begin, _PARTS)
     values, information, vectors = robust_solution(np.concatenate((rows[..., :YAW], yaws), axis=2), apart)
     without = without_each_part(information, vectors, part)[:, YAW:].reshape(pieces, _PARTS, pieces)
     difference = np.diff(without, axis=2)

@@ -156,7 +156,7 @@ def mounting_error(steps: Steps) -> MountingError:
     other_side = min(turned[turned > 0.0].sum(), -turned[turned < 0.0].sum())
     is_one_sided = other_side <= _LEAST_OTHER_SIDE * np.abs(turned).sum()
     values, information, vectors = robust_solution(steps.rows, steps.apart)
-    without = without_each_part(information, vectors, np.arange(len(vectors)) * PARTS // len(vectors))
+    without = without_each_part(information, vectors, equal_parts(len(vectors), PARTS))
     sigma = np.sqrt((PARTS - 1) / PARTS * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     x, y, yaw = values[1:].tolist()
     sigmas = (float(sigma[1]), float(sigma[2]), float(sigma[3]))
@@ -175,10 +175,16 @@ def robust_solution(rows: F64, apart: F64) -> tuple[F64, F64, F64]:
         residual = apart - rows @ values
         scale = np.maximum(1.4826 * np.median(np.abs(residual), axis=0), 1e-4)
         weight = 1.0 / scale**2 / (1.0 + ((residual / scale) ** 2).sum(axis=1, keepdims=True) / 4.0)
-        information = np.einsum("nip,ni,niq->npq", rows, weight, rows)
-        vectors = np.einsum("nip,ni,ni->np", rows, weight, apart)
-        values = np.linalg.solve(information.sum(axis=0) + PRIOR * np.eye(parameters), vectors.sum(axis=0))
-    return values, information, vectors
+        weighed = rows * weight[..., None]
+        columns = weighed.reshape(-1, parameters).T
+        information = columns @ rows.reshape(-1, parameters) + PRIOR * np.eye(parameters)
+        values = np.linalg.solve(information, columns @ apart.reshape(-1))
+    return values, np.swapaxes(weighed, 1, 2) @ rows, np.einsum("nip,ni->np", weighed, apart)
+
+
+def equal_parts(n: int, parts: int) -> NDArray[np.intp]:
+    """The part (n,) that each step belongs to, of as many of about the same length, in order."""
+    return np.arange(n) * parts // n
 
 
 def without_each_part(information: NDArray[Any], vectors: NDArray[Any], part: NDArray[np.intp]) -> NDArray[Any]:

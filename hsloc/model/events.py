@@ -102,6 +102,15 @@ class Scan:
         with np.errstate(invalid="ignore"):
             return np.isfinite(ranges) & (ranges >= self.range_min) & (ranges <= self.range_max)
 
+    def hit_ranges(self) -> NDArray[np.float64]:
+        """The ranges of the hits, NaN for all other beams, metres, shape (n,)."""
+        return np.where(self.hits(), self.ranges, np.nan).astype(np.float64)
+
+    def beams_towards(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Numbers (m,) of the beams nearest to points in the laser's frame; n and more where none looks there."""
+        along = (np.arctan2(y, x) - self.angle_min) * np.sign(self.angle_increment) % (2.0 * np.pi)
+        return np.asarray(along / abs(self.angle_increment) + 0.5).astype(np.intp)
+
     def no_returns(self) -> NDArray[np.bool_]:
         """Which beams saw nothing within range (+inf): free space up to `range_max`."""
         return np.isposinf(self.ranges)

@@ -86,11 +86,19 @@ def body_warnings(beams: Mapping[str, Bools]) -> tuple[RunWarning, ...]:
     )
 
 
+def changed_share(ranges: F64, before: F64, compared: Bools) -> float:
+    """Which part of the beams that are `compared` (n,) sees something else than before; 0 where too few hit twice."""
+    both = np.isfinite(ranges) & np.isfinite(before) & compared
+    apart = np.abs(ranges - before)[both]
+    changed = apart > np.maximum(_CHANGED_M, _CHANGED_PART * before[both])
+    return float(changed.mean()) if len(changed) >= _FEWEST else 0.0
+
+
 class _Views:
     """Scans of a laser, each of which sees something else than the one before."""
 
     def __init__(self, first: Scan) -> None:
-        self._ranges = [_hits(first)]
+        self._ranges = [first.hit_ranges()]
         with np.errstate(invalid="ignore"):
             self._possible = self._ranges[0] < _REACH_M
         self._turned = (0.0, 0.0)
@@ -108,11 +116,8 @@ class _Views:
         """Take in a scan, at which the robot had turned so far (rad)."""
         if self.is_settled or len(scan.ranges) != len(self._possible):
             return
-        ranges, before = _hits(scan), self._ranges[-1]
-        both = np.isfinite(ranges) & np.isfinite(before) & ~self._possible
-        apart = np.abs(ranges - before)[both]
-        changed = apart > np.maximum(_CHANGED_M, _CHANGED_PART * before[both])
-        if len(changed) < _FEWEST or changed.mean() <= _CHANGED_SHARE:
+        ranges, before = scan.hit_ranges(), self._ranges[-1]
+        if changed_share(ranges, before, ~self._possible) <= _CHANGED_SHARE:
             return
         self._turned = (turned if len(self._ranges) == 1 else self._turned[0], turned)
         self._ranges.append(ranges)
@@ -130,7 +135,3 @@ class _Views:
         own[possible[seen & (np.nanstd(ranges, axis=0) <= _SPREAD_M)]] = True
         own[1:-1] |= own[:-2] | own[2:]
         return own
-
-
-def _hits(scan: Scan) -> F64:
-    return np.where(scan.hits(), scan.ranges, np.nan).astype(np.float64)

@@ -1,7 +1,7 @@
 """People who walk with the robot while its map is made: returns that keep their place beside it while it drives.
 
 Whoever steers a robot to map a building walks behind it. Matched, such returns say that the robot stands still, and in
-the map they are a trail that later scans look through. They are told from everything else by two predictions: what
+the map they are a trail that later scans look through. Two predictions tell them apart from everything else: what
 stands still is passed; what walks along stays where it was, seen from the robot.
 """
 
@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field, replace
-from math import atan2, copysign, cos, hypot, pi, sin
+from itertools import product
+from math import cos, hypot, pi, sin
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
@@ -17,6 +18,7 @@ import numpy as np
 from hsloc.kernels.free_standing import find_free_standing
 from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import IDENTITY, Pose2
+from hsloc.preprocessing.body_returns import changed_share
 from hsloc.warnings import RunWarning, WarningCode
 
 if TYPE_CHECKING:
@@ -57,13 +59,13 @@ _MISSED = 2
 """Views in a row in which it may be hidden."""
 _STANDING = 0.3
 """Part of these views in which a thing may be where one that stands is expected."""
-_CHANGED_M, _CHANGED_PART, _CHANGED_SHARE, _FEWEST = 0.1, 0.05, 0.2, 20
-"""The robot has driven where a fifth of the other beams, of at least so many, changed by more than this (m), and this
-part of the range: along walls only what is ahead changes, and where wheels spin nothing does."""
+_CHANGED_SHARE = 0.2
+"""The robot has driven where a fifth of the beams that see beyond the reach changed: along walls only what is ahead
+does, and where wheels spin nothing."""
 _PARTS, _TURNS = (-1.0, 0.0, 0.15, 0.33, 0.5), (0.6, 0.8, 1.0, 1.25, 1.6)
 """Parts of the counted way and turn that a robot may have made whose wheels spin, or count wrongly."""
 _BETTER, _FAR_OFF_M = 0.8, 0.5
-"""It made a part of the way if returns are off by so much less then; each by up to this (m), as what was hidden is."""
+"""It made a part of the way if returns are off by less than this share then; each by this (m) at most."""
 _KEPT_VIEWS = 64
 """Views that are kept to be compared: 2 m of them, and what turns on the spot has."""
 _HELD_M, _HELD_S, _MOST_HELD = 3.0, 20.0, 5000
@@ -125,6 +127,11 @@ class _Track:
         self.places.append(place)
         while len(self.places) > _VIEWS and place.way - self.places[1].way >= _WAY_M:
             del self.places[0]
+
+    def forget(self) -> None:
+        """Begin anew at the last place."""
+        self.is_walking = False
+        del self.places[:-1]
 
     def at(self, view: int) -> _Place | None:
         """Where it was in this view, or last before it; from the view before the first one on."""
@@ -228,7 +235,7 @@ class WithoutCompanions:
         """Follow what is near the robot, and hide what walks along in this scan and in those before it."""
         laser = self._lasers.get(scan.frame_id)
         if laser is None or len(laser.ranges) != len(scan.ranges):
-            self._lasers[scan.frame_id] = laser = _Laser(pose, _ranges(scan))
+            self._lasers[scan.frame_id] = laser = _Laser(pose, scan.hit_ranges())
         held.laser = laser
         step = laser.at.between(pose)
         if hypot(step.x, step.y) >= _VIEW_M or abs(step.theta) >= _VIEW_RAD:
@@ -242,33 +249,30 @@ class WithoutCompanions:
     def _view(self, laser: _Laser, held: _Held, pose: Pose2, step: Pose2) -> None:
         """Follow what is near the robot from the last view, `step` before, to this one."""
         scan = cast("Scan", held.event)
-        ranges = _ranges(scan)
+        ranges = scan.hit_ranges()
         laser.at, laser.view = pose, laser.view + 1
         moved = hypot(step.x, step.y)
         laser.unseen += moved
         if moved > _LONGEST_M:
             laser.tracks, laser.unseen, laser.ranges = [], 0.0, ranges
-        elif _is_changed(ranges, laser.ranges):
+        elif changed_share(ranges, laser.ranges, (ranges > _REACH_M) & (laser.ranges > _REACH_M)) > _CHANGED_SHARE:
             laser.way, laser.unseen, laser.ranges = laser.way + laser.unseen, 0.0, ranges
         elif laser.unseen > _UNSEEN_M:
             laser.tracks = [track for track in laser.tracks if track.is_walking]
             laser.unseen, laser.ranges = 0.0, ranges
         laser.tracks = _followed(laser, scan, held.things or [], step)
-        began = [track for track in laser.tracks if track.decide()]
-        for track in began:
-            before = next((each for each in laser.views if each[0] >= track.places[0].view), None)
-            if before is not None and _moved_less(before[2], scan, ranges, before[1].between(pose)):
-                track.is_walking = False
-                del track.places[:-1]
+        began = [
+            track for track in laser.tracks if track.decide() and not _forgotten(track, laser.views, scan, ranges, pose)
+        ]
         laser.views.append((laser.view, pose, ranges))
         if sum(track.is_walking for track in laser.tracks) > _MOST_WALKING:
             laser.tracks = []
             return
-        for track in began:
-            for each in self._held if track.is_walking else ():
-                place = track.at(each.view) if each.laser is laser else None
-                if place is not None and each is not held:
-                    each.hide([place])
+        earlier = [each for each in self._held if each.laser is laser and each is not held]
+        for track, each in product(began, earlier):
+            place = track.at(each.view)
+            if place is not None:
+                each.hide([place])
 
     def warnings(self) -> tuple[RunWarning, ...]:
         """What was left out."""
@@ -285,17 +289,13 @@ class WithoutCompanions:
         )
 
 
-def _ranges(scan: Scan) -> F64:
-    return np.where(scan.hits(), scan.ranges, np.nan).astype(np.float64)
-
-
-def _is_changed(ranges: F64, before: F64) -> bool:
-    """Whether what is farther away looks different."""
-    with np.errstate(invalid="ignore"):
-        both = (ranges > _REACH_M) & (before > _REACH_M)
-    apart = np.abs(ranges - before)[both]
-    changed = apart > np.maximum(_CHANGED_M, _CHANGED_PART * before[both])
-    return len(changed) >= _FEWEST and float(changed.mean()) > _CHANGED_SHARE
+def _forgotten(track: _Track, views: Iterable[tuple[int, Pose2, F64]], scan: Scan, ranges: F64, pose: Pose2) -> bool:
+    """Whether the places of a track are forgotten, as the robot hardly moved since the first of them."""
+    since = next((each for each in views if each[0] >= track.places[0].view), None)
+    if since is None or not _moved_less(since[2], scan, ranges, since[1].between(pose)):
+        return False
+    track.forget()
+    return True
 
 
 def _moved_less(before: F64, scan: Scan, ranges: F64, step: Pose2) -> bool:
@@ -313,8 +313,7 @@ def _moved_less(before: F64, scan: Scan, ranges: F64, step: Pose2) -> bool:
         c, s = cos(moved.theta), sin(moved.theta)
         x = moved.x + c * points[:, 0] - s * points[:, 1]
         y = moved.y + s * points[:, 0] + c * points[:, 1]
-        along = (np.arctan2(y, x) - scan.angle_min) * copysign(1.0, scan.angle_increment) % (2.0 * pi)
-        beams = np.minimum((along / abs(scan.angle_increment) + 0.5).astype(np.intp), len(ranges))
+        beams = np.minimum(scan.beams_towards(x, y), len(ranges))
         return float(np.fmin(np.abs(seen[beams] - np.hypot(x, y)), _FAR_OFF_M).mean())
 
     whole, *parts = (min(off(part, turned) for turned in _TURNS) for part in (1.0, *_PARTS))
@@ -324,7 +323,7 @@ def _moved_less(before: F64, scan: Scan, ranges: F64, step: Pose2) -> bool:
 def _things(scan: Scan) -> list[_Thing]:
     """What stands free within reach, legs put together."""
     n, mounting = len(scan.ranges), scan.T_base_laser
-    is_turn = abs(scan.angle_increment) * n > 2.0 * np.pi - 2.0 * abs(scan.angle_increment)
+    is_turn = abs(scan.angle_increment) * n > 2.0 * pi - 2.0 * abs(scan.angle_increment)
     limits = np.array((scan.range_min, scan.range_max)).astype(np.float32)
     found = np.empty((n, 4))
     count = find_free_standing(
@@ -388,8 +387,7 @@ def _followed(laser: _Laser, scan: Scan, things: list[_Thing], step: Pose2) -> l
 def _is_there(scan: Scan, place: Pose2) -> bool:
     """Whether one of the beams towards a place in the base's frame ends there."""
     seen = scan.T_base_laser.inverse() @ place
-    along = (atan2(seen.y, seen.x) - scan.angle_min) * copysign(1.0, scan.angle_increment)
-    beam = round(along % (2.0 * pi) / abs(scan.angle_increment))
+    (beam,) = scan.beams_towards(np.array([seen.x]), np.array([seen.y]))
     ranges = scan.ranges[max(beam - 1, 0) : max(beam + 2, 0)]
     with np.errstate(invalid="ignore"):
         return bool((np.abs(ranges - hypot(seen.x, seen.y)) <= _STANDS_M).any())

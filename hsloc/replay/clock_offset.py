@@ -240,7 +240,7 @@ def offsets_of_mapping(
 
 def require_direction(request: RunRequest, log: Log, reading: ReadOptions, history: RunHistory) -> bool:
     """Raise TurnedLaser where the matches of a map show it, and the scans by themselves; whether these were asked."""
-    shown = history.mounting_error()
+    shown, _ = history.mounting()
     is_given = reading.laser_pose is not None or reading.calibration is not None
     if shown is None or not shown.is_turned or is_given or log.summary.laser_flipped:
         return False

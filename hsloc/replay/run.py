@@ -359,9 +359,8 @@ def _run_with(
     scale = None if localiser is None else localiser.map_scale
     if scale is not None and isinstance(correction, tuple):
         scale = replace(scale, corrected=correction[0].value)
-    mounting = history.mounting_error() if localise or not lidar_only else None
-    pieces = history.yaw_pieces() if localise else ()
-    states = history.states(scale, mounting, grid, pieces) if localise else None
+    mounting, pieces = history.mounting() if localise or not lidar_only else (None, ())
+    states = history.states(scale, mounting, pieces, grid) if localise else None
     tracked, localised = localised, localised if states is None else states.is_localised()
     return Result(
         request=request,
@@ -386,7 +385,7 @@ def _run_with(
         odometry_scale=None if localiser is None else localiser.odometry_scale,
         given_resolution=given_resolution,
         mounting_error=mounting,
-        yaw_pieces=pieces,
+        yaw_pieces=pieces if localise else (),
         ambiguities=history.ambiguities(states),
         preparation=preparation,
         clock_offsets=offsets,

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from hsloc.localisation.map_scale import MapScale
     from hsloc.localisation.motion_models import MotionModel
     from hsloc.localisation.mounting_changes import YawPiece
-    from hsloc.localisation.mounting_error import MountingError, Steps
+    from hsloc.localisation.mounting_error import MountingError
     from hsloc.localisation.states import StateRows
     from hsloc.model.certificate import Certificate
     from hsloc.model.estimate import Ambiguity, Estimate, Revised
@@ -267,8 +267,8 @@ class RunHistory:
         self,
         scale: MapScale | None = None,
         mounting: MountingError | None = None,
-        grid: OccupancyGrid | None = None,
         pieces: Sequence[YawPiece] = (),
+        grid: OccupancyGrid | None = None,
     ) -> StateRows | None:
         """The state of each pose of the trajectory in hindsight; None for an estimator that weighs no evidence.
 
@@ -314,9 +314,8 @@ class RunHistory:
             errors = mounting.pose_errors(self.trajectory()[0].poses)
             rows = with_pose_errors(rows, errors, "the laser is mounted elsewhere than stated")
         if pieces:
-            rows = with_pose_errors(
-                rows, piece_errors(pieces, self.trajectory()[0]), "the laser was turned on the robot"
-            )
+            errors = piece_errors(pieces, self.trajectory()[0])
+            rows = with_pose_errors(rows, errors, "the laser was turned on the robot")
         return rows
 
     def _is_alone(self) -> NDArray[np.bool_]:
@@ -328,34 +327,25 @@ class RunHistory:
         found: NDArray[np.bool_] = bounds[after + 1] - bounds[after] > max(_SILENT_NS, _SILENT_INTERVALS * usual)
         return found
 
-    def mounting_error(self) -> MountingError | None:
-        """How far the laser is from where it is said to be; None where that is not known or changes, or of several.
+    def mounting(self) -> tuple[MountingError | None, tuple[YawPiece, ...]]:
+        """How far the laser is from where it is said to be, or parts of the run in which it looks the same way.
 
-        Of a map that is built only the yaw, and a part of that: its scans are matched to each other with the odometry.
+        Neither where that is not known, or with several lasers. Of a map that is built only the yaw, and a part of it:
+        its scans are matched to each other with the odometry; the finished map says when the laser was turned.
         """
-        steps = self._mounting_steps()
-        if steps is None or self.yaw_pieces():
-            return None
-        found = mounting_error(steps)
-        return found if self._motion_model is not None else found.of_yaw()
-
-    def yaw_pieces(self) -> tuple[YawPiece, ...]:
-        """Parts in which the only laser looks the same way; none where it never turned, or that is not known."""
-        steps = self._mounting_steps()
+        steps, is_mapped = None, self._motion_model is None
+        if len(self._frames) == 1:
+            poses = np.array(self._mapped).reshape(-1, 6)
+            steps = steps_of_poses(poses[:, :3], poses[:, 3:]) if is_mapped else steps_of_anchors(self._anchors)
         if steps is None:
-            return ()
-        if self._motion_model is None:  # Of a map that is built this says that it did; the finished map says when.
-            return yaw_pieces(steps, np.arange(len(self._mapped) // 6))
-        counts = np.array([anchor.count for anchor in self._anchors])
-        return yaw_pieces(steps, np.array(self._odometry_stamps)[np.maximum(counts - 1, 0)])
-
-    def _mounting_steps(self) -> Steps | None:
-        if len(self._frames) != 1:
-            return None
-        if self._motion_model is not None:
-            return steps_of_anchors(self._anchors)
-        poses = np.array(self._mapped).reshape(-1, 6)
-        return steps_of_poses(poses[:, :3], poses[:, 3:])
+            return None, ()
+        stamps = np.arange(len(self._mapped) // 6)
+        if not is_mapped:
+            counts = np.array([anchor.count for anchor in self._anchors])
+            stamps = np.array(self._odometry_stamps)[np.maximum(counts - 1, 0)]
+        pieces = yaw_pieces(steps, stamps)
+        error = None if pieces else mounting_error(steps)
+        return error.of_yaw() if error is not None and is_mapped else error, pieces
 
     def ambiguities(self, states: StateRows | None) -> tuple[Ambiguity, ...]:
         """Between which places the run does not decide, and when; `states` are those of its poses."""

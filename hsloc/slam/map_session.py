@@ -98,8 +98,8 @@ class MapSession:
     def believed_steps(self, registration: JointRegistrationParameters) -> Edges:
         """The odometry's steps before the refined map is held against them: next to no weight for those that slipped.
 
-        Nor for those of which a scan that was believed says so much else that it would lose the walls it was paired
-        with where the odometry has it: standing wheels of a robot that moves say to the centimetre that it does not.
+        Nor for those of which a scan that was believed says something else, by more than the gate within which it finds
+        the walls it was paired with: standing wheels of a robot that moves say to the centimetre that it does not.
         """
         apart = pose_differences(self.motions[1:], self.steps.measured)
         off = np.hypot(apart[:, 0], apart[:, 1]) + registration.radius * np.abs(apart[:, 2])

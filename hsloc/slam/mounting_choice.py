@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hsloc.errors import HslocError
-from hsloc.localisation.mounting_error import MIN_SIGMAS, PARTS, PRIOR, MountingError, without_each_part
+from hsloc.localisation.mounting_error import (
+    MIN_SIGMAS,
+    PARTS,
+    PRIOR,
+    MountingError,
+    equal_parts,
+    without_each_part,
+)
 from hsloc.log import laser_mounting, open_log
 from hsloc.model.events import Odometry, Scan
 from hsloc.model.pose2 import Pose2, relative_poses, wrap_angle, wrap_angles
@@ -218,7 +225,7 @@ def _direction_by(motion: _Motion) -> tuple[Pose2, float, float]:
         information = np.einsum("np,n,nq->npq", rows.conj(), weight, rows)
         vectors = rows.conj() * (weight * seen)[:, None]
         values = np.linalg.solve(information.sum(axis=0) + PRIOR * np.eye(2), vectors.sum(axis=0))
-    without = without_each_part(information, vectors, np.arange(len(vectors)) * PARTS // len(vectors))
+    without = without_each_part(information, vectors, equal_parts(len(vectors), PARTS))
     low, high = _SCALES_OF_DIRECTION
     if not all(low < abs(each) < high for each in (values[0], *without[:, 0])):
         return _NOTHING

@@ -110,8 +110,7 @@ class EventLog:
         part = fraction[:, None, None]
         found = (1.0 - part) * known[before] + part * known[after]
         walk = fraction * (1.0 - fraction)
-        limit = _LARGEST_NOISE * (_NOISE_M + _NOISE_SHARE * span)
-        slips = np.hypot(apart[:, 0], apart[:, 1]) + self._turn_length * np.abs(apart[:, 2]) > limit
+        slips = np.hypot(apart[:, 0], apart[:, 1]) + self._turn_length * np.abs(apart[:, 2]) > _noise_limit(span)
         weight = np.where(slips, 1.0 / 3.0 - walk, walk)
         weight[self._known()] = 0.0
         found += (weight[:, None] * apart)[:, :, None] * apart[:, None, :]
@@ -128,8 +127,13 @@ class EventLog:
         if calibration is not None:
             odometry = apply(calibration, self._index(), odometry)
         keys, key_poses = self._known(), self._known_poses(key_poses)
-        before, after, span, fraction = self._between(odometry, keys)
-        fraction = self._of_pushes(odometry, key_poses, (before, after, span), fraction)
+        steps = relative_poses(odometry[:-1], odometry[1:])
+        before, after, span, fraction = self._between(steps, keys)
+        moved = relative_poses(key_poses[before], key_poses[after])
+        counted = relative_poses(odometry[keys[before]], odometry[keys[after]])
+        more = np.hypot(moved[:, 0], moved[:, 1]) - np.hypot(counted[:, 0], counted[:, 1])
+        pushed, part = _standing(steps, keys[before], keys[after])
+        fraction = np.where(pushed & (more > _noise_limit(span)), part, fraction)
         from_before = compose_poses(key_poses[before], relative_poses(odometry[keys[before]], odometry))
         from_after = compose_poses(key_poses[after], relative_poses(odometry[keys[after]], odometry))
         return from_before, pose_differences(from_after, from_before), before, after, span, fraction
@@ -162,37 +166,19 @@ class EventLog:
         values: F64 = np.concatenate((of_keys, of_anchored))[np.argsort([*self._keys, *self._anchored], kind="stable")]
         return values
 
-    def _between(self, odometry: F64, keys: I64) -> tuple[I64, I64, F64, F64]:
+    def _between(self, steps: F64, keys: I64) -> tuple[I64, I64, F64, F64]:
         """Of each event the keyscans before and after it, the path between them, and the part of it that was driven."""
-        steps = relative_poses(odometry[:-1], odometry[1:])
         lengths = _STILL_M + np.hypot(steps[:, 0], steps[:, 1]) + self._turn_length * np.abs(steps[:, 2])
         counted = np.flatnonzero(~np.array(self._is_scan, dtype=bool))
         if len(counted):
             # The last scan before the first message and the first after the last one are taken at these.
             lengths[: max(counted[0] - 1, 0)] = lengths[counted[-1] + 1 :] = _UNCOUNTED_M
         path_length = np.concatenate(([0.0], np.cumsum(lengths)))
-        before = np.clip(np.searchsorted(keys, np.arange(len(odometry)), side="right") - 1, 0, len(keys) - 1)
+        before = np.clip(np.searchsorted(keys, np.arange(len(path_length)), side="right") - 1, 0, len(keys) - 1)
         after = np.minimum(before + 1, len(keys) - 1)
         span = path_length[keys[after]] - path_length[keys[before]]
         fraction = np.clip((path_length - path_length[keys[before]]) / np.maximum(span, 1e-12), 0.0, 1.0)
         return before, after, span, fraction
-
-    def _of_pushes(self, odometry: F64, key_poses: F64, between: tuple[I64, I64, F64], fraction: F64) -> F64:
-        """The part of each event, where the robot moved farther than the odometry counts: while this stood still.
-
-        It was pushed then. One that moved less than is counted slipped while it was counted.
-        """
-        before, after, span = between
-        keys = self._known()
-        moved = relative_poses(key_poses[before], key_poses[after])
-        counted = relative_poses(odometry[keys[before]], odometry[keys[after]])
-        more = np.hypot(moved[:, 0], moved[:, 1]) - np.hypot(counted[:, 0], counted[:, 1])
-        steps = relative_poses(odometry[:-1], odometry[1:])
-        stood = np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) < _SAME)))
-        first, last = stood[keys[before]], stood[keys[after]]
-        pushed = (more > _LARGEST_NOISE * (_NOISE_M + _NOISE_SHARE * span)) & (last - first >= _FEWEST_STANDING)
-        part = np.clip((stood - first) / np.maximum(last - first, 1.0), 0.0, 1.0)
-        return np.where(pushed, part, fraction)
 
     def _index(self) -> F64:
         """For each event the number of odometry messages before it, a scan between two messages being half-way."""
@@ -206,3 +192,19 @@ class EventLog:
         """Odometry messages of the log, shape (k, 3)."""
         poses: F64 = np.array(self._poses).reshape(-1, 3)[~np.array(self._is_scan, dtype=bool)]
         return poses
+
+
+def _noise_limit(span: F64) -> F64:
+    """What two keyscans disagree in (m) with the odometry between them, at most, if that is noise; `span` (m)."""
+    return np.asarray(_LARGEST_NOISE * (_NOISE_M + _NOISE_SHARE * span))
+
+
+def _standing(steps: F64, first: I64, last: I64) -> tuple[NDArray[np.bool_], F64]:
+    """Whether the odometry counted no way for a while between two events (n,), and which part of that was over.
+
+    A robot that moved farther than is counted was pushed then; one that moved less slipped while it was counted.
+    """
+    stood = np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) < _SAME)))
+    before, after = stood[first], stood[last]
+    part = np.clip((stood - before) / np.maximum(after - before, 1.0), 0.0, 1.0)
+    return after - before >= _FEWEST_STANDING, part

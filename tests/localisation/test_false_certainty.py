@@ -47,7 +47,7 @@ def judge(
     for event, estimate in replay(drive, localiser):
         history.add(event, estimate)
     trajectory, _ = history.trajectory()
-    truth, states = history.reference(), history.states(localiser.map_scale, history.mounting_error(), grid)
+    truth, states = history.reference(), history.states(localiser.map_scale, *history.mounting(), grid)
     assert truth is not None
     assert states is not None
     off = trajectory.poses - truth.poses

@@ -60,3 +60,12 @@ def test_cells_lie_where_the_origin_puts_them_turned_ones_too() -> None:
     np.testing.assert_allclose(grid.centres(grid.occupied()), [[9.75, 20.75]])
     assert grid.free().sum() == 4
     np.testing.assert_allclose(grid.bounds(), (9.0, 20.0, 10.0, 21.5))
+
+
+@pytest.mark.parametrize("increment", [np.radians(1.0), np.radians(-1.0)])
+def test_beams_towards_points_are_those_that_see_them(increment: float) -> None:
+    scan = Scan(0, np.array([2.0] * 90 + [np.inf] * 90, dtype=np.float32), 0.3, float(increment), 0.05, 12.0)
+    points = scan.directions() * 2.0
+    np.testing.assert_array_equal(scan.beams_towards(*points.T), np.arange(180))
+    assert (scan.beams_towards(*(-points[10:-10]).T) >= 180).all()
+    np.testing.assert_array_equal(np.isfinite(scan.hit_ranges()), scan.hits())
